@@ -1,0 +1,12 @@
+//! The one door between Rust and its hosts: `python` builds `gscodec._native`. Arrays in, arrays out, no algorithms.
+#[cfg(feature = "python")]
+mod gsv_py;
+#[cfg(feature = "python")]
+mod raster_py;
+
+#[cfg(feature = "python")]
+#[pyo3::pymodule]
+fn _native(m: &pyo3::Bound<'_, pyo3::types::PyModule>) -> pyo3::PyResult<()> {
+    gsv_py::register(m)?;
+    raster_py::register(m)
+}

@@ -1,0 +1,2 @@
+//! Bytes <-> integer maps.
+#![forbid(unsafe_code)]

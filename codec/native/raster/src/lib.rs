@@ -1,0 +1,1 @@
+//! Rasterizer, SSIM and hash-grid kernels.
