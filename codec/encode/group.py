@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from gscodec import _native
-from gscodec.bitstream.color import decorrelate
+from gscodec.bitstream.color import STEP_WEIGHTS, decorrelate
 from gscodec.bitstream.quantization import Steps, steps_for, subject_radius
 from gscodec.bitstream.transform import dct_basis
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply
@@ -78,12 +78,19 @@ def align_axes(s: Stack, middle: int) -> Stack:
     return Stack(s.means, quats, scales, s.logit_opacities, s.sh0, s.shN, s.lifetimes)
 
 
-def quantize_channels(values: np.ndarray, step: float) -> dict:
+def channel_steps(name: str, steps: Steps, channels: int) -> np.ndarray:
+    """[C] f32 step of each channel of an attribute."""
+    step = np.full(channels, getattr(steps, name))
+    if name in ("sh0", "shN"):
+        step *= np.tile(STEP_WEIGHTS, channels // 3)
+    return step.astype(np.float32)
+
+
+def quantize_channels(values: np.ndarray, steps: np.ndarray) -> dict:
     """[N, C] floats -> channels of `encode_group`; offsets are the medians, so that small integers are common."""
     offsets = np.median(values, axis=0) if len(values) else np.zeros(values.shape[1])
     offsets = offsets.astype(np.float32)
-    q = np.rint((values - offsets) / np.float32(step)).astype(np.int32)
-    steps = np.full(values.shape[1], step, np.float32)
+    q = np.rint((values - offsets) / steps).astype(np.int32)
     return {"values": np.ascontiguousarray(q.T), "steps": steps.tolist(), "offsets": offsets.tolist()}
 
 
@@ -148,7 +155,7 @@ def _trajectories(s: Stack, channels: dict, steps: Steps, x: np.ndarray, motion:
     step = {"means": steps.motion, "quats": steps.quats}
     out = {}
     for name, values in residual.items():
-        size = float(np.float32(step.get(name, getattr(steps, name))))
+        size = float(np.float32(step.get(name) or channel_steps(name, steps, values.shape[2])[0]))
         c = trim(quantize_trajectory(values, basis, size, DEAD_ZONE)).transpose(0, 2, 1)  # [K, C, N]
         if c.any():
             out[name] = {"coefficients": np.ascontiguousarray(c), "step": size}
@@ -173,8 +180,9 @@ def group_integers(group: Group, quality: float, *, keep_all: bool = False, step
     positions = grid.to_integers(s.means[middle])
     order = _native.morton_order(positions)
     positions, s = positions[order], align_axes(s.take(order), middle)
-    channels = {n: quantize_channels(v.mean(0), getattr(steps, n)) for n, v in _appearance(s).items()}
-    channels["quats"] = quantize_channels(s.quats[middle, :, 1:], steps.quats)
+    values = {n: v.mean(0) for n, v in _appearance(s).items()}
+    values["quats"] = s.quats[middle, :, 1:]
+    channels = {n: quantize_channels(v, channel_steps(n, steps, v.shape[1])) for n, v in values.items()}
     channels["quats"] = _inside_unit_ball(channels["quats"])
     out = {
         "frames": frames,
