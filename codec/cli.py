@@ -28,7 +28,9 @@ app = typer.Typer(
 )
 _out = Console(soft_wrap=True, highlight=False)
 
-Sequence = Annotated[Path, typer.Argument(metavar="SEQ", help="A capture (folder or transforms.json) or a splat, or a folder of splats.")]
+Sequence = Annotated[
+    Path, typer.Argument(metavar="SEQ", help="A capture (folder or transforms.json) or a splat, or a folder of splats.")
+]
 Stream = Annotated[Path, typer.Argument(metavar="OUT.gsv", help="A .gsv file.")]
 Frames = Annotated[str | None, typer.Option(metavar="A:B", help="Only frames A to B-1.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -46,7 +48,9 @@ def _show_version(value: bool) -> None:
 
 @app.callback()
 def _root(
-    version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
+    ] = False,
 ) -> None:
     pass
 
@@ -96,8 +100,8 @@ def train(
     quality: Quality = 50.0,
 ) -> None:
     """Capture to one .ply per frame, the first half of encode."""
-    from gscodec.progress import Bar
     from gscodec.commands import train_to_folder
+    from gscodec.progress import Bar
 
     with Bar() as bar:
         count = train_to_folder(
@@ -107,7 +111,9 @@ def train(
 
 
 @app.command()
-def decode(stream: Stream, folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the .ply files go.")]) -> None:
+def decode(
+    stream: Stream, folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the .ply files go.")]
+) -> None:
     """Stream to one standard 3DGS .ply per frame."""
     from gscodec.decode import open_stream
     from gscodec.splats import write_sequence
@@ -165,7 +171,9 @@ def info(
         f"{facts['bits_per_gaussian_frame']:.3f} bits per Gaussian and frame"
     )
     for name, u in facts["units"].items():
-        _out.print(f"  {name:<32}{u['bytes']:>10} bytes {u['share']:>6.1%} {u['bits_per_gaussian']:>8.2f} bits/Gaussian/group")
+        _out.print(
+            f"  {name:<32}{u['bytes']:>10} bytes {u['share']:>6.1%} {u['bits_per_gaussian']:>8.2f} bits/Gaussian/group"
+        )
 
 
 @app.command(name="eval")
@@ -194,7 +202,10 @@ def evaluate(
 
 def _warn_if_cut(stream) -> None:
     if not stream.complete:
-        print(f"warning: {stream.name} ends inside a group; its {stream.frame_count} whole frames are used", file=sys.stderr)
+        print(
+            f"warning: {stream.name} ends inside a group; its {stream.frame_count} whole frames are used",
+            file=sys.stderr,
+        )
 
 
 def _say(message, category, filename, lineno, file=None, line=None) -> None:

@@ -1,7 +1,7 @@
 """What the studio's commands do: the joints between stages, one function a command, no arithmetic.
 
-    encode: capture -> train -> encode, or splats -> encode        train: capture -> train -> .ply folder
-    eval:   stream + capture or splats -> metrics
+encode: capture -> train -> encode, or splats -> encode        train: capture -> train -> .ply folder
+eval:   stream + capture or splats -> metrics
 """
 
 from __future__ import annotations
@@ -131,6 +131,7 @@ def _encode_capture(source, out, settings, preset, frames, gop, device, bar) -> 
 
 def _open_capture(source: Path, frames: str | None):
     from gscodec.capture import open_capture
+
     capture = open_capture(source)
     if frames is None:
         return capture

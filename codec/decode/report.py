@@ -18,7 +18,9 @@ def describe(stream: Stream) -> dict:
         decoded = stream.group(i)
         most = max(most, decoded.count)
         gaussian_frames += decoded.count * g["frames"]
-        groups.append({"start_frame": g["start_frame"], "frames": g["frames"], "bytes": g["size"], "gaussians": decoded.count})
+        groups.append(
+            {"start_frame": g["start_frame"], "frames": g["frames"], "bytes": g["size"], "gaussians": decoded.count}
+        )
         for u in decoded.units():
             name = " ".join(x for x in (u["type"], u["attribute"]) if x)
             units[name] = units.get(name, 0) + u["bytes"]

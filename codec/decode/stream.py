@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+
 from gscodec import _native
 from gscodec.camera import Camera
 from gscodec.errors import BitstreamError

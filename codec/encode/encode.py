@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+
 from gscodec import _native
 from gscodec.camera import Camera
 from gscodec.encode.group import group_integers
@@ -59,7 +60,9 @@ class EncodeReport:
         }
 
 
-def stream_config(*, fps: float, sh_degree: int, cameras: list[Camera] = (), up: str = "y", background=(0.5,) * 3) -> dict:
+def stream_config(
+    *, fps: float, sh_degree: int, cameras: list[Camera] = (), up: str = "y", background=(0.5,) * 3
+) -> dict:
     """The config box: what a player must know before the first group."""
     return {
         "fps": fps,

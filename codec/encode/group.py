@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+
 from gscodec import _native
 from gscodec.bitstream.color import STEP_WEIGHTS, decorrelate
 from gscodec.bitstream.quantization import Steps, steps_for, subject_radius

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+
 from gscodec import _native
 from gscodec.bitstream.quantization import Steps
 from gscodec.bitstream.transform import dct_basis
@@ -164,7 +165,6 @@ def fit_nodes(grid_positions: np.ndarray, x: np.ndarray, means: np.ndarray, coun
         turned[t] = blend.turn(rotvec_to_quat(rotations[t]))
     coefficients = np.concatenate([q_rotations, q_translations], 2).transpose(0, 2, 1)  # [K, 6, M]
     return NodeMotion(node_grid, trim(coefficients), carried, turned)
-
 
 
 def quantize_trajectory(values: np.ndarray, basis: np.ndarray, step: float, dead_zone: float = 0.5) -> np.ndarray:

@@ -20,7 +20,7 @@ FIELD_OF_VIEW = 40.0  # degrees, orbit camera
 
 
 def up_vector(axis: str) -> np.ndarray:
-    """"z" or "-y" -> [3] unit vector."""
+    """ "z" or "-y" -> [3] unit vector."""
     v = np.zeros(3)
     v["xyz".index(axis[-1])] = -1.0 if axis.startswith("-") else 1.0
     return v
@@ -75,14 +75,16 @@ def camera_path(stream, camera: str, size: str | None, frames: range) -> Iterato
         fixed = load_camera(Path(camera))
     else:
         names = ", ".join(known) or "none in this file"
-        raise UsageError(f"--camera {camera} does not exist, expected orbit, a .json file or a reference camera ({names})")
+        raise UsageError(
+            f"--camera {camera} does not exist, expected orbit, a .json file or a reference camera ({names})"
+        )
     fixed = fixed.resized(*wanted) if wanted else fixed
     for _ in frames:
         yield fixed
 
 
 def parse_size(size: str | None) -> tuple[int, int] | None:
-    """"640x480" -> (640, 480).
+    """ "640x480" -> (640, 480).
 
     Raises:
         UsageError: not of that form, or outside 1 to 16384.

@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+
 from gscodec.bitstream.quantization import Steps
 from gscodec.bitstream.transform import dct_basis
 from gscodec.gaussians import Gaussians
@@ -61,7 +62,9 @@ class GroupModel:
         self.coefficients = {}  # in units of the quantization step
         for name, (channels, most) in RESIDUALS.items():
             self.coefficients[name] = torch.zeros(min(most, len(means)), n, channels, requires_grad=True)
-        self.log_scales = {n: torch.full((len(c), 1, 1), -1.0, requires_grad=True) for n, c in self.coefficients.items()}
+        self.log_scales = {
+            n: torch.full((len(c), 1, 1), -1.0, requires_grad=True) for n, c in self.coefficients.items()
+        }
 
     def residual(self, name: str, t: int) -> torch.Tensor:
         """[N, C] residual of an attribute at frame `t`, in its own units."""

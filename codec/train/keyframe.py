@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+
 from gscodec.render.step import Workspace, render_loss
 from gscodec.train.model import Model
 from gscodec.train.settings import TrainSettings

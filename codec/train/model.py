@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+
 from gscodec.gaussians import SH_C0, Gaussians
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")

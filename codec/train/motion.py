@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+
 from gscodec.render.step import Workspace, render_loss
 from gscodec.train.hashgrid import HashGrid
 from gscodec.train.keyframe import rotate
@@ -144,9 +145,7 @@ def _fit_frame(key, views, frame, settings, radius, start, graph, on_step):
         )
         rigid = settings.rigidity * graph.loss(means, turned)
         optimizer.zero_grad()
-        torch.autograd.backward(
-            [means, quats, rigid], [result.grads["means"], result.grads["quats"], torch.ones(())]
-        )
+        torch.autograd.backward([means, quats, rigid], [result.grads["means"], result.grads["quats"], torch.ones(())])
         optimizer.step()
         if on_step:
             on_step(frame, step, result.loss)

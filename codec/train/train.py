@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+
 from gscodec.bitstream.quantization import steps_for, subject_radius
 from gscodec.errors import CaptureError
 from gscodec.gaussians import Gaussians, Group
@@ -164,7 +165,9 @@ def _train_group(capture, views, frames: range, last: Gaussians | None, settings
     )
     if len(frames) == 1:
         return Group([key.gaussians()])
-    means, turned = track(key, views, frames, settings, radius=radius, on_step=report(f"motion {frames[0]}-{frames[-1]}"))
+    means, turned = track(
+        key, views, frames, settings, radius=radius, on_step=report(f"motion {frames[0]}-{frames[-1]}")
+    )
     group = GroupModel(key, means, turned, steps_for(settings.quality, radius))
     finetune(group, views, frames, settings, radius=radius, on_step=report(f"fine-tune {frames[0]}-{frames[-1]}"))
     with torch.no_grad():
