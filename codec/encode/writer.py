@@ -1,8 +1,8 @@
 """The growing file: group payloads -> OUT.gsv.part, playable at any moment, then OUT.gsv with its index.
 
-OUT.gsv.part holds the init segment and whole fragments; OUT.gsv.part.json says what made it, so that a second run goes on
-where the first one stopped, and only if input and settings are the same. `finish` writes the indexed file beside it
-and renames; a file under the final name is always complete.
+OUT.gsv.part holds the init segment and whole fragments; OUT.gsv.part.json says what made it, so that a second run goes
+on where the first one stopped, and only if input and settings are the same. `finish` writes the indexed file beside
+it and renames; a file under the final name is always complete.
 """
 
 from __future__ import annotations
