@@ -3,6 +3,9 @@
 All derive from `GscodecError`, which the command line prints as one sentence; anything else is a bug of ours.
 """
 
+import importlib
+from types import ModuleType
+
 
 class GscodecError(Exception):
     """Base of everything that a user can cause and mend."""
@@ -22,3 +25,19 @@ class CaptureError(GscodecError):
 
 class UsageError(GscodecError):
     """An argument or a combination of arguments makes no sense, or an extra has to be installed first."""
+
+
+def require(module: str, purpose: str) -> ModuleType:
+    """The optional module `module`, imported when it is needed, since the player's side installs without it.
+
+    Args:
+        module: import name, e.g. "cv2".
+        purpose: what needs it, the start of the message, e.g. "reading a video".
+
+    Raises:
+        UsageError: it is not installed; names the extra that has it.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as e:
+        raise UsageError(f"{purpose} needs {module}; install it with: pip install 'gscodec[encode]'") from e

@@ -1,0 +1,89 @@
+"""A multi-view capture as the later stages see it: fixed pinhole cameras and a lazy view per camera and frame.
+
+Layout (reader) -> Capture -> train, metrics. Views are decoded on request and never kept, so a capture larger than
+memory works, and any number of threads may ask at once. Colours are 8-bit sRGB and not premultiplied: compositing
+happens in the file's own space on a background that the caller names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gscodec.camera import Camera
+from gscodec.capture.images import View, resize_area
+from gscodec.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Synchronised images of fixed cameras.
+
+    Attributes:
+        name: of the folder, for messages and reports.
+        fps: frames a second.
+        cameras: undistorted pinhole cameras; each has an image of every frame.
+        frame_count: frames of this (possibly restricted) capture.
+        has_alpha: views carry an alpha channel (from the images or from masks).
+        read: (camera index, frame of the source) -> View at the source's size, undistorted; thread-safe.
+        first_frame: source frame that is frame 0 here.
+    """
+
+    name: str
+    fps: float
+    cameras: Sequence[Camera]
+    frame_count: int
+    has_alpha: bool
+    read: Callable[[int, int], View]
+    first_frame: int = 0
+
+    def view(self, camera_index: int, frame: int) -> View:
+        """The image of a camera at a frame, at the camera's size.
+
+        Raises:
+            UsageError: there is no such camera or frame.
+            CaptureError: the image cannot be read or has another size than the calibration says.
+        """
+        if not 0 <= camera_index < len(self.cameras):
+            raise UsageError(f"{self.name}: no camera {camera_index}, there are {len(self.cameras)} (0 to n - 1)")
+        if not 0 <= frame < self.frame_count:
+            raise UsageError(f"{self.name}: no frame {frame}, there are {self.frame_count} (0 to n - 1)")
+        camera = self.cameras[camera_index]
+        return resize_area(self.read(camera_index, self.first_frame + frame), camera.width, camera.height)
+
+    def indices(self, split: str) -> list[int]:
+        """Indices of the cameras of a split, "train" or "test"."""
+        return [i for i, c in enumerate(self.cameras) if c.split == split]
+
+    def frames(self, start: int | None, stop: int | None = None) -> Capture:
+        """The frames [start, stop) as a capture of its own; None means the first or the last, negative ends count back.
+
+        Raises:
+            UsageError: no frame is left.
+        """
+        a, b, _ = slice(start, stop).indices(self.frame_count)
+        if b <= a:
+            raise UsageError(f"{self.name}: frames {start}:{stop} is empty, the capture has {self.frame_count} frames")
+        return replace(self, first_frame=self.first_frame + a, frame_count=b - a)
+
+    def scaled(self, scale: float) -> Capture:
+        """The capture with images `scale` times the size (area filter), at least 1 pixel.
+
+        Raises:
+            UsageError: the scale is not in (0, 1].
+        """
+        if not 0 < scale <= 1:
+            raise UsageError(f"image scale {scale} is outside (0, 1]; images are only ever made smaller")
+        size = [(max(1, round(c.width * scale)), max(1, round(c.height * scale))) for c in self.cameras]
+        return replace(self, cameras=[c.resized(w, h) for c, (w, h) in zip(self.cameras, size, strict=True)])
+
+
+def composite(view: View, background: Sequence[float]) -> np.ndarray:
+    """[H, W, 3] u8: the view over `background` (r, g, b in 0..1), blended in sRGB as every splat renderer does."""
+    if view.alpha is None:
+        return view.rgb
+    a = view.alpha[..., None].astype(np.float32) / 255
+    out = view.rgb * a + np.asarray(background, np.float32) * (255 * (1 - a))
+    return (out + 0.5).astype(np.uint8)

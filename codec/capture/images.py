@@ -1,0 +1,126 @@
+"""One image file -> View: 8-bit sRGB colour, not premultiplied, and its alpha; filters that respect the alpha.
+
+OpenImageIO reads every format. It premultiplies by alpha unless told not to, and formats that are premultiplied by
+nature (EXR) it leaves so: both end up unassociated here. Float images are linear light and get the sRGB curve;
+integers are taken to be sRGB already. Resampling filters premultiplied colours, or the colour hidden under alpha 0
+would bleed into the edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gscodec.errors import CaptureError, require
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr", ".tif", ".tiff")  # what a name without one is tried with
+
+
+@dataclass(frozen=True)
+class View:
+    """rgb: [H, W, 3] u8 sRGB, not premultiplied. alpha: [H, W] u8, or None where the image covers everything."""
+
+    rgb: np.ndarray
+    alpha: np.ndarray | None = None
+
+
+def _open(path: Path):
+    oiio = require("OpenImageIO", "reading images")
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    if not path.is_file():
+        raise CaptureError(f"{path}: image is missing")
+    image = oiio.ImageInput.open(str(path), config)
+    if image is None:
+        raise CaptureError(f"{path}: not a readable image ({oiio.geterror() or 'unknown format'})")
+    return image
+
+
+def image_size(path: Path) -> tuple[int, int, bool]:
+    """Width, height and whether there is an alpha channel, from the header alone.
+
+    Raises:
+        CaptureError: the file is missing or not an image.
+    """
+    image = _open(path)
+    spec = image.spec()
+    image.close()
+    return spec.width, spec.height, _channels(spec.channelnames)[1] is not None
+
+
+def _channels(names: tuple[str, ...]) -> tuple[list[int], int | None]:
+    """Which channels are red, green, blue and alpha; grey images repeat their one colour channel."""
+    at = {n.rsplit(".", 1)[-1].upper(): i for i, n in reversed(list(enumerate(names)))}
+    colour = [at[c] for c in "RGB"] if all(c in at for c in "RGB") else [0, 0, 0]
+    return colour, at.get("A")
+
+
+def read_image(path: Path) -> View:
+    """Reads PNG, JPEG, EXR, TIFF, WebP ... of 8 or 16 bit or float.
+
+    Raises:
+        CaptureError: the file is missing, not an image or damaged.
+        UsageError: OpenImageIO is not installed.
+    """
+    image = _open(path)
+    spec = image.spec()
+    integer = np.dtype(str(spec.format)).kind == "u" if str(spec.format) != "half" else False
+    pixels = image.read_image("uint8" if integer and str(spec.format) == "uint8" else "float")
+    message = image.geterror()
+    image.close()
+    if pixels is None or message:
+        raise CaptureError(f"{path}: damaged image ({message or 'no pixels'})")
+    colour, a = _channels(spec.channelnames)
+    pixels = pixels.reshape(spec.height, spec.width, -1)
+    alpha = None if a is None else pixels[..., a]
+    rgb = pixels[..., colour]
+    if alpha is not None and not spec.getattribute("oiio:UnassociatedAlpha"):
+        top = 255 if rgb.dtype == np.uint8 else 1
+        rgb = _divide(rgb.astype(np.float32), alpha.astype(np.float32) / top, top).astype(rgb.dtype)
+    if not integer:
+        rgb = _srgb(rgb)
+    return View(_u8(rgb), None if alpha is None else _u8(alpha))
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """[H, W] u8 coverage: the alpha channel of the file if it has one, else its first colour channel."""
+    view = read_image(path)
+    return np.ascontiguousarray(view.rgb[..., 0]) if view.alpha is None else view.alpha
+
+
+def _srgb(linear: np.ndarray) -> np.ndarray:
+    linear = np.clip(np.nan_to_num(linear), 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def _u8(x: np.ndarray) -> np.ndarray:
+    if x.dtype != np.uint8:
+        x = (np.clip(np.nan_to_num(x), 0, 1) * 255 + 0.5).astype(np.uint8)
+    return np.ascontiguousarray(x)
+
+
+def _divide(rgb: np.ndarray, alpha: np.ndarray, top: float) -> np.ndarray:
+    """Premultiplied f32 colour -> unassociated, rounded to nearest where it is an integer scale; 0 under alpha 0."""
+    out = rgb / np.maximum(alpha, 1e-6)[..., None] * (alpha > 0)[..., None]
+    return np.clip(out + (0.5 if top == 255 else 0), 0, top)
+
+
+def resample(view: View, op: Callable[[np.ndarray], np.ndarray]) -> View:
+    """Applies a linear filter `op` (on [H, W, C] f32) to premultiplied colour and alpha, and divides again."""
+    if view.alpha is None:
+        return View((np.clip(op(view.rgb.astype(np.float32)), 0, 255) + 0.5).astype(np.uint8))
+    a = view.alpha.astype(np.float32)
+    out = op(np.dstack([view.rgb * (a / 255)[..., None], a]))
+    rgb = _divide(out[..., :3], out[..., 3] / 255, 255)
+    return View(rgb.astype(np.uint8), (np.clip(out[..., 3], 0, 255) + 0.5).astype(np.uint8))
+
+
+def resize_area(view: View, width: int, height: int) -> View:
+    """The view at another (smaller) size, each new pixel the mean of the area it covers."""
+    if view.rgb.shape[:2] == (height, width):
+        return view
+    cv2 = require("cv2", "scaling images")
+    return resample(view, lambda x: cv2.resize(x, (width, height), interpolation=cv2.INTER_AREA))

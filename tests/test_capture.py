@@ -1,0 +1,468 @@
+"""Capture readers on tiny captures made here: what they read, what they leave out with a warning, what they refuse."""
+
+import json
+import sys
+import threading
+import warnings
+
+import cv2
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from gscodec.camera import Camera, look_at
+from gscodec.capture import View, composite, find_capture, open_capture
+from gscodec.capture.images import read_image, resize_area
+from gscodec.capture.undistort import undistortion
+from gscodec.capture.video import Video
+from gscodec.errors import CaptureError, UsageError, require
+
+W, H = 24, 16
+GL = np.diag([1.0, -1, -1, 1])
+
+
+def write_image(path, pixels, dtype="uint8", unassociated=True):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    h, w, c = pixels.shape
+    spec = oiio.ImageSpec(w, h, c, dtype)
+    if unassociated:
+        spec.attribute("oiio:UnassociatedAlpha", 1)
+    out = oiio.ImageOutput.create(str(path))
+    assert out.open(str(path), spec)
+    assert out.write_image(pixels)
+    out.close()
+
+
+def pixels(camera, frame, channels=4):
+    p = np.full((H, W, channels), 10 * camera + frame, np.uint8)
+    p[..., 1] = 200
+    if channels == 4:
+        p[..., 3] = np.where(np.arange(W) < W // 2, 255, 40)
+    return p
+
+
+def pose(k):
+    view = look_at((3 * np.cos(k), 3 * np.sin(k), 1), (0, 0, 0), (0, 0, 1))
+    return np.linalg.inv(view) @ GL
+
+
+@pytest.fixture
+def rig(tmp_path):
+    """A capture of 3 cameras x 2 frames; returns (folder, its data, a function that writes the data)."""
+    data = {"w": W, "h": H, "fl_x": 30.0, "cx": 12.0, "cy": 8.0, "fps": 25, "frames": []}
+    for k in range(3):
+        for t in range(2):
+            name = f"images/cam{k}/{t:03}.png"
+            write_image(tmp_path / name, pixels(k, t))
+            item = {"file_path": name, "camera": f"cam{k}", "frame": t, "split": "test" if k == 2 else "train"}
+            data["frames"].append(item | {"transform_matrix": pose(k).tolist()})
+
+    def save(path="transforms.json"):
+        (tmp_path / path).write_text(json.dumps(data))
+        return open_capture(tmp_path)
+
+    return tmp_path, data, save
+
+
+def test_reads_cameras_frames_and_alpha(rig):
+    _, _, save = rig
+    capture = save()
+    assert (capture.fps, capture.frame_count, capture.has_alpha) == (25, 2, True)
+    assert [c.name for c in capture.cameras] == ["cam0", "cam1", "cam2"]
+    assert (capture.indices("train"), capture.indices("test")) == ([0, 1], [2])
+    view = capture.view(1, 1)
+    np.testing.assert_array_equal(np.dstack([view.rgb, view.alpha]), pixels(1, 1))
+
+
+def test_pose_becomes_opencv_world_to_camera(rig):
+    camera = rig[2]().cameras[1]
+    expected = look_at((3 * np.cos(1), 3 * np.sin(1), 1), (0, 0, 0), (0, 0, 1))
+    np.testing.assert_allclose(camera.viewmat, expected, atol=1e-9)
+    assert (camera.K[0, 0], camera.K[1, 1], camera.K[0, 2]) == (30, 30, 12)
+
+
+def test_frame_range_and_scale(rig):
+    capture = rig[2]().frames(1, None).scaled(0.5)
+    assert capture.frame_count == 1
+    assert (capture.cameras[0].width, capture.cameras[0].K[0, 0]) == (12, 15)
+    view = capture.view(2, 0)
+    assert view.rgb.shape == (8, 12, 3)
+    assert view.rgb[0, 0, 0] == 21
+    with pytest.raises(UsageError, match=r"frames 5:9 is empty, the capture has 1 frames"):
+        capture.frames(5, 9)
+    with pytest.raises(UsageError, match="scale 2 is outside"):
+        capture.scaled(2)
+    with pytest.raises(UsageError, match="no camera 3, there are 3"):
+        capture.view(3, 0)
+    with pytest.raises(UsageError, match="no frame 1, there are 1"):
+        capture.view(0, 1)
+
+
+def test_time_instead_of_frame_and_names_without_suffix(rig):
+    _, data, save = rig
+    for f in data["frames"]:
+        f["time"] = f.pop("frame") / 60
+        f["file_path"] = f["file_path"].removesuffix(".png")
+    capture = save()
+    assert capture.frame_count == 2
+    assert capture.view(0, 1).rgb[0, 0, 0] == 1
+
+
+def test_fps_from_frame_and_time(rig):
+    _, data, save = rig
+    del data["fps"]
+    for f in data["frames"]:
+        f["time"] = f["frame"] / 60
+    assert save().fps == pytest.approx(60)
+
+
+def test_cameras_told_apart_by_pose(rig):
+    _, data, save = rig
+    for f in data["frames"]:
+        del f["camera"]
+    assert (len(save().cameras), save().frame_count) == (3, 2)
+
+
+def test_static_capture_of_two_files_is_one_frame(rig):
+    path, data, save = rig
+    for f in data["frames"]:
+        for key in ("camera", "frame", "split"):
+            f.pop(key, None)
+    everything = [f for f in data["frames"] if f["file_path"].endswith("000.png")]
+    data["frames"] = everything[2:]
+    (path / "transforms_test.json").write_text(json.dumps(data))
+    data["frames"] = everything[:2]
+    capture = save("transforms_train.json")
+    assert (capture.frame_count, len(capture.cameras), capture.indices("test")) == (1, 3, [2])
+
+
+def test_nerfstudio_split_lists(rig):
+    _, data, save = rig
+    for f in data["frames"]:
+        del f["split"]
+    data["test_filenames"] = [f["file_path"] for f in data["frames"] if f["camera"] == "cam0"]
+    assert save().indices("test") == [0]
+
+
+def test_focal_length_from_angle_and_per_frame(rig):
+    _, data, save = rig
+    del data["fl_x"]
+    for f in data["frames"]:
+        f["camera_angle_x"] = 2 * np.arctan(0.5)
+    assert save().cameras[0].K[0, 0] == pytest.approx(W)
+
+
+def test_masks_folder(rig):
+    path, data, save = rig
+    for f in data["frames"]:
+        write_image(path / f["file_path"], pixels(0, 0, channels=3))
+        write_image(path / f["file_path"].replace("images", "masks"), np.full((H, W, 1), 77, np.uint8))
+    capture = save()
+    assert capture.has_alpha
+    assert (capture.view(0, 0).alpha == 77).all()
+    write_image(path / "masks/cam0/000.png", np.zeros((3, 5, 1), np.uint8))
+    with pytest.raises(CaptureError, match=r"masks/cam0/000.png: mask is 5x3, its image 24x16"):
+        capture.view(0, 0)
+
+
+def break_pose(values):
+    return lambda f: f.__setitem__("transform_matrix", values)
+
+
+@pytest.mark.parametrize(
+    ("harm", "message"),
+    [
+        (lambda f: f.pop("transform_matrix"), "cam1 is left out: frame 0 has no pose"),
+        (break_pose(np.zeros((4, 4)).tolist()), "frame 0: transform_matrix is singular"),
+        (break_pose(np.diag([1, 1, -1, 1]).tolist()), "singular, sheared or mirrored"),
+        (break_pose([[1, 2], [3]]), "transform_matrix is not 4x4 finite numbers"),
+        (lambda f: f.__setitem__("frame", 7), "frame 0 is missing"),
+        (lambda f: f.__setitem__("file_path", "images/none.png"), r"frame 0: image .*none.png is missing"),
+        (lambda f: f.__setitem__("w", 99), r"image .*000.png is 24x16, expected 99x16"),
+        (lambda f: f.__setitem__("fl_x", -1), "focal length -1.0 x -1.0 is not positive"),
+    ],
+)
+def test_a_broken_camera_is_left_out(rig, harm, message):
+    _, data, save = rig
+    harm(data["frames"][2])
+    with pytest.warns(UserWarning, match=message):
+        capture = save()
+    assert [c.name for c in capture.cameras] == ["cam0", "cam2"]
+
+
+def test_a_moving_camera_is_left_out(rig):
+    _, data, save = rig
+    data["frames"][3]["transform_matrix"] = pose(9).tolist()
+    with pytest.warns(UserWarning, match="camera cam1 is left out: it moves at frame 1"):
+        assert len(save().cameras) == 2
+
+
+def test_no_camera_left_is_an_error(rig):
+    _, data, save = rig
+    del data["fl_x"]
+    with pytest.raises(CaptureError, match="no camera can be used; the last one: no focal length"), pytest.warns():
+        save()
+
+
+def test_all_test_cameras_is_an_error(rig):
+    _, data, save = rig
+    for f in data["frames"]:
+        f["split"] = "test"
+    with pytest.raises(CaptureError, match="all 3 cameras are test cameras"):
+        save()
+
+
+def test_an_image_that_changes_size_is_named(rig):
+    path, _, save = rig
+    write_image(path / "images/cam1/001.png", np.zeros((4, 4, 4), np.uint8))
+    with pytest.raises(CaptureError, match=r"001.png: camera cam1, frame 1 is 4x4, expected 24x16"):
+        save().view(1, 1)
+
+
+def test_damaged_and_missing_images(rig):
+    path, _, save = rig
+    capture = save()
+    (path / "images/cam1/001.png").write_bytes(b"not an image")
+    with pytest.raises(CaptureError, match=r"001.png: not a readable image"):
+        capture.view(1, 1)
+    whole = (path / "images/cam0/001.png").read_bytes()
+    (path / "images/cam0/001.png").write_bytes(whole[:60])
+    with pytest.raises(CaptureError, match=r"001.png: (damaged|not a readable) image"):
+        capture.view(0, 1)
+    (path / "images/cam0/000.png").unlink()
+    with pytest.raises(CaptureError, match=r"000.png: image is missing"):
+        capture.view(0, 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not valid JSON"),
+        ('{"frames": []}', "no 'frames'"),
+        ('{"frames": [{}]}', r"frames\[0\] has no file_path"),
+        ('{"camera_model": "OPENCV_FISHEYE", "frames": [{}]}', "camera_model OPENCV_FISHEYE is not supported"),
+    ],
+)
+def test_bad_transforms_files(tmp_path, text, message):
+    (tmp_path / "transforms.json").write_text(text)
+    with pytest.raises(CaptureError, match=message):
+        open_capture(tmp_path)
+
+
+def test_detector_says_what_it_looked_for(tmp_path):
+    with pytest.raises(CaptureError, match=r"the folder is empty; looked for transforms.json .* and for calibration/"):
+        open_capture(tmp_path)
+    (tmp_path / "readme").touch()
+    with pytest.raises(CaptureError, match="not a capture; looked for"):
+        open_capture(tmp_path)
+    with pytest.raises(CaptureError, match="no such file or folder"):
+        open_capture(tmp_path / "gone")
+    assert find_capture(tmp_path) is None
+
+
+def test_missing_library_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(UsageError, match=r"reading videos needs cv2; install it with: pip install 'gscodec\[encode\]'"):
+        require("cv2", "reading videos")
+
+
+# -- images
+
+
+@pytest.mark.parametrize(
+    ("suffix", "dtype"), [("png", "uint8"), ("png", "uint16"), ("tif", "uint16"), ("webp", "uint8")]
+)
+def test_integer_images_are_srgb_and_unassociated(tmp_path, suffix, dtype):
+    source = np.dstack([np.full((8, 8), v, np.uint8) for v in (200, 100, 50, 128)])
+    scaled = source if dtype == "uint8" else (source.astype(np.uint16) * 257)
+    write_image(tmp_path / f"a.{suffix}", scaled, dtype)
+    view = read_image(tmp_path / f"a.{suffix}")
+    assert np.abs(view.rgb.astype(int) - source[..., :3]).max() <= (6 if suffix == "webp" else 0)
+    assert (view.alpha == 128).all()
+
+
+def test_exr_is_linear_and_premultiplied(tmp_path):
+    linear = np.array([0.5, 0.2, 0.01, 1.0], np.float32)
+    image = np.tile(linear * 0.5, (4, 4, 1)).astype(np.float32)  # premultiplied with alpha 0.5
+    write_image(tmp_path / "a.exr", image, "half", unassociated=False)
+    view = read_image(tmp_path / "a.exr")
+    np.testing.assert_array_equal(view.rgb[0, 0], [188, 124, 25])
+    assert view.alpha[0, 0] == 128
+
+
+def test_grey_image(tmp_path):
+    write_image(tmp_path / "a.png", np.full((4, 4, 1), 90, np.uint8))
+    view = read_image(tmp_path / "a.png")
+    assert (view.rgb == 90).all()
+    assert view.alpha is None
+
+
+def test_area_filter_ignores_colour_under_alpha_zero():
+    rgb = np.zeros((2, 2, 3), np.uint8)
+    rgb[0, 0], rgb[1, 1] = (200, 100, 40), (255, 255, 255)
+    small = resize_area(View(rgb, np.array([[255, 0], [0, 0]], np.uint8)), 1, 1)
+    np.testing.assert_array_equal(small.rgb[0, 0], (200, 100, 40))
+    assert small.alpha[0, 0] == 64
+
+
+def test_composite_blends_over_the_background():
+    view = View(np.full((1, 1, 3), 200, np.uint8), np.array([[51]], np.uint8))
+    assert composite(view, (0.5, 0.0, 1.0))[0, 0].tolist() == [142, 40, 244]
+    assert composite(View(view.rgb), (1, 1, 1)) is view.rgb
+
+
+def test_undistortion_moves_pixels_where_opencv_projects_them():
+    K = np.array([[80.0, 0, 48], [0, 80, 32], [0, 0, 1]])
+    camera = Camera("a", K, np.eye(4), 96, 64, np.array([-0.2, 0.05, 0.01, -0.01]))
+    pinhole, warp = undistortion(camera)
+    assert not pinhole.distortion.size
+    point = np.array([[[0.15, -0.1, 1.0]]])
+    zero = np.zeros(3)
+    u, v = cv2.projectPoints(point, zero, zero, K, camera.distortion)[0].ravel()  # half-integer pixel centres
+    y, x = np.mgrid[:64, :96] + 0.5
+    image = np.exp(-((x - u) ** 2 + (y - v) ** 2) / 8) * 255
+    out = warp(View(np.dstack([image] * 3).astype(np.uint8))).rgb[..., 0].astype(float)
+    at = pinhole.K @ point[0, 0]
+    assert (out * x).sum() / out.sum() == pytest.approx(at[0], abs=0.15)
+    assert (out * y).sum() / out.sum() == pytest.approx(at[1], abs=0.15)
+
+
+# -- Qualisys
+
+CALIBRATION = """<calibration><cameras>{}</cameras></calibration>"""
+CAMERA = """<camera serial="{name}"><fov_video bottom="{b}" left="0" right="63" top="0"/>
+<transform x="{x}" y="0" z="0" r11="{r}" r12="0" r13="0" r21="0" r22="1" r23="0" r31="0" r32="0" r33="1"/>
+<intrinsic focalLengthU="{f}" focalLengthV="6400" centerPointU="2016" centerPointV="1504" radialDistortion1="0"
+radialDistortion2="0" tangentalDistortion1="0" tangentalDistortion2="0"/></camera>"""
+
+
+def write_video(path, frames, size=(64, 48)):
+    path.parent.mkdir(exist_ok=True)
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 50, size)
+    for t in range(frames):
+        video.write(np.full((size[1], size[0], 3), (0, 0, 4 * t), np.uint8))
+    video.release()
+
+
+@pytest.fixture
+def qualisys(tmp_path):
+    def save(**cameras):
+        values = {"b": 47, "x": 1000, "r": 1, "f": 6400}
+        text = "".join(CAMERA.format(name=n, **(values | c)) for n, c in cameras.items())
+        (tmp_path / "calibration").mkdir(exist_ok=True)
+        (tmp_path / "calibration" / "Calib.qca.txt").write_text(CALIBRATION.format(text))
+        return lambda: open_capture(tmp_path)
+
+    for n in ("a", "b"):
+        write_video(tmp_path / f"videos/{n}.mp4", 60)
+    return tmp_path, save
+
+
+def test_qualisys_units_and_axes(qualisys):
+    capture = qualisys[1](a={}, b={"x": -500})()
+    camera = capture.cameras[0]
+    assert (capture.fps, capture.frame_count, capture.has_alpha) == (50, 60, False)
+    assert camera.K.tolist() == [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
+    np.testing.assert_allclose(camera.center, (1, 0, 0))
+    x, y, z, _ = camera.viewmat @ (1, 2, -10, 1)  # y up and z back in the calibration
+    assert (x, y, z) == (0, -2, 10)
+
+
+def test_video_frames_in_any_order(qualisys):
+    video = Video(qualisys[0] / "videos/a.mp4")
+    order = [0, 1, 2, 1, 59, 3, 30, 30, 4, 58]
+    for t in order:
+        assert abs(int(video.frame(t)[24, 32, 0]) - 4 * t) <= 6, t
+    with pytest.raises(CaptureError, match=r"a.mp4: frame 99 cannot be decoded, the header promises 60"):
+        video.frame(99)
+    assert abs(int(video.frame(5)[24, 32, 0]) - 20) <= 6
+
+
+def test_views_from_threads(qualisys):
+    capture = qualisys[1](a={}, b={})()
+    wrong = []
+
+    def check(camera):
+        for t in range(0, 20):
+            if abs(int(capture.view(camera, t).rgb[24, 32, 0]) - 4 * t) > 6:
+                wrong.append((camera, t))
+
+    threads = [threading.Thread(target=check, args=(i % 2,)) for i in range(4)]
+    for t in threads:
+        t.start()
+    for t in threads:
+        t.join()
+    assert not wrong
+
+
+def test_short_videos_are_named(qualisys):
+    path, save = qualisys
+    write_video(path / "videos/a.mp4", 40)
+    with pytest.warns(UserWarning, match=r"a.mp4: short video, 40 of 60 frames; the capture ends at frame 40"):
+        assert save(a={}, b={})().frame_count == 40
+    write_video(path / "videos/a.mp4", 20)
+    with pytest.warns(UserWarning, match=r"a.mp4: short video, 20 of 60 frames; the camera is left out"):
+        capture = save(a={}, b={})()
+    assert (capture.frame_count, len(capture.cameras)) == (60, 1)
+
+
+def test_video_at_another_scale(qualisys):
+    path, save = qualisys
+    write_video(path / "videos/a.mp4", 60, (32, 24))
+    capture = save(a={}, b={})()
+    assert capture.cameras[0].K[0].tolist() == [50, 0, 16]
+    assert capture.view(0, 3).rgb.shape == (24, 32, 3)
+
+
+@pytest.mark.parametrize(
+    ("harm", "message"),
+    [
+        ({"b": 9}, "its video is 64x48, expected 64x10"),
+        ({"r": 0}, "rotation r11..r33 is singular"),
+        ({"x": "nan"}, "<transform> is missing or incomplete"),
+        ({"f": ""}, "<intrinsic> is missing or incomplete, expected numbers focalLengthU"),
+        ({"f": -1}, "focal length .* is not positive"),
+    ],
+)
+def test_a_broken_qualisys_camera_is_left_out(qualisys, harm, message):
+    with pytest.warns(UserWarning, match=message):
+        assert len(qualisys[1](a=harm, b={})().cameras) == 1
+
+
+def test_missing_and_damaged_videos(qualisys):
+    path, save = qualisys
+    (path / "videos/a.mp4").write_bytes(b"nothing")
+    with pytest.warns(UserWarning, match="left out") as seen:
+        save(a={}, b={}, c={})()
+    text = " ".join(str(w.message) for w in seen)
+    assert "a.mp4: not a readable video" in text
+    assert "camera c is left out: no video, looked for c with .mp4" in text
+    with pytest.raises(CaptureError, match="no camera can be used"), pytest.warns():
+        save(c={})()
+    with pytest.raises(CaptureError, match="video is missing"):
+        Video(path / "none.mp4")
+
+
+@pytest.mark.parametrize(("text", "message"), [("<a>", "not valid XML"), ("<a/>", "no cameras, expected a Qualisys")])
+def test_bad_calibration_files(tmp_path, text, message):
+    (tmp_path / "x.qca.txt").write_text(text)
+    with pytest.raises(CaptureError, match=message):
+        open_capture(tmp_path)
+
+
+def test_qualisys_masks(qualisys):
+    path, save = qualisys
+    for t in range(60):
+        write_image(path / f"masks/a/{t:03}.png", np.full((48, 64, 1), t, np.uint8))
+    capture = save(a={}, b={})()
+    assert capture.has_alpha
+    assert (capture.view(0, 7).alpha == 7).all()
+    (path / "masks/a/000.png").unlink()
+    with pytest.raises(CaptureError, match="59 masks for 60 frames"):
+        save(a={}, b={})()
+
+
+def test_nothing_warns_on_a_sound_capture(rig):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rig[2]()
