@@ -10,6 +10,7 @@ import numpy as np
 
 COARSE = 64  # voxels a side
 MISSES = 0  # masks that may disagree with a voxel
+SEEN_SHARE = 0.5  # of the views must see a voxel
 
 
 def meeting_point(cameras) -> np.ndarray:
@@ -36,7 +37,7 @@ def _lattice(low: np.ndarray, high: np.ndarray, step: float) -> tuple[np.ndarray
 
 
 def _inside(points: np.ndarray, views) -> np.ndarray:
-    """[N] bool: in the mask of every view that sees the point, and seen by at least two."""
+    """[N] bool: in the mask of every view that sees the point, and seen by most (masks say nothing of what is off)."""
     seen = np.zeros(len(points), np.int32)
     missed = np.zeros(len(points), np.int32)
     for camera, _, alpha in views:
@@ -45,7 +46,7 @@ def _inside(points: np.ndarray, views) -> np.ndarray:
         on = (depth > 0.01) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
         seen += on
         missed[on] += alpha[y[on], x[on]] < 128
-    return (seen >= 2) & (missed <= MISSES)
+    return (seen >= max(2, SEEN_SHARE * len(views))) & (missed <= MISSES)
 
 
 def _colors(points: np.ndarray, views) -> np.ndarray:
