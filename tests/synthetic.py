@@ -1,6 +1,7 @@
 """Small Gaussian sequences with known motion, for tests."""
 
 import numpy as np
+
 from gscodec.encode.canonical import quat_multiply
 from gscodec.encode.motion import rotvec_to_matrix, rotvec_to_quat
 from gscodec.gaussians import Gaussians, GaussianSequence, Group

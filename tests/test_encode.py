@@ -5,6 +5,8 @@ import json
 
 import numpy as np
 import pytest
+from synthetic import blob, covariances, turning
+
 from gscodec import _native
 from gscodec.bitstream.color import correlate, decorrelate
 from gscodec.bitstream.quantization import steps_for, subject_radius
@@ -17,7 +19,6 @@ from gscodec.encode.motion import choose_nodes
 from gscodec.encode.writer import StreamWriter
 from gscodec.errors import UsageError
 from gscodec.gaussians import Gaussians, Group
-from synthetic import blob, covariances, turning
 
 
 def write(sequence, out, quality=50.0, **settings):

@@ -3,8 +3,9 @@
 import ast
 from pathlib import Path
 
-import gscodec
 import pytest
+
+import gscodec
 
 ROOT = Path(gscodec.__file__).parent
 BASE = {"errors", "gaussians", "camera", "frames", "_native"}
