@@ -1,0 +1,233 @@
+"""A folder of splats -> GaussianSequence with lazy frames; sequence_writer.py is its mirror.
+
+With a sequence.json (ours) groups, lifetimes and nodes are as written. Without one the folder is somebody else's:
+it is a tracked sequence only where that is verified, a matched one where Gaussians can be matched from frame to
+frame, and otherwise every frame is a group of its own. Frames are read when asked for; a few stay in memory.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from gscodec.camera import Camera
+from gscodec.capture.detect import LOOKED_FOR, find_capture
+from gscodec.errors import CaptureError, UsageError
+from gscodec.gaussians import Gaussians, GaussianSequence, Group, Nodes
+from gscodec.splats.files import EXPECTED, is_splat, read_splat, splat_size
+from gscodec.splats.tracking import relate
+
+FPS = 30.0  # of folders that do not say
+GOP = 20  # frames of a group
+KEEP = 4  # frames in memory
+
+
+@dataclass(frozen=True)
+class SplatSequence(GaussianSequence):
+    """A sequence read from files.
+
+    Attributes:
+        mode: "stored" (sequence.json says which index is what), "tracked" (verified), "matched" (frames were reordered)
+            or "independent" (groups of one frame).
+        names: file name of each frame.
+    """
+
+    mode: str = "stored"
+    names: Sequence[str] = ()
+
+
+class Frames(Sequence):
+    """Lazy frames of a folder: reads, reorders and keeps the last few; thread-safe."""
+
+    def __init__(self, paths: list[Path], orders: dict[int, np.ndarray], hidden: dict[int, tuple] | None = None):
+        """`orders`: frame -> [N] order; `hidden`: frame -> ([N] bool, logit opacities of those that are not shown)."""
+        self._paths, self._orders, self._hidden = paths, orders, hidden or {}
+        self._kept: OrderedDict[int, Gaussians] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def __getitem__(self, t):
+        if isinstance(t, slice):
+            return FrameRange(self, range(len(self))[t])
+        t = range(len(self))[t]
+        with self._lock:
+            if t not in self._kept:
+                self._kept[t] = self._read(t)
+                while len(self._kept) > KEEP:
+                    self._kept.popitem(last=False)
+            return self._kept[t]
+
+    def _read(self, t: int) -> Gaussians:
+        g = read_splat(self._paths[t])
+        if t in self._orders:
+            g = g.take(self._orders[t])
+        if t in self._hidden:
+            where, values = self._hidden[t]
+            if len(where) != len(g) or where.sum() != len(values):
+                raise CaptureError(f"{self._paths[t]}: {len(g)} Gaussians, sequence.json has lifetimes of {len(where)}")
+            opacities = g.logit_opacities.copy()
+            opacities[where] = values
+            g = replace(g, logit_opacities=opacities)
+        return g
+
+
+class FrameRange(Sequence):
+    """Some of the frames of a `Frames`, as lazy as it."""
+
+    def __init__(self, frames: Frames, index: range):
+        self._frames, self._index = frames, index
+
+    def __len__(self) -> int:
+        return len(self._index)
+
+    def __getitem__(self, t):
+        if isinstance(t, slice):
+            return FrameRange(self._frames, self._index[t])
+        return self._frames[self._index[t]]
+
+
+def splat_paths(path: Path) -> list[Path]:
+    """The frames of a folder in natural order (2 before 10), or the one frame that `path` itself is."""
+    if not path.is_dir() or (path / "meta.json").is_file():
+        return [path] if is_splat(path) else []
+    found = [p for p in path.iterdir() if is_splat(p)]
+    return sorted(found, key=lambda p: [int(w) if w.isdigit() else w for w in re.split(r"(\d+)", p.name)])
+
+
+def detect_input(path: str | Path) -> str:
+    """What encode has been given.
+
+    Returns:
+        "capture" or "splats".
+
+    Raises:
+        CaptureError: neither; lists what was looked for.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise CaptureError(f"{path}: no such file or folder, expected a capture or a folder of splats")
+    if find_capture(path):
+        return "capture"
+    if splat_paths(path):
+        return "splats"
+    looked = "; ".join([*LOOKED_FOR, f"splats, one per frame: {EXPECTED}"])
+    raise CaptureError(f"{path}: neither a capture nor splats; looked for {looked}")
+
+
+def open_sequence(
+    path: str | Path,
+    *,
+    gop: int = GOP,
+    fps: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> SplatSequence:
+    """Opens a folder of splats (or a single one) as a sequence.
+
+    Args:
+        gop: frames of a group at most, where there is no sequence.json.
+        fps: frames a second; by default as sequence.json says, or 30.
+        progress: called with (pairs of frames checked, pairs) while tracking is verified.
+
+    Raises:
+        CaptureError: there are no splats, or sequence.json does not fit them.
+        UsageError: `gop` or `fps` is not positive.
+    """
+    path = Path(path)
+    if gop < 1 or (fps is not None and not fps > 0):
+        raise UsageError(f"gop {gop} and fps {fps} must be positive")
+    paths = splat_paths(path) if path.exists() else []
+    if not paths:
+        raise CaptureError(f"{path}: no splats, expected one file per frame: {EXPECTED}")
+    if path.is_dir() and (path / "sequence.json").is_file():
+        return _stored(path, paths, fps)
+    orders, cuts, mode = _tracks(paths, progress)
+    frames = Frames(paths, orders)
+    groups = []
+    for start, stop in pairwise([*cuts, len(paths)]):
+        groups += [Group(frames[a : min(a + gop, stop)]) for a in range(start, stop, gop)]
+    return SplatSequence(fps or FPS, groups, mode=mode, names=[p.name for p in paths])
+
+
+def _tracks(paths: list[Path], progress: Callable | None) -> tuple[dict[int, np.ndarray], list[int], str]:
+    """Order of each frame that needs one, the frames at which tracks begin, and the mode."""
+    orders: dict[int, np.ndarray] = {}
+    cuts, sizes = [0], [splat_size(p) for p in paths]
+    before = None
+    for t in range(1, len(paths)):
+        related: np.ndarray | bool = False
+        if sizes[t] == sizes[t - 1]:
+            before = read_splat(paths[t - 1]).means if before is None else before
+            after = read_splat(paths[t]).means
+            related = relate(before, after)
+            if related is not False and (t - 1 in orders or related is not True):
+                # `after` is in file order: bring it into the order of the track
+                last = orders.get(t - 1, np.arange(len(after)))
+                orders[t] = last if related is True else related[last]
+            before = after
+        else:
+            before = None
+        if related is False:
+            cuts.append(t)
+        if progress:
+            progress(t, len(paths) - 1)
+    independent = len(paths) > 1 and len(cuts) == len(paths)
+    return orders, cuts, "independent" if independent else "matched" if orders else "tracked"
+
+
+def _stored(path: Path, paths: list[Path], fps: float | None) -> SplatSequence:
+    """The sequence that sequence.json describes."""
+    where = path / "sequence.json"
+    try:
+        data = json.loads(where.read_text())
+        rate = float(fps or data["fps"])
+        spans = [(int(g["start"]), int(g["frames"]), g.get("extra")) for g in data["groups"]]
+        cameras = [_camera(c) for c in data.get("cameras", [])]
+    except (ValueError, KeyError, TypeError) as e:
+        raise CaptureError(f"{where}: not valid ({type(e).__name__}: {e}), expected fps and groups") from e
+    end = 0
+    for i, (start, count, _) in enumerate(spans):
+        if start != end or count < 1 or start + count > len(paths):
+            raise CaptureError(
+                f"{where}: group {i} is {count} frames from {start}, expected to start at {end} "
+                f"and to end within the {len(paths)} splats of the folder"
+            )
+        end = start + count
+    if not spans or rate <= 0:
+        raise CaptureError(f"{where}: {len(spans)} groups at {rate} frames a second, expected at least one group")
+    groups = [_stored_group(path, paths, *span) for span in spans]
+    return SplatSequence(rate, groups, cameras, names=[p.name for p in paths[:end]])
+
+
+def _stored_group(path: Path, paths: list[Path], start: int, count: int, extra: str | None) -> Group:
+    own = paths[start : start + count]
+    if not extra:
+        return Group(Frames(own, {})[:])
+    try:
+        with np.load(path / Path(extra).name) as stored:
+            arrays = {k: stored[k] for k in stored.files}
+    except (OSError, ValueError) as e:
+        raise CaptureError(f"{path / extra}: missing or damaged ({e}), sequence.json refers to it") from e
+    lifetimes, nodes, hidden = arrays.get("lifetimes"), None, {}
+    if "node_positions" in arrays:
+        nodes = Nodes(arrays["node_positions"], arrays["node_rotations"], arrays["node_translations"])
+    if lifetimes is not None:
+        for t in range(count):
+            away = (lifetimes[:, 0] > t) | (t >= lifetimes[:, 1])
+            if away.any():
+                hidden[t] = away, arrays[f"hidden_{t}"]
+    return Group(Frames(own, {}, hidden)[:], lifetimes, nodes)
+
+
+def _camera(c: dict) -> Camera:
+    K, viewmat = (np.array(c[k], np.float64) for k in ("K", "viewmat"))
+    return Camera(str(c["name"]), K, viewmat, int(c["width"]), int(c["height"]), split=str(c.get("split", "train")))

@@ -1,0 +1,91 @@
+"""GaussianSequence -> a folder with one .ply per frame and sequence.json; the mirror of sequence.py.
+
+Other tools see plain 3DGS files; a Gaussian outside its lifetime is there with an opacity that shows nothing, so
+that every frame of a group has the same indices, and its true opacity lies beside the nodes in an .npz. Groups can
+be added one by one: sequence.json is replaced after each, so that what is finished can be used and a stopped run
+can go on.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from gscodec.camera import Camera
+from gscodec.gaussians import GaussianSequence, Group
+from gscodec.splats.part_file import part_file
+from gscodec.splats.ply import write_ply
+
+HIDDEN = -30.0  # logit opacity that no renderer shows
+NAME = "sequence.json"
+
+
+class SequenceWriter:
+    """Adds groups to a folder.
+
+    Attributes:
+        groups: descriptions of the groups that are complete, as in sequence.json; more than none after a resume.
+        frame_count: frames of those groups.
+    """
+
+    def __init__(self, folder: str | Path, fps: float, cameras: Sequence[Camera] = (), *, resume: bool = False):
+        """Starts afresh, or with `resume` goes on after the groups that sequence.json lists."""
+        self._folder = Path(folder)
+        self._folder.mkdir(parents=True, exist_ok=True)
+        listed = self._folder / NAME
+        self.groups = json.loads(listed.read_text())["groups"] if resume and listed.is_file() else []
+        self._head = {"fps": fps, "cameras": [_camera(c) for c in cameras]}
+
+    @property
+    def frame_count(self) -> int:
+        return sum(g["frames"] for g in self.groups)
+
+    def add(self, group: Group, progress: Callable[[int], None] | None = None) -> None:
+        """Writes a group; `progress` is called with the number of frames written in all."""
+        start, extra = self.frame_count, {}
+        for t in range(len(group)):
+            g = group.frames[t]
+            if group.lifetimes is not None:
+                away = (group.lifetimes[:, 0] > t) | (t >= group.lifetimes[:, 1])
+                if away.any():
+                    extra[f"hidden_{t}"] = g.logit_opacities[away]
+                    g = replace(g, logit_opacities=np.where(away, np.float32(HIDDEN), g.logit_opacities))
+            write_ply(self._folder / f"{start + t:06d}.ply", g)
+            if progress:
+                progress(start + t + 1)
+        entry = {"start": start, "frames": len(group)}
+        if group.lifetimes is not None:
+            extra["lifetimes"] = group.lifetimes
+        if group.nodes is not None:
+            extra |= {f"node_{k}": v for k, v in vars(group.nodes).items()}
+        if extra:
+            entry["extra"] = f"group_{len(self.groups):04d}.npz"
+            with part_file(self._folder / entry["extra"]) as part, part.open("wb") as f:
+                np.savez(f, **extra)
+        self.groups.append(entry)
+        with part_file(self._folder / NAME) as part:
+            part.write_text(json.dumps(self._head | {"groups": self.groups}, indent=1) + "\n")
+
+
+def write_sequence(
+    sequence: GaussianSequence, folder: str | Path, progress: Callable[[int], None] | None = None
+) -> None:
+    """Writes a whole sequence; `progress` is called with the number of frames written."""
+    writer = SequenceWriter(folder, sequence.fps, sequence.cameras)
+    for group in sequence.groups:
+        writer.add(group, progress)
+
+
+def _camera(c: Camera) -> dict:
+    return {
+        "name": c.name,
+        "width": c.width,
+        "height": c.height,
+        "K": c.K.tolist(),
+        "viewmat": c.viewmat.tolist(),
+        "split": c.split,
+    }

@@ -1,0 +1,497 @@
+"""Splat formats and sequences: what is written comes back, what is damaged is named, what is tracked is found out."""
+
+import json
+import struct
+import threading
+import zipfile
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gscodec.camera import Camera
+from gscodec.errors import CaptureError, UsageError
+from gscodec.gaussians import Gaussians, GaussianSequence, Group, Nodes
+from gscodec.splats import (
+    SequenceWriter,
+    detect_input,
+    open_sequence,
+    read_splat,
+    write_sequence,
+    write_splat,
+)
+from gscodec.splats.codebook import codebook, palette
+from gscodec.splats.files import splat_size
+from gscodec.splats.tracking import match, relate
+
+FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
+
+
+def gaussians(n, k=0, seed=0):
+    rng = np.random.default_rng(seed)
+
+    def normal(*shape):
+        return rng.normal(size=shape).astype(np.float32)
+
+    quats = normal(n, 4)
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    return Gaussians(normal(n, 3), quats, normal(n, 3) - 4, 2 * normal(n), normal(n, 3), 0.3 * normal(n, k, 3))
+
+
+def assert_close(a, b, means=1e-6, log_scales=1e-6, angle=1e-5, opacity=1e-6, sh0=1e-6, shN=1e-6):
+    np.testing.assert_allclose(b.means, a.means, atol=means)
+    np.testing.assert_allclose(b.log_scales, a.log_scales, atol=log_scales)
+    np.testing.assert_allclose(np.abs((a.quats * b.quats).sum(1)), 1, atol=angle)
+    np.testing.assert_allclose(1 / (1 + np.exp(-b.logit_opacities)), 1 / (1 + np.exp(-a.logit_opacities)), atol=opacity)
+    np.testing.assert_allclose(b.sh0, a.sh0, atol=sh0)
+    np.testing.assert_allclose(b.shN, a.shN, atol=shN)
+
+
+# -- .ply
+
+
+@settings(max_examples=25, deadline=None)
+@given(n=st.integers(0, 40), k=st.sampled_from([0, 3, 8, 15]), seed=st.integers(0, 99))
+def test_ply_round_trip_is_exact(tmp_path_factory, n, k, seed):
+    path = tmp_path_factory.mktemp("ply") / "a.ply"
+    g = gaussians(n, k, seed).validate("test")
+    write_splat(path, g)
+    back = read_splat(path)
+    for name in FIELDS:
+        limit = 1e-6 if name == "quats" else 0
+        np.testing.assert_allclose(getattr(back, name), getattr(g, name), rtol=0, atol=limit)
+    assert splat_size(path) == (n, k)
+
+
+def test_ply_is_what_plyfile_reads(tmp_path):
+    plyfile = pytest.importorskip("plyfile")
+    g = gaussians(5, 3)
+    write_splat(tmp_path / "a.ply", g)
+    rows = plyfile.PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+    np.testing.assert_array_equal(rows["f_rest_4"], g.shN[:, 1, 1])  # channel-major: green starts at 3
+    np.testing.assert_array_equal(rows["rot_0"], g.quats[:, 0])
+    np.testing.assert_array_equal(rows["opacity"], g.logit_opacities)
+
+
+COLUMNS = ("unknown", *(f"rot_{i}" for i in range(4)), *(f"scale_{i}" for i in range(3)), "opacity")
+COLUMNS += ("f_dc_0", "f_dc_1", "f_dc_2", "z", "y", "x")
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_big_endian", "binary_little_endian"])
+def test_ply_in_any_order_and_encoding(tmp_path, kind):
+    values = [9, 1, 0, 0, 0, -4, -5, -6, 0.5, 0.1, 0.2, 0.3, 3, 2, 1]
+    lines = ["ply", f"format {kind} 1.0", "comment made by hand", "obj_info x", "element vertex 1"]
+    lines += [f"property {'uchar' if c == 'unknown' else 'double'} {c}" for c in COLUMNS]
+    lines += ["element face 1", "property list uchar int vertex_indices", "end_header", ""]
+    row = " ".join(map(str, values)).encode() + b"\n3 0 0 0\n"
+    if kind != "ascii":
+        row = struct.pack((">" if "big" in kind else "<") + "B14d", *values) + b"\x01\x00\x00\x00\x00"
+    (tmp_path / "a.ply").write_bytes("\n".join(lines).encode() + row)
+    g = read_splat(tmp_path / "a.ply")
+    assert g.means.tolist() == [[1, 2, 3]]
+    assert g.quats.tolist() == [[1, 0, 0, 0]]
+    assert g.log_scales.tolist() == [[-4, -5, -6]]
+    assert g.logit_opacities.tolist() == [0.5]
+    np.testing.assert_allclose(g.sh0, [[0.1, 0.2, 0.3]], rtol=1e-6)
+    assert g.sh_degree == 0
+
+
+HEADER = "ply\nformat {} 1.0\nelement vertex {}\n{}end_header\n"
+PROPERTIES = "".join(f"property float {c}\n" for c in COLUMNS)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("plyx", "not a PLY file"),
+        ("ply\nformat ascii 1.0\n", "up to 'end_header'"),
+        (HEADER.format("ascii", "many", ""), "header line 3 is not valid PLY: 'element vertex many'"),
+        (HEADER.format("ascii", 1, "property wide x\n"), "header line 4 is not valid PLY"),
+        (HEADER.format("middle_endian", 1, ""), "header line 2 is not valid PLY"),
+        ("ply\nelement vertex 0\nend_header\n", "the header names no known format"),
+        (HEADER.format("ascii", -2, "property float x\n"), "element vertex has a count of -2"),
+        (HEADER.format("ascii", 1, "property float x\n" * 2), "has a property twice"),
+        (HEADER.format("ascii", 1, "property float x\n") + "1\n", "no property y, z, f_dc_0, .* not a mesh"),
+        (HEADER.format("ascii", 2, PROPERTIES) + "1 " * 20, "truncated, 1 of 2 rows of element vertex"),
+        (HEADER.format("ascii", 1, PROPERTIES) + "x " * 15, "has a value that is not a number"),
+        (HEADER.format("binary_little_endian", 9, PROPERTIES) + "1" * 150, "truncated, 2 of 9 rows"),
+        (HEADER.format("binary_little_endian", 10**15, PROPERTIES), "truncated, 0 of 1000000000000000 rows"),
+        (HEADER.format("ascii", 1, PROPERTIES + "property float f_rest_0\n") + "1 " * 16, "1 f_rest properties"),
+        (HEADER.format("ascii", 1, PROPERTIES) + "nan " * 15, "means of Gaussian 0 is not finite"),
+    ],
+)
+def test_bad_ply(tmp_path, content, message):
+    (tmp_path / "a.ply").write_bytes(content.encode())
+    with pytest.raises(CaptureError, match=message):
+        read_splat(tmp_path / "a.ply")
+
+
+def test_a_failed_write_leaves_nothing(tmp_path):
+    g = gaussians(3)
+    with pytest.raises(ValueError, match="dimension"):
+        write_splat(tmp_path / "a.ply", Gaussians(g.means, g.quats[:2], g.log_scales, g.logit_opacities, g.sh0, g.shN))
+    with pytest.raises(UsageError, match=r"cannot tell the format from the name"):
+        write_splat(tmp_path / "a.obj", g)
+    assert not list(tmp_path.iterdir())
+
+
+def test_unknown_and_missing_files(tmp_path):
+    with pytest.raises(CaptureError, match="no such file, expected a splat"):
+        read_splat(tmp_path / "a.ply")
+    (tmp_path / "a.splat").touch()
+    with pytest.raises(CaptureError, match="not a known splat format"):
+        read_splat(tmp_path / "a.splat")
+
+
+# -- .compressed.ply
+
+
+@pytest.mark.parametrize("k", [0, 15])
+def test_compressed_ply_round_trip(tmp_path, k):
+    g = gaussians(700, k)
+    path = tmp_path / "a.compressed.ply"
+    write_splat(path, g)
+    assert splat_size(path) == (700, k)
+    back = read_splat(path)
+    step = 1 / 1023  # of a chunk's range, which is below 8 here
+    assert_close(g, back, 8 * step, 8 * step, 2e-5, 0.5 / 255 + 1e-6, 8 / 255 / 2 + 1e-3, 8 / 256)
+    write_splat(tmp_path / "b.compressed.ply", back)
+    assert_close(back, read_splat(tmp_path / "b.compressed.ply"), 1e-5, 1e-5, 1e-6, 1e-6, 1e-5, 1e-5)
+
+
+def compressed(path, chunks=1, rows=1, sh=None, drop=""):
+    """A .compressed.ply of one Gaussian built word by word from the format's description."""
+    names = [f"{m}_{a}" for m in ("min", "max") for a in ("x", "y", "z")]
+    names += [f"{m}_scale_{a}" for m in ("min", "max") for a in "xyz"]
+    header = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
+    header += [f"property float {n}" for n in names if n != drop] + [f"element vertex {rows}"]
+    header += [f"property uint packed_{w}" for w in ("position", "rotation", "scale", "color")]
+    if sh is not None:
+        header += [f"element sh {sh}", *(f"property uchar f_rest_{i}" for i in range(9))]
+    bounds = [0, 0, 0, 1, 2, 4, -8, -8, -8, 0, 0, 0][: 12 - bool(drop)]
+    data = struct.pack(f"<{len(bounds)}f", *bounds) * chunks
+    words = (2047 << 21 | 0 << 11 | 2047, 2 << 30 | 1023 << 20 | 512 << 10 | 512, 1 << 31, 255 << 24 | 128)
+    data += struct.pack("<4I", *words) * rows + bytes(range(9)) * (sh or 0)
+    path.write_bytes("\n".join([*header, "end_header", ""]).encode() + data)
+    return path
+
+
+def test_compressed_ply_bits(tmp_path):
+    g = read_splat(compressed(tmp_path / "a.ply", sh=1))  # found by content, whatever the name
+    assert g.means.tolist() == [[1, 0, 4]]
+    np.testing.assert_allclose(g.log_scales, [[-8 + 8 * 1024 / 2047, -8, -8]], rtol=1e-6)
+    np.testing.assert_allclose(g.quats, [[0.7071, 0, 0.7071, 0]], atol=2e-3)  # index 2 is y, wxyz
+    np.testing.assert_allclose(g.sh0 * 0.28209479 + 0.5, [[1, 0, 0]], atol=1e-6)
+    assert g.logit_opacities[0] == pytest.approx(np.log(128 / 127), rel=1e-5)
+    assert g.shN[0, 0].tolist() == [-4, 8 * (3.5 / 256 - 0.5), 8 * (6.5 / 256 - 0.5)]
+
+
+@pytest.mark.parametrize(
+    ("harm", "message"),
+    [
+        ({"chunks": 2}, "2 chunks for 1 Gaussians, expected 1 of 256"),
+        ({"sh": 3}, "3 rows of SH for 1 Gaussians"),
+        ({"drop": "max_x"}, "no property max_x, expected a SuperSplat compressed PLY"),
+    ],
+)
+def test_bad_compressed_ply(tmp_path, harm, message):
+    with pytest.raises(CaptureError, match=message):
+        read_splat(compressed(tmp_path / "a.ply", **harm))
+
+
+@pytest.mark.parametrize("name", ["a.compressed.ply", "a.sog"])
+def test_formats_that_cannot_be_empty(tmp_path, name):
+    with pytest.raises(CaptureError, match=r"no Gaussians to write; use .ply"):
+        write_splat(tmp_path / name, gaussians(0))
+
+
+# -- SOG
+
+
+@pytest.mark.parametrize(("name", "k"), [("a.sog", 0), ("a.sog", 8), ("folder/meta.json", 3)])
+def test_sog_round_trip(tmp_path, name, k):
+    g = gaussians(300, k)
+    write_splat(tmp_path / name, g)
+    path = tmp_path / name if name.endswith(".sog") else tmp_path / "folder"
+    assert splat_size(path) == (300, k)
+    back = read_splat(path)
+    assert_close(g, back, 4e-4, 0.5, 2e-4, 1 / 255, 0.5, 0.3)
+    assert np.abs(back.log_scales - g.log_scales).mean() < 0.02
+    assert np.abs(back.shN - g.shN).mean() < 0.01 if k else True
+    write_splat(tmp_path / "b.sog", back)
+    assert_close(back, read_splat(tmp_path / "b.sog"), 1e-5, 1e-6, 1e-4)
+
+
+@pytest.fixture
+def sog(tmp_path):
+    """An unpacked SOG and a function that changes its meta.json."""
+    write_splat(tmp_path / "meta.json", gaussians(20, 3))
+    meta = json.loads((tmp_path / "meta.json").read_text())
+
+    def save(**change):
+        (tmp_path / "meta.json").write_text(json.dumps(meta | change))
+        return tmp_path
+
+    return meta, save
+
+
+def test_sog_quaternion_tag_is_in_alpha(sog):
+    folder = sog[1]()
+    _, bgr = 0, np.full((4, 5, 4), 128, np.uint8)
+    bgr[..., 3] = 254  # y is the largest
+    cv2.imwrite(str(folder / "quats.webp"), bgr, [cv2.IMWRITE_WEBP_QUALITY, 101])
+    np.testing.assert_allclose(read_splat(folder).quats, [[0, 0, 1, 0]] * 20, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": 3}, "SOG version 3, only 2 is read"),
+        ({"version": None}, "SOG version None"),
+        ({"count": 999}, r"not valid SOG version 2 \(ValueError: map .* has 25 pixels for 999|has \d+ pixels for 999"),
+        ({"scales": {}}, "not valid SOG version 2 .KeyError: 'files'"),
+        ({"sh0": {"files": ["none.webp"], "codebook": [0]}}, "map none.webp is missing"),
+        ({"sh0": {"files": ["meta.json"], "codebook": [0]}}, "map meta.json is not a readable 8-bit colour image"),
+        ({"sh0": {"files": ["sh0.webp"], "codebook": [0]}}, "not valid SOG version 2 .IndexError"),
+    ],
+)
+def test_bad_sog(sog, change, message):
+    with pytest.raises(CaptureError, match=message):
+        read_splat(sog[1](**change))
+
+
+def test_bad_sog_palette(sog):
+    meta, save = sog
+    with pytest.raises(CaptureError, match="SH palette is 192 pixels wide, expected 512"):
+        read_splat(save(shN=meta["shN"] | {"bands": 2}))
+    with pytest.raises(CaptureError, match="SH label 19 for a palette of 3"):
+        read_splat(save(shN=meta["shN"] | {"count": 3}))
+
+
+def test_bad_sog_bundles(tmp_path):
+    (tmp_path / "a.sog").write_bytes(b"PK nothing")
+    with pytest.raises(CaptureError, match=r"not a readable .sog"):
+        read_splat(tmp_path / "a.sog")
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as z:
+        z.writestr("a.txt", "")
+    with pytest.raises(CaptureError, match=r"no readable meta.json"):
+        read_splat(tmp_path / "a.sog")
+
+
+def test_codebook_of_few_values_is_exact():
+    values = np.array([[1.0, 2], [5, 1]], np.float32)
+    levels, index = codebook(values)
+    assert len(levels) == 256
+    np.testing.assert_array_equal(np.array(levels, np.float32)[index], values)
+
+
+def test_codebook_beats_even_steps():
+    values = np.random.default_rng(0).normal(size=20000) ** 3
+    levels, index = codebook(values)
+    even = np.ptp(values) / 255 / np.sqrt(12)
+    assert np.sqrt(np.mean((np.array(levels)[index] - values) ** 2)) < even / 2
+
+
+def test_palette_cuts_where_there_are_too_many():
+    vectors = np.random.default_rng(0).normal(size=(1000, 9)).astype(np.float32)
+    entries, label = palette(vectors, 256)
+    assert len(entries) == 256
+    assert np.mean((entries[label] - vectors) ** 2) < 0.6 * vectors.var()
+
+
+# -- sequences
+
+
+def moved(g, t):
+    """Turned about z by 0.02 rad a frame, as a body moves."""
+    c, s = np.cos(0.02 * t), np.sin(0.02 * t)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return Gaussians(g.means @ turn.T, *(getattr(g, f) for f in FIELDS[1:]))
+
+
+def save_frames(folder, frames):
+    folder.mkdir(exist_ok=True)
+    for t, g in enumerate(frames):
+        write_splat(folder / f"f{t}.ply", g)
+    return folder
+
+
+def test_tracked_folder(tmp_path):
+    g = gaussians(500)
+    s = open_sequence(save_frames(tmp_path / "s", [moved(g, t) for t in range(12)]), gop=5, fps=24)
+    assert (s.mode, s.fps, [len(x) for x in s.groups]) == ("tracked", 24, [5, 5, 2])
+    assert s.names[10] == "f10.ply"  # natural order: f2 before f10
+    np.testing.assert_allclose(s.frame(11).means, moved(g, 11).means, atol=1e-6)
+
+
+def test_shuffled_folder_is_matched(tmp_path):
+    g, rng = gaussians(500), np.random.default_rng(1)
+    frames = [moved(g, 0.2 * t) for t in range(4)]
+    frames = [frames[0]] + [f.take(rng.permutation(500)) for f in frames[1:3]] + [frames[3]]
+    s = open_sequence(save_frames(tmp_path / "s", frames))
+    assert (s.mode, len(s.groups)) == ("matched", 1)
+    for t in range(4):
+        np.testing.assert_allclose(s.frame(t).means, moved(g, 0.2 * t).means, atol=1e-5)
+        np.testing.assert_allclose(s.frame(t).sh0, g.sh0, atol=1e-6)
+
+
+def test_locally_swapped_indices_are_not_called_tracked():
+    """Each frame sorted along a curve: index i stays near, but a third of the Gaussians swap with neighbours."""
+    a = gaussians(2000).means
+    b = a + np.float32(0.001)
+    swap = np.arange(2000)
+    by_x = np.argsort(a[:, 0])
+    pairs = by_x[: 2 * 330].reshape(-1, 2)
+    swap[pairs[:, 0]], swap[pairs[:, 1]] = pairs[:, 1].copy(), pairs[:, 0].copy()
+    order = relate(a, b[swap])
+    assert order is not True
+    np.testing.assert_allclose(b[swap][order], b, atol=1e-7)
+
+
+def test_jitter_is_still_tracked():
+    a = gaussians(2000).means
+    noise = np.random.default_rng(2).normal(size=a.shape) * 0.02
+    assert relate(a, a + noise.astype(np.float32)) is True
+
+
+def test_unrelated_frames_are_independent(tmp_path):
+    frames = [gaussians(200, seed=1), gaussians(200, seed=2), gaussians(150, seed=3)]
+    s = open_sequence(save_frames(tmp_path / "s", frames))
+    assert (s.mode, [len(g) for g in s.groups]) == ("independent", [1, 1, 1])
+
+
+def test_a_cut_starts_a_group(tmp_path):
+    a, b = gaussians(200, seed=1), gaussians(220, seed=2)
+    s = open_sequence(save_frames(tmp_path / "s", [a, moved(a, 1), b, moved(b, 1), moved(b, 2)]))
+    assert (s.mode, [len(g) for g in s.groups]) == ("tracked", [2, 3])
+    assert (len(s.frame(1)), len(s.frame(2))) == (200, 220)
+
+
+def test_match_leaves_the_rest_to_an_assignment():
+    a = np.random.default_rng(0).uniform(size=(300, 3))
+    b = a.copy()
+    b[7], b[9] = a[9] + 0.3, a[9] + 0.4  # neither is anybody's nearest
+    order = match(a, b)
+    assert sorted(order) == list(range(300))
+    assert match(a, b + 5) is None
+
+
+def test_single_files_and_tiny_frames(tmp_path):
+    write_splat(tmp_path / "a.ply", gaussians(3))
+    write_splat(tmp_path / "b.ply", gaussians(3))
+    assert open_sequence(tmp_path / "a.ply").frame_count == 1
+    assert open_sequence(tmp_path).mode == "tracked"
+    write_splat(tmp_path / "b.ply", gaussians(3, seed=4))
+    assert open_sequence(tmp_path).mode == "independent"
+
+
+def stored_sequence():
+    g = gaussians(50, 3)
+    lifetimes = np.stack([np.zeros(50), np.full(50, 4)], 1).astype(np.int32)
+    lifetimes[:5] = (1, 3)
+    nodes = Nodes(*(np.random.default_rng(0).normal(size=s).astype(np.float32) for s in ((6, 3), (4, 6, 3), (4, 6, 3))))
+    camera = Camera("a", np.diag([9.0, 9, 1]), np.eye(4), 32, 24, split="test")
+    groups = [Group([moved(g, t) for t in range(4)], lifetimes, nodes), Group([gaussians(40, 3, 9)])]
+    return GaussianSequence(25, groups, [camera])
+
+
+def test_sequence_round_trip(tmp_path):
+    source = stored_sequence()
+    seen = []
+    write_sequence(source, tmp_path / "s", seen.append)
+    assert seen == [1, 2, 3, 4, 5]
+    s = open_sequence(tmp_path / "s")
+    assert (s.mode, s.fps, s.frame_count, s.cameras[0].split) == ("stored", 25, 5, "test")
+    for ours, theirs in zip(s.groups, source.groups, strict=True):
+        for a, b in zip(ours.frames, theirs.frames, strict=True):
+            for name in FIELDS:
+                np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-6)
+    np.testing.assert_array_equal(s.groups[0].lifetimes, source.groups[0].lifetimes)
+    np.testing.assert_array_equal(s.groups[0].nodes.rotations, source.groups[0].nodes.rotations)
+    assert (len(s.frame(0)), len(s.frame(1))) == (45, 50)
+    assert (read_splat(tmp_path / "s/000000.ply").logit_opacities[:5] == -30).all()  # hidden from other tools
+
+
+def test_writer_goes_on_after_a_stop(tmp_path):
+    groups = stored_sequence().groups
+    SequenceWriter(tmp_path, 25).add(groups[0])
+    assert open_sequence(tmp_path).frame_count == 4
+    writer = SequenceWriter(tmp_path, 25, resume=True)
+    assert (writer.frame_count, len(writer.groups)) == (4, 1)
+    writer.add(groups[1])
+    assert open_sequence(tmp_path).frame_count == 5
+
+
+def test_frames_are_lazy_and_thread_safe(tmp_path):
+    g = gaussians(100)
+    s = open_sequence(save_frames(tmp_path / "s", [moved(g, t) for t in range(8)]))
+    wrong = []
+
+    def check():
+        for t in range(8):
+            if not np.allclose(s.groups[0].frames[t].means, moved(g, t).means, atol=1e-6):
+                wrong.append(t)
+
+    threads = [threading.Thread(target=check) for _ in range(3)]
+    for t in threads:
+        t.start()
+    for t in threads:
+        t.join()
+    assert not wrong
+    (tmp_path / "s/f7.ply").unlink()
+    assert len(s.groups[0].frames[2:][1]) == 100
+    with pytest.raises(IndexError):
+        s.groups[0].frames[8]
+
+
+def edit(folder, change):
+    data = json.loads((folder / "sequence.json").read_text())
+    change(data)
+    (folder / "sequence.json").write_text(json.dumps(data))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.pop("fps"), "not valid .KeyError: 'fps'"),
+        (lambda d: d.update(fps=-1), "at -1.0 frames a second"),
+        (lambda d: d.update(groups=[]), "0 groups at"),
+        (lambda d: d["groups"][1].update(start=3), "group 1 is 1 frames from 3, expected to start at 4"),
+        (lambda d: d["groups"][1].update(frames=9), "group 1 is 9 frames from 4, .* within the 5 splats"),
+        (lambda d: d["groups"][0].update(extra="none.npz"), "none.npz: missing or damaged"),
+    ],
+)
+def test_bad_sequence_json(tmp_path, change, message):
+    write_sequence(stored_sequence(), tmp_path)
+    edit(tmp_path, change)
+    with pytest.raises(CaptureError, match=message):
+        open_sequence(tmp_path)
+
+
+def test_lifetimes_that_do_not_fit(tmp_path):
+    write_sequence(stored_sequence(), tmp_path)
+    write_splat(tmp_path / "000000.ply", gaussians(20, 3))
+    with pytest.raises(CaptureError, match=r"000000.ply: 20 Gaussians, sequence.json has lifetimes of 50"):
+        open_sequence(tmp_path).frame(0)
+
+
+def test_sequence_arguments(tmp_path):
+    with pytest.raises(CaptureError, match="no splats, expected one file per frame"):
+        open_sequence(tmp_path)
+    with pytest.raises(UsageError, match="gop 0 and fps None must be positive"):
+        open_sequence(tmp_path, gop=0)
+
+
+def test_detect_input(tmp_path):
+    with pytest.raises(
+        CaptureError, match=r"neither a capture nor splats; looked for transforms.json.*Qualisys.*splats"
+    ):
+        detect_input(tmp_path)
+    with pytest.raises(CaptureError, match="no such file or folder"):
+        detect_input(tmp_path / "gone")
+    write_splat(tmp_path / "a.ply", gaussians(2))
+    assert detect_input(tmp_path) == detect_input(tmp_path / "a.ply") == "splats"
+    (tmp_path / "transforms.json").write_text("{}")
+    assert detect_input(tmp_path) == "capture"  # an initial point cloud may lie beside it
