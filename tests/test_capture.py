@@ -4,6 +4,7 @@ import json
 import sys
 import threading
 import warnings
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -466,3 +467,17 @@ def test_nothing_warns_on_a_sound_capture(rig):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         rig[2]()
+
+
+# -- the bundled example
+
+
+def test_bundled_example():
+    capture = open_capture(Path(__file__).parent.parent / "examples" / "lumberjack")
+    assert (capture.frame_count, capture.fps, capture.has_alpha) == (20, 30, True)
+    assert (len(capture.indices("train")), len(capture.indices("test"))) == (12, 2)
+    view = capture.view(13, 19)
+    assert view.rgb.shape == (256, 256, 3)
+    assert 0.15 < (view.alpha > 0).mean() < 0.35
+    feet, head = (capture.cameras[0].viewmat @ (0, 0, z, 1) for z in (0, 1.8))
+    assert feet[1] > head[1]  # z is up in the world, y is down in the image
