@@ -41,7 +41,8 @@ impl Level {
         let (mut low, mut frac, mut inside) = ([0u32; 3], [0.0; 3], [true; 3]);
         for d in 0..3 {
             inside[d] = (0.0..=1.0).contains(&point[d]);
-            let x = point[d].max(0.0).min(1.0) * self.cells as f32; // NaN becomes 0
+            let x = if inside[d] { point[d] } else { f32::from(point[d] > 0.5) }; // NaN becomes 0
+            let x = x * self.cells as f32;
             low[d] = (x as u32).min(self.cells - 1);
             frac[d] = x - low[d] as f32;
         }
