@@ -250,6 +250,51 @@ fn image_loss<'py>(
     ))
 }
 
+/// Instant-NGP grid: `cells` on a side of each level, `table` entries at most a level.
+#[pyclass(frozen)]
+struct HashGrid {
+    inner: raster::HashGrid,
+}
+
+#[pymethods]
+impl HashGrid {
+    #[new]
+    fn new(features: usize, cells: Vec<u32>, table: usize) -> PyResult<Self> {
+        Ok(HashGrid {
+            inner: raster::HashGrid::new(features, &cells, table).map_err(usage)?,
+        })
+    }
+
+    #[getter]
+    fn entries(&self) -> usize {
+        self.inner.entries()
+    }
+
+    /// points [N, 3], table [entries, F] -> out [N, L * F], written in place.
+    fn forward(&self, py: Python, points: In, table: In, mut out: InOut) -> PyResult<()> {
+        let (points, table) = (contiguous(points.as_slice())?, contiguous(table.as_slice())?);
+        let out = contiguous(out.as_slice_mut())?;
+        py.detach(|| self.inner.forward(points, table, out)).map_err(usage)
+    }
+
+    /// Adds to grad_table and overwrites grad_points.
+    fn backward(
+        &self,
+        py: Python,
+        points: In,
+        table: In,
+        grad_out: In,
+        mut grad_table: InOut,
+        mut grad_points: Option<InOut>,
+    ) -> PyResult<()> {
+        let (points, table) = (contiguous(points.as_slice())?, contiguous(table.as_slice())?);
+        let (grad_out, grad_table) = (contiguous(grad_out.as_slice())?, contiguous(grad_table.as_slice_mut())?);
+        let grad_points = grad_points.as_mut().map(|g| contiguous(g.as_slice_mut())).transpose()?;
+        py.detach(|| self.inner.backward(points, table, grad_out, grad_table, grad_points))
+            .map_err(usage)
+    }
+}
+
 /// Names of the instruction sets that this machine can use, fastest first.
 #[pyfunction]
 fn simd_levels() -> Vec<&'static str> {
@@ -258,6 +303,7 @@ fn simd_levels() -> Vec<&'static str> {
 
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<Rasterizer>()?;
+    m.add_class::<HashGrid>()?;
     m.add_function(wrap_pyfunction!(image_loss, m)?)?;
     m.add_function(wrap_pyfunction!(simd_levels, m)?)
 }

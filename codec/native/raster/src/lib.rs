@@ -11,6 +11,7 @@ mod bin;
 pub mod constants;
 mod divide;
 mod forward;
+mod hashgrid;
 mod loss;
 mod project;
 mod project_backward;
@@ -22,6 +23,7 @@ mod sort;
 mod step;
 mod tile;
 
+pub use hashgrid::HashGrid;
 pub use loss::{ImageLoss, LossValue, Pair};
 pub use project::Projected;
 pub use rasterizer::{Rasterizer, Shade, Timings};
