@@ -55,7 +55,15 @@ def _encode_splats(source, out, settings, frames, gop, bar) -> EncodeReport:
     total = sequence.frame_count
     cameras = sequence.cameras
     first = sequence.frame(0)
-    config = stream_config(fps=sequence.fps, sh_degree=first.sh_degree, cameras=cameras, up="-y")
+    longest = max(len(g) for g in sequence.groups)
+    config = stream_config(
+        fps=sequence.fps,
+        sh_degree=first.sh_degree,
+        gaussians=len(first),
+        frames=longest,
+        cameras=cameras,
+        up=up_axis(cameras) if cameras else "-y",  # what 3DGS trainers leave when nothing is known
+    )
     return encode_groups(
         lambda done: (sequence.groups[i] for i in range(done, len(sequence.groups))),
         out,
@@ -106,7 +114,12 @@ def _encode_capture(source, out, settings, preset, frames, gop, device, bar) -> 
     work = out.with_name(out.name + ".work")
     _check_device(device)
     config = stream_config(
-        fps=capture.fps, sh_degree=0, cameras=capture.cameras, up=up_axis(capture.cameras), background=(0.5,) * 3
+        fps=capture.fps,
+        sh_degree=0,
+        gaussians=recipe.gaussians_max,
+        frames=gop,
+        cameras=capture.cameras,
+        up=up_axis(capture.cameras),
     )
     report = encode_groups(
         lambda done: train_groups(

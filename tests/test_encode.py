@@ -22,7 +22,7 @@ from gscodec.gaussians import Gaussians, Group
 
 
 def write(sequence, out, quality=50.0, **settings):
-    config = stream_config(fps=sequence.fps, sh_degree=sequence.frame(0).sh_degree)
+    config = stream_config(fps=sequence.fps, sh_degree=sequence.frame(0).sh_degree, gaussians=400, frames=8)
     return encode_groups(
         lambda done: iter(sequence.groups[done:]),
         out,
@@ -151,7 +151,7 @@ def test_frames_in_any_order_are_the_same(tmp_path):
 def test_ctrl_c_leaves_a_playable_file_and_a_second_run_goes_on(tmp_path):
     sequence = turning(60, frames=3)
     groups = [sequence.groups[0]] * 4
-    config = stream_config(fps=25, sh_degree=0)
+    config = stream_config(fps=25, sh_degree=0, gaussians=100, frames=6)
     out = tmp_path / "a.gsv"
 
     def interrupted(done):
@@ -179,7 +179,7 @@ def test_ctrl_c_leaves_a_playable_file_and_a_second_run_goes_on(tmp_path):
 
 
 def test_other_settings_do_not_resume(tmp_path):
-    config = stream_config(fps=25, sh_degree=0)
+    config = stream_config(fps=25, sh_degree=0, gaussians=100, frames=6)
     payload, _ = _native.encode_group(group_integers(Group([blob(5)]), 50))
     for fingerprint, found in (({"q": 1}, 0), ({"q": 1}, 1), ({"q": 2}, 0)):
         writer = StreamWriter(tmp_path / "a.gsv", config, fingerprint)
@@ -192,7 +192,7 @@ def test_other_settings_do_not_resume(tmp_path):
 def test_a_part_cut_anywhere_keeps_its_whole_groups(tmp_path):
     sequence = turning(20, frames=2)
     out = tmp_path / "a.gsv"
-    config = stream_config(fps=25, sh_degree=0)
+    config = stream_config(fps=25, sh_degree=0, gaussians=100, frames=6)
     payload, _ = _native.encode_group(group_integers(sequence.groups[0], 50))
     writer = StreamWriter(out, config, {})
     ends = [writer.bytes]

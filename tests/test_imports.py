@@ -12,7 +12,7 @@ BASE = {"errors", "gaussians", "camera", "frames", "_native"}
 ALLOWED = {
     "bitstream": BASE,
     "capture": BASE,
-    "splats": BASE,
+    "splats": BASE | {"capture"},
     "render": BASE | {"bitstream", "decode", "progress"},
     "metrics": BASE | {"render", "capture", "splats"},
     "decode": BASE | {"bitstream", "render"},

@@ -29,7 +29,7 @@ def player(tmp_path_factory):
     encode_groups(
         lambda done: iter(sequence.groups),
         path / "a.gsv",
-        stream_config(fps=25, sh_degree=0),
+        stream_config(fps=25, sh_degree=0, gaussians=100, frames=6),
         EncodeSettings(),
         fingerprint={},
     )

@@ -25,7 +25,6 @@ class Steps:
     sh0: float
     shN: float
     motion: float  # residual trajectories of means, world units
-    node_rotation: float  # radians
     node_translation: float  # world units
 
 
@@ -41,7 +40,6 @@ def steps_for(quality: float, radius: float) -> Steps:
         sh0=0.2 * f,
         shN=0.2 * f,
         motion=means,
-        node_rotation=0.01 * f,
         node_translation=means,
     )
 

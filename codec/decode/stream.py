@@ -115,7 +115,12 @@ class _Groups(Sequence):
         return len(self.stream.groups)
 
     def __getitem__(self, i: int) -> Group:
-        return Group(_Frames(self.stream, i), self.stream.group(i).lifetimes())
+        group = self.stream.group(i)
+        if group.visible(0) is None:
+            return Group(_Frames(self.stream, i))
+        shown = np.stack([group.visible(t) for t in range(group.frames)])  # [T, N], one run of frames each
+        start = shown.argmax(0)
+        return Group(_Frames(self.stream, i), np.stack([start, start + shown.sum(0)], 1).astype(np.int32))
 
 
 class _Frames(Sequence):

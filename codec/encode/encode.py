@@ -17,7 +17,7 @@ from gscodec import _native
 from gscodec.camera import Camera
 from gscodec.encode.group import group_integers
 from gscodec.encode.writer import StreamWriter
-from gscodec.errors import UsageError
+from gscodec.errors import LimitError, UsageError
 from gscodec.gaussians import Group
 
 
@@ -60,13 +60,42 @@ class EncodeReport:
         }
 
 
+def smallest_level(gaussians: int, frames: int) -> int:
+    """The lowest level (spec 5) whose caps hold groups of that size.
+
+    Raises:
+        LimitError: none does.
+    """
+    levels = _native.levels()
+    for level in levels:
+        if gaussians <= level["gaussians"] and frames <= level["frames"]:
+            return level["level"]
+    top = levels[-1]
+    if frames > top["frames"]:
+        raise LimitError(
+            f"groups of {frames} frames are too long, the highest level allows {top['frames']}: lower --gop"
+        )
+    return top["level"]
+
+
 def stream_config(
-    *, fps: float, sh_degree: int, cameras: list[Camera] = (), up: str = "y", background=(0.5,) * 3
+    *,
+    fps: float,
+    sh_degree: int,
+    gaussians: int,
+    frames: int,
+    cameras: list[Camera] = (),
+    up: str = "y",
+    background=(0.5,) * 3,
 ) -> dict:
-    """The config box: what a player must know before the first group."""
+    """The config box: what a player must know before the first group.
+
+    Args:
+        gaussians, frames: about how many a group has; the level is the smallest with room for twice as many Gaussians.
+    """
     return {
         "fps": fps,
-        "level": _native.LEVEL_MAX,
+        "level": smallest_level(2 * gaussians, frames),
         "metres_per_unit": 1.0,
         "up": up,
         "color_space": "srgb",

@@ -204,7 +204,7 @@ def group_integers(group: Group, quality: float, *, keep_all: bool = False, step
         out["nodes"] = {
             "positions": motion.positions,
             "coefficients": motion.coefficients,
-            "rotation_step": steps.node_rotation,
+            "rotation_step": motion.rotation_step,
             "translation_step": steps.node_translation,
             "neighbors": min(4, len(motion.positions)),
         }

@@ -29,12 +29,14 @@ class NodeMotion:
     Attributes:
         positions: [M, 3] u32 on the grid, Morton order.
         coefficients: [K, 6, M] i32, rotation vector then translation.
+        rotation_step: radians.
         carried: [T, N, 3] f64, means after blending.
         turned: [T, N, 4] f64, blended rotation of each Gaussian, wxyz.
     """
 
     positions: np.ndarray
     coefficients: np.ndarray
+    rotation_step: float
     carried: np.ndarray
     turned: np.ndarray
 
@@ -141,6 +143,9 @@ def fit_nodes(grid_positions: np.ndarray, x: np.ndarray, means: np.ndarray, coun
     nodes = to_world(node_grid)
     blend = Blend(grid_positions, node_grid)
     frames, m = len(means), len(nodes)
+    # An error of one rotation step at the usual distance from a node moves a Gaussian by one translation step.
+    lever = np.sqrt(((x - nodes[blend.index[:, 0]]) ** 2).sum(1).mean())
+    rotation_step = float(np.float32(min(steps.node_translation / max(lever, 1e-12), 0.1)))
     ridge = identity(m, format="csc").multiply(RIDGE * blend.mass).tocsc()
     solve = splu((blend.transposed @ blend.matrix).tocsc() + ridge).solve
     rotations, translations = np.zeros((2, frames, m, 3))
@@ -149,8 +154,8 @@ def fit_nodes(grid_positions: np.ndarray, x: np.ndarray, means: np.ndarray, coun
         rotations[t], translations[t] = _fit_frame(blend, x, nodes, means[t], near)
         near = rotations[t]
     basis = dct_basis(frames)
-    q_rotations = quantize_trajectory(rotations.reshape(frames, -1), basis, steps.node_rotation).reshape(-1, m, 3)
-    rotations = np.einsum("kt,kmc->tmc", basis, q_rotations * steps.node_rotation)
+    q_rotations = quantize_trajectory(rotations.reshape(frames, -1), basis, rotation_step).reshape(-1, m, 3)
+    rotations = np.einsum("kt,kmc->tmc", basis, q_rotations * rotation_step)
     carried = np.empty_like(means)
     for t in range(frames):  # translations make up for the quantized rotations
         carried[t] = blend.rotate(x, nodes, rotvec_to_matrix(rotations[t]))
@@ -164,7 +169,7 @@ def fit_nodes(grid_positions: np.ndarray, x: np.ndarray, means: np.ndarray, coun
         carried[t] += blend.matrix @ translations[t]
         turned[t] = blend.turn(rotvec_to_quat(rotations[t]))
     coefficients = np.concatenate([q_rotations, q_translations], 2).transpose(0, 2, 1)  # [K, 6, M]
-    return NodeMotion(node_grid, trim(coefficients), carried, turned)
+    return NodeMotion(node_grid, trim(coefficients), rotation_step, carried, turned)
 
 
 def quantize_trajectory(values: np.ndarray, basis: np.ndarray, step: float, dead_zone: float = 0.5) -> np.ndarray:

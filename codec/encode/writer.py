@@ -14,6 +14,7 @@ import shutil
 from pathlib import Path
 
 from gscodec import _native
+from gscodec.errors import BitstreamError
 
 
 class StreamWriter:
@@ -47,12 +48,12 @@ class StreamWriter:
                 if data[: len(self.init)] != self.init:
                     return False
                 index = _native.demux(data)
-        except (OSError, ValueError):
+        except (OSError, ValueError, BitstreamError):
             return False
         end = len(self.init)
-        for g in index["groups"]:
-            self.fragments.append((g["fragment_size"], g["frames"], g["sync"]))
-            end += g["fragment_size"]
+        for g in index["groups"]:  # a fragment of ours ends with its payload
+            start, end = end, g["offset"] + g["size"]
+            self.fragments.append((end - start, g["frames"], g["sync"]))
         os.truncate(self.part, end)  # a fragment cut short by kill -9
         return True
 

@@ -17,8 +17,8 @@ from gscodec.train.model import Model
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views
 
-RATES = {"quats": 2e-3, "log_scales": 5e-3, "logit_opacities": 3e-2, "sh0": 5e-3, "shN": 2.5e-4}
-MEANS_RATE = (4e-4, 4e-6)  # start, end, times the radius of the subject
+RATES = {"quats": 2e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 5e-3, "shN": 2.5e-4}
+MEANS_RATE = (1.6e-3, 1.6e-5)  # start, end, times the radius of the subject
 DENSIFY_EVERY = 100
 DENSIFY_FROM, DENSIFY_UNTIL = 0.1, 0.6  # of the steps
 GROWTH = 0.12  # share of the Gaussians that one round may add
