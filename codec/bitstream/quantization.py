@@ -24,7 +24,6 @@ class Steps:
     logit_opacities: float
     sh0: float
     shN: float
-    motion: float  # residual trajectories of means, world units
     node_translation: float  # world units
 
 
@@ -39,9 +38,17 @@ def steps_for(quality: float, radius: float) -> Steps:
         logit_opacities=1.0 * f,
         sh0=0.2 * f,
         shN=0.2 * f,
-        motion=means,
         node_translation=means,
     )
+
+
+def trajectory_step(step: float, frames: int) -> float:
+    """Step of temporal DCT coefficients where the canonical value has `step`.
+
+    An error of the canonical value shows in all T frames, one of an orthonormal coefficient once: at equal slopes of
+    rate against distortion the coefficient's step is sqrt(T) times as large.
+    """
+    return float(np.float32(step * np.sqrt(frames)))
 
 
 def subject_radius(means: np.ndarray) -> float:

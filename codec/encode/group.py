@@ -13,7 +13,7 @@ import numpy as np
 
 from gscodec import _native
 from gscodec.bitstream.color import STEP_WEIGHTS, decorrelate
-from gscodec.bitstream.quantization import Steps, steps_for, subject_radius
+from gscodec.bitstream.quantization import Steps, steps_for, subject_radius, trajectory_step
 from gscodec.bitstream.transform import dct_basis
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply
 from gscodec.encode.motion import NodeMotion, choose_nodes, quantize_trajectory, trim
@@ -153,10 +153,9 @@ def _trajectories(s: Stack, channels: dict, steps: Steps, x: np.ndarray, motion:
     }
     for name, values in _appearance(s).items():
         residual[name] = values - dequantize_channels(channels[name])[None]
-    step = {"means": steps.motion, "quats": steps.quats}
     out = {}
     for name, values in residual.items():
-        size = float(np.float32(step.get(name) or channel_steps(name, steps, values.shape[2])[0]))
+        size = trajectory_step(channel_steps(name, steps, values.shape[2])[0], len(basis))
         c = trim(quantize_trajectory(values, basis, size, DEAD_ZONE)).transpose(0, 2, 1)  # [K, C, N]
         if c.any():
             out[name] = {"coefficients": np.ascontiguousarray(c), "step": size}

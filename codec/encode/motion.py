@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gscodec import _native
-from gscodec.bitstream.quantization import Steps
+from gscodec.bitstream.quantization import Steps, trajectory_step
 from gscodec.bitstream.transform import dct_basis
 
 NEIGHBORS = 4  # nodes that a Gaussian blends
@@ -204,5 +204,6 @@ def choose_nodes(grid_positions, x, means, steps: Steps, to_world) -> NodeMotion
 
 def _residual_bits(residual: np.ndarray, steps: Steps) -> float:
     """Estimated bits of the residual trajectories [T, N, 3]."""
-    c = np.abs(np.tensordot(dct_basis(len(residual)), residual, 1)) / steps.motion
+    frames = len(residual)
+    c = np.abs(np.tensordot(dct_basis(frames), residual, 1)) / trajectory_step(steps.means, frames)
     return float(np.log2(1 + np.where(c < 0.6, 0, c)).sum() * 2.5)

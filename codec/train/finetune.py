@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from gscodec.bitstream.quantization import Steps
+from gscodec.bitstream.quantization import Steps, trajectory_step
 from gscodec.bitstream.transform import dct_basis
 from gscodec.gaussians import Gaussians
 from gscodec.render.step import Workspace, render_loss
@@ -57,7 +57,7 @@ class GroupModel:
         self.key, self.turned = key, turned
         self.moved = means - key.params["means"]  # [T, N, 3]
         self.basis = torch.from_numpy(dct_basis(len(means))).float()  # [T, T]
-        self.unit = {"means": steps.motion, "quats": steps.quats, "sh0": steps.sh0}
+        self.unit = {name: trajectory_step(getattr(steps, name), len(means)) for name in RESIDUALS}
         n = len(key)
         self.coefficients = {}  # in units of the quantization step
         for name, (channels, most) in RESIDUALS.items():
