@@ -162,6 +162,9 @@ def test_vmaf_refuses(monkeypatch):
         monkeypatch.setattr(vmaf_module, "_ffmpeg", lambda: None)
         with pytest.warns(UserWarning, match="VMAF is left out: the ffmpeg of imageio-ffmpeg has no libvmaf"):
             assert meter.score() is None
+        monkeypatch.setattr(vmaf_module, "_ffmpeg", lambda: sys.executable)
+        with pytest.raises(RuntimeError, match="ffmpeg failed on VMAF"):
+            meter.score()
 
 
 # -- rate
