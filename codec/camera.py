@@ -41,6 +41,13 @@ class Camera:
         K[1] *= height / self.height
         return replace(self, K=K, width=width, height=height)
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The rectangle of this view that starts at pixel (left, top)."""
+        K = self.K.copy()
+        K[0, 2] -= left
+        K[1, 2] -= top
+        return replace(self, K=K, width=int(width), height=int(height))
+
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     """[4, 4] f64 world-to-camera matrix, OpenCV axes, of a camera at `eye` that looks at `target`, `up` upwards."""

@@ -78,7 +78,9 @@ class Gaussians:
             arrays[name] = a
         norm = np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
         if n and norm.min() == 0:
-            raise CaptureError(f"{where}: the quaternion of Gaussian {int(norm.argmin())} is zero, expected unit length")
+            raise CaptureError(
+                f"{where}: the quaternion of Gaussian {int(norm.argmin())} is zero, expected unit length"
+            )
         arrays["quats"] = (arrays["quats"] / norm).astype(np.float32)
         return Gaussians(**arrays)
 

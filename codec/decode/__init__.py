@@ -1,0 +1,5 @@
+"""Bytes -> GaussianSequence: the thin Python face of the native decoder."""
+
+from gscodec.decode.stream import Stream, open_stream
+
+__all__ = ["Stream", "open_stream"]

@@ -1,0 +1,1 @@
+"""GaussianSequence -> bytes. Order, quantize, predict, entropy, mux."""

@@ -1,5 +1,309 @@
-use pyo3::prelude::*;
+//! `_native.Rasterizer`: numpy arrays in, numpy arrays out. Parameters come as the tuple (means, quats, log_scales,
+//! logit_opacities, sh0, shN), f32 and contiguous; gradients as those and (grad2d, max_weight, sum_weight), written in place.
 
-pub fn register(_m: &Bound<'_, PyModule>) -> PyResult<()> {
-    Ok(())
+use numpy::{PyArray1, PyReadonlyArrayDyn, PyReadwriteArrayDyn, prelude::*};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use raster::{Gradients, ImageLoss, Lambdas, Level, Pair, RasterError, Region, Shade, Splats, Step, Target, View};
+
+type In<'py> = PyReadonlyArrayDyn<'py, f32>;
+type InOut<'py> = PyReadwriteArrayDyn<'py, f32>;
+type Bytes<'py> = PyReadonlyArrayDyn<'py, u8>;
+type Params<'py> = (In<'py>, In<'py>, In<'py>, In<'py>, In<'py>, In<'py>);
+type Grads<'py> = (
+    (InOut<'py>, InOut<'py>, InOut<'py>, InOut<'py>, InOut<'py>, InOut<'py>),
+    (InOut<'py>, InOut<'py>, InOut<'py>),
+);
+/// (image, alpha), flat
+type Picture<'py> = (Bound<'py, PyArray1<f32>>, Bound<'py, PyArray1<f32>>);
+
+fn usage(e: RasterError) -> PyErr {
+    PyValueError::new_err(e.to_string())
+}
+
+fn contiguous<T>(r: Result<T, impl std::fmt::Display>) -> PyResult<T> {
+    r.map_err(|e| PyValueError::new_err(e.to_string()))
+}
+
+fn splats<'a>(p: &'a Params) -> PyResult<Splats<'a>> {
+    Ok(Splats {
+        means: contiguous(p.0.as_slice())?,
+        quats: contiguous(p.1.as_slice())?,
+        log_scales: contiguous(p.2.as_slice())?,
+        logit_opacities: contiguous(p.3.as_slice())?,
+        sh0: contiguous(p.4.as_slice())?,
+        sh_n: contiguous(p.5.as_slice())?,
+        sh_k: p.5.shape().get(1).copied().unwrap_or(0),
+    })
+}
+
+fn gradients<'a>(g: &'a mut Grads) -> PyResult<Gradients<'a>> {
+    let (params, stats) = g;
+    Ok(Gradients {
+        means: contiguous(params.0.as_slice_mut())?,
+        quats: contiguous(params.1.as_slice_mut())?,
+        log_scales: contiguous(params.2.as_slice_mut())?,
+        logit_opacities: contiguous(params.3.as_slice_mut())?,
+        sh0: contiguous(params.4.as_slice_mut())?,
+        sh_n: contiguous(params.5.as_slice_mut())?,
+        grad2d: contiguous(stats.0.as_slice_mut())?,
+        max_weight: contiguous(stats.1.as_slice_mut())?,
+        sum_weight: contiguous(stats.2.as_slice_mut())?,
+    })
+}
+
+fn level(name: &str) -> PyResult<Level> {
+    if name == "auto" {
+        return Ok(Level::best());
+    }
+    let available = Level::available();
+    let names: Vec<&str> = available.iter().map(|l| l.name()).collect();
+    available.iter().copied().find(|l| l.name() == name).ok_or_else(|| {
+        PyValueError::new_err(format!(
+            "simd {name:?} is not available here, expected auto or one of {}",
+            names.join(", ")
+        ))
+    })
+}
+
+/// size, (fx, fy, cx, cy), rows of the world-to-camera matrix and the region (x, y, width, height).
+#[derive(FromPyObject)]
+struct ViewArgs {
+    #[pyo3(item)]
+    size: [usize; 2],
+    #[pyo3(item)]
+    intrinsics: [f32; 4],
+    #[pyo3(item)]
+    viewmat: [[f32; 4]; 3],
+    #[pyo3(item)]
+    region: [usize; 4],
+}
+
+impl ViewArgs {
+    fn view(&self) -> View {
+        let [fx, fy, cx, cy] = self.intrinsics;
+        let m = &self.viewmat;
+        let [x, y, width, height] = self.region;
+        View {
+            width: self.size[0],
+            height: self.size[1],
+            focal: [fx, fy],
+            center: [cx, cy],
+            rotation: std::array::from_fn(|i| [m[i][0], m[i][1], m[i][2]]),
+            translation: [m[0][3], m[1][3], m[2][3]],
+            region: Region { x, y, width, height },
+        }
+    }
+}
+
+#[pyclass]
+struct Rasterizer {
+    inner: raster::Rasterizer,
+    step: Step,
+}
+
+#[pymethods]
+impl Rasterizer {
+    #[new]
+    #[pyo3(signature = (threads=0, simd="auto"))]
+    fn new(threads: usize, simd: &str) -> PyResult<Self> {
+        Ok(Rasterizer {
+            inner: raster::Rasterizer::new(level(simd)?, threads),
+            step: Step::default(),
+        })
+    }
+
+    #[getter]
+    fn simd(&self) -> &'static str {
+        self.inner.level().name()
+    }
+
+    /// Milliseconds of the last passes.
+    fn timings(&self) -> Vec<(&'static str, f64)> {
+        let t = self.inner.timings;
+        vec![
+            ("project", t.project),
+            ("bin", t.bin),
+            ("blend", t.blend),
+            ("loss", t.loss),
+            ("backward_tiles", t.backward_tiles),
+            ("backward_project", t.backward_project),
+        ]
+    }
+
+    fn forward<'py>(
+        &mut self,
+        py: Python<'py>,
+        params: Params<'py>,
+        view: ViewArgs,
+        background: [f32; 3],
+        training: bool,
+    ) -> PyResult<Picture<'py>> {
+        let (splats, view) = (splats(&params)?, view.view());
+        py.detach(|| self.inner.forward(&splats, &view, Shade::over(background), training))
+            .map_err(usage)?;
+        Ok((
+            PyArray1::from_slice(py, self.inner.image()),
+            PyArray1::from_slice(py, self.inner.alpha()),
+        ))
+    }
+
+    fn backward(&mut self, py: Python, params: Params, grad_image: In, grad_alpha: In, grads: Grads) -> PyResult<()> {
+        let mut grads = grads;
+        let (splats, mut out) = (splats(&params)?, gradients(&mut grads)?);
+        let (image, alpha) = (contiguous(grad_image.as_slice())?, contiguous(grad_alpha.as_slice())?);
+        py.detach(|| self.inner.backward(&splats, image, alpha, &mut out))
+            .map_err(usage)
+    }
+
+    /// (loss, l1, mse, ssim, mask, gradient of the gain). `target` is (rgb, alpha or None, weight or None).
+    #[allow(clippy::too_many_arguments, clippy::type_complexity)]
+    fn step(
+        &mut self,
+        py: Python,
+        params: Params,
+        view: ViewArgs,
+        shade: ([f32; 3], Option<[f32; 3]>),
+        target: (Bytes, Option<Bytes>, Option<In>),
+        lambdas: (f32, f32),
+        grads: Grads,
+    ) -> PyResult<(f64, f64, f64, f64, f64, [f64; 3])> {
+        let mut grads = grads;
+        let (splats, view, mut out) = (splats(&params)?, view.view(), gradients(&mut grads)?);
+        let (rgb, alpha, weight) = &target;
+        let target = Target {
+            rgb: contiguous(rgb.as_slice())?,
+            alpha: alpha.as_ref().map(|a| contiguous(a.as_slice())).transpose()?,
+            weight: weight.as_ref().map(|w| contiguous(w.as_slice())).transpose()?,
+        };
+        let (shade, lambdas) = (
+            Shade {
+                background: shade.0,
+                gain: shade.1,
+            },
+            Lambdas {
+                ssim: lambdas.0,
+                mask: lambdas.1,
+            },
+        );
+        let (step, inner) = (&mut self.step, &mut self.inner);
+        let v = py
+            .detach(|| step.run(inner, &splats, &view, shade, target, lambdas, &mut out))
+            .map_err(usage)?;
+        Ok((v.loss, v.image.l1, v.image.mse, v.image.ssim, v.mask, v.gain))
+    }
+
+    /// The picture of the last pass.
+    fn picture<'py>(&self, py: Python<'py>) -> Picture<'py> {
+        (
+            PyArray1::from_slice(py, self.inner.image()),
+            PyArray1::from_slice(py, self.inner.alpha()),
+        )
+    }
+
+    /// [N] larger half side of each ellipse's box in pixels, 0 for the invisible, and [N] depths.
+    fn radii<'py>(&self, py: Python<'py>) -> Picture<'py> {
+        let projected = self.inner.projected();
+        let radii = projected.iter().map(|p| if p.visible() { p.rx.max(p.ry) } else { 0.0 });
+        (
+            PyArray1::from_iter(py, radii),
+            PyArray1::from_iter(py, projected.iter().map(|p| p.depth)),
+        )
+    }
+}
+
+/// (loss, l1, mse, ssim, gradient [H * W * 3]) of an image [H, W, 3].
+#[pyfunction]
+#[pyo3(signature = (image, target, weight, ssim_lambda, simd="auto"))]
+#[allow(clippy::type_complexity)]
+fn image_loss<'py>(
+    py: Python<'py>,
+    image: In,
+    target: In,
+    weight: Option<In>,
+    ssim_lambda: f32,
+    simd: &str,
+) -> PyResult<(f64, f64, f64, f64, Bound<'py, PyArray1<f32>>)> {
+    let (level, width) = (level(simd)?, image.shape().get(1).copied().unwrap_or(0));
+    let weight = weight.as_ref().map(|w| contiguous(w.as_slice())).transpose()?;
+    let (x, y) = (contiguous(image.as_slice())?, contiguous(target.as_slice())?);
+    let pair = Pair {
+        image: x,
+        target: y,
+        width,
+        weight,
+    };
+    let (value, grad) = py
+        .detach(|| {
+            let mut grad = vec![0.0; x.len()];
+            ImageLoss::default()
+                .run(level, pair, ssim_lambda, &mut grad)
+                .map(|v| (v, grad))
+        })
+        .map_err(usage)?;
+    Ok((
+        value.loss,
+        value.l1,
+        value.mse,
+        value.ssim,
+        PyArray1::from_vec(py, grad),
+    ))
+}
+
+/// Instant-NGP grid: `cells` on a side of each level, `table` entries at most a level.
+#[pyclass(frozen)]
+struct HashGrid {
+    inner: raster::HashGrid,
+}
+
+#[pymethods]
+impl HashGrid {
+    #[new]
+    fn new(features: usize, cells: Vec<u32>, table: usize) -> PyResult<Self> {
+        Ok(HashGrid {
+            inner: raster::HashGrid::new(features, &cells, table).map_err(usage)?,
+        })
+    }
+
+    #[getter]
+    fn entries(&self) -> usize {
+        self.inner.entries()
+    }
+
+    /// points [N, 3], table [entries, F] -> out [N, L * F], written in place.
+    fn forward(&self, py: Python, points: In, table: In, mut out: InOut) -> PyResult<()> {
+        let (points, table) = (contiguous(points.as_slice())?, contiguous(table.as_slice())?);
+        let out = contiguous(out.as_slice_mut())?;
+        py.detach(|| self.inner.forward(points, table, out)).map_err(usage)
+    }
+
+    /// Adds to grad_table and overwrites grad_points.
+    fn backward(
+        &self,
+        py: Python,
+        points: In,
+        table: In,
+        grad_out: In,
+        mut grad_table: InOut,
+        mut grad_points: Option<InOut>,
+    ) -> PyResult<()> {
+        let (points, table) = (contiguous(points.as_slice())?, contiguous(table.as_slice())?);
+        let (grad_out, grad_table) = (contiguous(grad_out.as_slice())?, contiguous(grad_table.as_slice_mut())?);
+        let grad_points = grad_points.as_mut().map(|g| contiguous(g.as_slice_mut())).transpose()?;
+        py.detach(|| self.inner.backward(points, table, grad_out, grad_table, grad_points))
+            .map_err(usage)
+    }
+}
+
+/// Names of the instruction sets that this machine can use, fastest first.
+#[pyfunction]
+fn simd_levels() -> Vec<&'static str> {
+    Level::available().iter().map(|l| l.name()).collect()
+}
+
+pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_class::<Rasterizer>()?;
+    m.add_class::<HashGrid>()?;
+    m.add_function(wrap_pyfunction!(image_loss, m)?)?;
+    m.add_function(wrap_pyfunction!(simd_levels, m)?)
 }

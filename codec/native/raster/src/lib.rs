@@ -1,1 +1,32 @@
-//! Rasterizer, SSIM and hash-grid kernels.
+//! CPU rasterizer and training kernels: Gaussians + view -> image, and gradients back; image loss; hash grid.
+//!
+//! scene -> project -> sort -> bin -> forward (tiles) -> image; backward (tiles) -> project_backward (Gaussians). `simd` is the
+//! only place with `unsafe`. This crate never sees bytes of a stream: everything here may be fed floats of any value.
+
+// Kernels index several arrays in step; iterators over some of them would hide that.
+#![allow(clippy::needless_range_loop)]
+
+mod backward;
+mod bin;
+pub mod constants;
+mod divide;
+mod forward;
+mod hashgrid;
+mod loss;
+mod project;
+mod project_backward;
+mod rasterizer;
+mod scene;
+mod sh;
+mod simd;
+mod sort;
+mod step;
+mod tile;
+
+pub use hashgrid::HashGrid;
+pub use loss::{ImageLoss, LossValue, Pair};
+pub use project::Projected;
+pub use rasterizer::{Rasterizer, Shade, Timings};
+pub use scene::{Gradients, RasterError, Region, Splats, View};
+pub use simd::Level;
+pub use step::{Lambdas, Step, StepValue, Target};

@@ -1,0 +1,107 @@
+"""Benchmarks of the whole pipeline, through the command line as users run it; results as JSON in bench/results.
+
+usage: python bench/run.py [statue] [lumberjack] [demo]
+
+`statue` and `lumberjack` need the data folder that the environment variable GSCODEC_DATA names (lumberjack/ and
+splats/statue.ply in it, tools/animate_splat.py beside it); without it they are left out with a word.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "bench" / "results"
+GSCODEC = [sys.executable, "-c", "from gscodec.cli import main; main()"]
+
+
+def machine() -> dict:
+    """What the figures were measured on."""
+    model = platform.processor()
+    if Path("/proc/cpuinfo").exists():
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        model = next((x.split(":")[1].strip() for x in lines if x.startswith("model name")), model)
+    return {"cpu": model, "cores": os.cpu_count(), "system": platform.system(), "python": platform.python_version()}
+
+
+def commit() -> str:
+    """Short hash of the checkout, "+" if it has changes."""
+    git = lambda *a: subprocess.run(["git", *a], cwd=ROOT, capture_output=True, text=True).stdout.strip()  # noqa: E731
+    return git("rev-parse", "--short", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
+
+
+def gscodec(*args) -> tuple[str, float]:
+    """Runs a command; returns its stdout and seconds."""
+    start = time.perf_counter()
+    done = subprocess.run([*GSCODEC, *map(str, args)], stdout=subprocess.PIPE, text=True, check=True)
+    return done.stdout, time.perf_counter() - start
+
+
+def measure(name: str, source: Path, folder: Path, *encode_options: str) -> dict:
+    """Encodes `source`, evaluates the stream and returns the figures."""
+    out, report = folder / f"{name}.gsv", folder / f"{name}.json"
+    _, seconds = gscodec("encode", source, out, "--json", report, *encode_options)
+    evaluated = json.loads(gscodec("eval", out, source, "--json")[0])
+    evaluated.pop("per_frame")
+    units = json.loads(gscodec("info", out, "--json")[0])["units"]
+    return {
+        "case": name,
+        "command": f"gscodec encode {source.name} {name}.gsv {' '.join(encode_options)}".strip(),
+        "encode_seconds": round(seconds, 2),
+        **evaluated,
+        "units": {n: u["bytes"] for n, u in units.items()},
+        "stage_seconds": json.loads(report.read_text())["seconds"],
+    }
+
+
+def statue(data: Path, folder: Path) -> dict:
+    """The size-quality case: 20 frames, 101,275 Gaussians."""
+    tool = data.parent / "tools" / "animate_splat.py"
+    plys = folder / "statue"
+    subprocess.run(
+        [sys.executable, tool, data / "splats" / "statue.ply", plys, "--frames", "20"], check=True, stdout=sys.stderr
+    )
+    return measure("statue", plys, folder)
+
+
+def lumberjack(data: Path, folder: Path) -> dict:
+    """The capture: 30 frames, 512 x 512, 20 training cameras."""
+    return measure("lumberjack", data / "lumberjack", folder)
+
+
+def demo(_: Path | None, folder: Path) -> dict:
+    """The bundled example of `make demo`."""
+    return measure("demo", ROOT / "examples" / "lumberjack", folder)
+
+
+CASES = {"demo": demo, "statue": statue, "lumberjack": lumberjack}
+
+
+def main() -> None:
+    """Runs the cases named on the command line, all by default."""
+    named = sys.argv[1:] or list(CASES)
+    unknown = set(named) - set(CASES)
+    if unknown:
+        sys.exit(f"error: no such benchmark: {', '.join(unknown)}, expected {', '.join(CASES)}")
+    data = os.environ.get("GSCODEC_DATA")
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    for name in named:
+        if name != "demo" and not data:
+            print(f"{name}: left out, GSCODEC_DATA is not set", file=sys.stderr)
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            result = CASES[name](Path(data) if data else None, Path(folder))
+        result = {"machine": machine(), "commit": commit(), **result}
+        (RESULTS / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")
+        print(json.dumps(result, indent=1))
+
+
+if __name__ == "__main__":
+    main()

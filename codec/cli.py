@@ -1,0 +1,237 @@
+"""The command line: each command parses, calls one library function and prints.
+
+Results go to stdout (`--json` for machines), progress to stderr. What a user can cause and mend ends as one sentence
+and exit code 1 (2 for a wrong call); anything else is a bug and shows its traceback.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from gscodec import __version__
+from gscodec.errors import GscodecError, UsageError
+from gscodec.frames import frame_range
+
+app = typer.Typer(
+    help="Streaming volumetric video: captures and Gaussian sequences to one small playable file.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+_out = Console(soft_wrap=True, highlight=False)
+
+Sequence = Annotated[
+    Path, typer.Argument(metavar="SEQ", help="A capture (folder or transforms.json) or a splat, or a folder of splats.")
+]
+Stream = Annotated[Path, typer.Argument(metavar="OUT.gsv", help="A .gsv file.")]
+Frames = Annotated[str | None, typer.Option(metavar="A:B", help="Only frames A to B-1.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Gop = Annotated[int, typer.Option(help="Frames in a group.")]
+Preset = Annotated[str, typer.Option(help="Training budget: fast, medium or slow.")]
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda (needs gsplat).")]
+Quality = Annotated[float, typer.Option(help="0 (small) to 100 (fine).")]
+
+
+def _show_version(value: bool) -> None:
+    if value:
+        print(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def encode(
+    seq: Sequence,
+    out: Stream,
+    quality: Quality = 50.0,
+    preset: Preset = "medium",
+    frames: Frames = None,
+    gop: Gop = 20,
+    device: Device = "auto",
+    keep_all: Annotated[bool, typer.Option("--keep-all", help="Keep Gaussians that nobody can see.")] = False,
+    report: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the report there.")] = None,
+) -> None:
+    """Capture or Gaussian sequence to a stream. A second run resumes; Ctrl-C leaves a playable file."""
+    from gscodec.commands import encode_input
+    from gscodec.progress import Bar
+
+    with Bar() as bar:
+        result = encode_input(
+            seq, out, quality=quality, preset=preset, frames=frames, gop=gop, device=device, keep_all=keep_all, bar=bar
+        )
+    if report:
+        report.write_text(json.dumps(result.to_json(), indent=1))
+    if result.groups == 0:
+        raise UsageError("stopped before the first group was done; run the same command to go on")
+    r = result.to_json()
+    _out.print(
+        f"{out}: {r['frames']} frames, {r['gaussians']} Gaussians, {r['bytes']} bytes, "
+        f"{r['kb_per_frame']:.2f} kB/frame, {r['bits_per_gaussian_frame']:.2f} bits per Gaussian and frame"
+    )
+    if result.interrupted:
+        print("stopped early: the file holds the groups done, the same command goes on", file=sys.stderr)
+        raise typer.Exit(130)
+
+
+@app.command()
+def train(
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture (folder or transforms.json).")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the .ply files go.")],
+    preset: Preset = "medium",
+    frames: Frames = None,
+    gop: Gop = 20,
+    device: Device = "auto",
+    quality: Quality = 50.0,
+) -> None:
+    """Capture to one .ply per frame, the first half of encode."""
+    from gscodec.commands import train_to_folder
+    from gscodec.progress import Bar
+
+    with Bar() as bar:
+        count = train_to_folder(
+            capture, folder, preset=preset, frames=frames, gop=gop, device=device, quality=quality, bar=bar
+        )
+    _out.print(f"{folder}: {count} frames")
+
+
+@app.command()
+def decode(
+    stream: Stream, folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the .ply files go.")]
+) -> None:
+    """Stream to one standard 3DGS .ply per frame."""
+    from gscodec.decode import open_stream
+    from gscodec.splats import write_sequence
+
+    s = open_stream(stream)
+    _warn_if_cut(s)
+    write_sequence(s.sequence(), folder)
+    _out.print(f"{folder}: {s.frame_count} frames")
+
+
+@app.command()
+def render(
+    stream: Stream,
+    dest: Annotated[Path, typer.Argument(metavar="DEST", help="A .mp4 file or a folder for .png images.")],
+    camera: Annotated[str, typer.Option(help="orbit, the name of a reference camera, or a camera .json.")] = "orbit",
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Picture size.")] = None,
+    frames: Frames = None,
+) -> None:
+    """Render a stream on the CPU to a video or images."""
+    from gscodec.decode import open_stream
+    from gscodec.progress import Bar
+    from gscodec.render.movie import render_stream
+
+    s = open_stream(stream)
+    _warn_if_cut(s)
+    with Bar() as bar:
+        count = render_stream(s, dest, camera=camera, size=size, frames=frame_range(frames, s.frame_count), bar=bar)
+    _out.print(f"{dest}: {count} frames")
+
+
+@app.command()
+def info(
+    stream: Stream,
+    as_json: Json = False,
+    maps: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the attribute maps as 16-bit images.")] = None,
+) -> None:
+    """What is in a file: groups, bits by attribute and unit."""
+    from gscodec.decode import open_stream
+    from gscodec.decode.report import describe, write_maps
+
+    s = open_stream(stream)
+    _warn_if_cut(s)
+    facts = describe(s)
+    if maps:
+        write_maps(s, maps)
+    if as_json:
+        print(json.dumps(facts, indent=1))
+        return
+    _out.print(
+        f"{stream}: {facts['frames']} frames at {facts['fps']:g} fps in {facts['groups']} groups, "
+        f"{facts['gaussians']} Gaussians, SH degree {facts['sh_degree']}, level {facts['level']}"
+    )
+    _out.print(
+        f"{facts['bytes']} bytes, {facts['kb_per_frame']:.2f} kB/frame, {facts['mbit_per_s']:.2f} Mbit/s, "
+        f"{facts['bits_per_gaussian_frame']:.3f} bits per Gaussian and frame"
+    )
+    for name, u in facts["units"].items():
+        _out.print(
+            f"  {name:<32}{u['bytes']:>10} bytes {u['share']:>6.1%} {u['bits_per_gaussian']:>8.2f} bits/Gaussian/group"
+        )
+
+
+@app.command(name="eval")
+def evaluate(
+    stream: Stream,
+    seq: Sequence,
+    split: Annotated[str, typer.Option(help="Cameras of a capture: test or train.")] = "test",
+    frames: Frames = None,
+    as_json: Json = False,
+) -> None:
+    """PSNR, SSIM, VMAF and temporal stability against a capture or the splats that were encoded."""
+    from gscodec.commands import evaluate_stream
+    from gscodec.progress import Bar
+
+    with Bar() as bar:
+        result = evaluate_stream(stream, seq, split=split, frames=frames, bar=bar)
+    if as_json:
+        print(json.dumps(result, indent=1))
+        return
+    for key, value in result.items():
+        if isinstance(value, float):
+            _out.print(f"{key:<26}{value:.4f}")
+        elif isinstance(value, int | str):
+            _out.print(f"{key:<26}{value}")
+
+
+def _warn_if_cut(stream) -> None:
+    if not stream.complete:
+        print(
+            f"warning: {stream.name} ends inside a group; its {stream.frame_count} whole frames are used",
+            file=sys.stderr,
+        )
+
+
+def _say(message, category, filename, lineno, file=None, line=None) -> None:
+    print(f"warning: {message}", file=sys.stderr)
+
+
+def main() -> None:
+    """Entry point of the `gscodec` command."""
+    warnings.showwarning = _say
+    try:
+        app(standalone_mode=False)
+    except typer.Exit as e:
+        sys.exit(e.exit_code)
+    except (typer.Abort, KeyboardInterrupt):
+        print("stopped", file=sys.stderr)
+        sys.exit(130)
+    except GscodecError as e:
+        print(f"error: {e}", file=sys.stderr)
+        sys.exit(1)
+    except OSError as e:
+        where = f"{e.filename}: " if e.filename else ""
+        print(f"error: {where}{e.strerror or e}", file=sys.stderr)
+        sys.exit(1)
+    except Exception as e:
+        if type(e).__module__.startswith(("click", "typer")):  # a wrong call
+            show = getattr(e, "show", None)
+            show() if show else print(f"error: {e}", file=sys.stderr)
+            sys.exit(getattr(e, "exit_code", 2))
+        raise

@@ -1,0 +1,194 @@
+"""What the studio's commands do: the joints between stages, one function a command, no arithmetic.
+
+encode: capture -> train -> encode, or splats -> encode        train: capture -> train -> .ply folder
+eval:   stream + capture or splats -> metrics
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from gscodec.camera import Camera
+from gscodec.encode.encode import EncodeReport, EncodeSettings, encode_groups, stream_config
+from gscodec.errors import UsageError
+from gscodec.frames import frame_range
+from gscodec.gaussians import GaussianSequence, Group
+from gscodec.progress import Bar
+
+AXES = ("x", "y", "z")
+
+
+def encode_input(
+    source: Path,
+    out: Path,
+    *,
+    quality: float,
+    preset: str,
+    frames: str | None,
+    gop: int,
+    device: str,
+    keep_all: bool,
+    bar: Bar,
+) -> EncodeReport:
+    """Encodes a capture or splats at `source` into the file `out`.
+
+    Raises:
+        UsageError, CaptureError: see the message.
+    """
+    from gscodec.splats import detect_input
+
+    settings = EncodeSettings(quality=quality, keep_all=keep_all)
+    out = Path(out)
+    if out.suffix != ".gsv":
+        raise UsageError(f"{out}: the output must be named *.gsv")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if detect_input(source) == "splats":
+        return _encode_splats(source, out, settings, frames, gop, bar)
+    return _encode_capture(source, out, settings, preset, frames, gop, device, bar)
+
+
+def _encode_splats(source, out, settings, frames, gop, bar) -> EncodeReport:
+    sequence = _restrict(_open_splats(source, gop, bar), frames)
+    total = sequence.frame_count
+    cameras = sequence.cameras
+    first = sequence.frame(0)
+    config = stream_config(fps=sequence.fps, sh_degree=first.sh_degree, cameras=cameras, up="-y")
+    return encode_groups(
+        lambda done: (sequence.groups[i] for i in range(done, len(sequence.groups))),
+        out,
+        config,
+        settings,
+        fingerprint={"input": str(source.resolve()), "frames": frames, "gop": gop, **asdict(settings)},
+        on_group=lambda r: bar.update("encode", r.frames, total),
+    )
+
+
+def _open_splats(source: Path, gop: int, bar: Bar) -> GaussianSequence:
+    from gscodec.splats import open_sequence
+
+    sequence = open_sequence(source, gop=gop)
+    words = {
+        "tracked": "index i is the same Gaussian in every frame",
+        "matched": "Gaussians were matched from frame to frame",
+        "independent": "frames do not match each other, each is coded alone",
+    }
+    if sequence.frame_count > 1:
+        bar.say(f"{source}: {sequence.mode} ({words.get(sequence.mode, 'as sequence.json says')})")
+    return sequence
+
+
+def _restrict(sequence: GaussianSequence, frames: str | None) -> GaussianSequence:
+    """Frames A:B; groups that the range cuts become shorter."""
+    chosen = frame_range(frames, sequence.frame_count)
+    if len(chosen) == sequence.frame_count:
+        return sequence
+    groups, start = [], 0
+    for g in sequence.groups:
+        a, b = max(chosen[0] - start, 0), min(chosen[-1] + 1 - start, len(g))
+        if a < b:
+            life = g.lifetimes
+            if life is not None:
+                life = np.clip(life - a, 0, b - a)
+            groups.append(Group([g.frames[t] for t in range(a, b)], life))
+        start += len(g)
+    return sequence.with_groups(groups)
+
+
+def _encode_capture(source, out, settings, preset, frames, gop, device, bar) -> EncodeReport:
+    from gscodec.train.settings import train_settings
+    from gscodec.train.train import train_groups
+
+    capture = _open_capture(source, frames)
+    recipe = train_settings(preset, gop=gop, quality=settings.quality)
+    work = out.with_name(out.name + ".work")
+    _check_device(device)
+    config = stream_config(
+        fps=capture.fps, sh_degree=0, cameras=capture.cameras, up=up_axis(capture.cameras), background=(0.5,) * 3
+    )
+    report = encode_groups(
+        lambda done: train_groups(
+            capture,
+            recipe,
+            first_group=done,
+            checkpoints=work,
+            on_progress=lambda p: bar.update(p.stage, p.done, p.total),
+        ),
+        out,
+        config,
+        settings,
+        fingerprint={"input": str(source.resolve()), "frames": frames, **asdict(recipe), **asdict(settings)},
+    )
+    if not report.interrupted:
+        for f in work.glob("group_*.npz"):
+            f.unlink()
+        if work.exists():
+            work.rmdir()
+    return report
+
+
+def _open_capture(source: Path, frames: str | None):
+    from gscodec.capture import open_capture
+
+    capture = open_capture(source)
+    if frames is None:
+        return capture
+    chosen = frame_range(frames, capture.frame_count)
+    return capture.frames(chosen.start, chosen.stop)
+
+
+def _check_device(device: str) -> None:
+    from gscodec.render.rasterize import cuda_available
+
+    if device not in ("auto", "cpu", "cuda"):
+        raise UsageError(f"--device {device} does not exist, expected auto, cpu or cuda")
+    if device == "cuda" and not cuda_available():
+        raise UsageError("--device cuda: no CUDA device with gsplat was found; install gsplat or use --device cpu")
+
+
+def up_axis(cameras: list[Camera]) -> str:
+    """The world axis that the cameras hold upwards, e.g. "z" or "-y"."""
+    up = -np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
+    i = int(np.abs(up).argmax())
+    return ("-" if up[i] < 0 else "") + AXES[i]
+
+
+def train_to_folder(
+    source: Path, folder: Path, *, preset: str, frames: str | None, gop: int, device: str, quality: float, bar: Bar
+) -> int:
+    """Trains a capture and writes one .ply per frame and sequence.json; returns the number of frames."""
+    from gscodec.splats import write_sequence
+    from gscodec.train.settings import train_settings
+    from gscodec.train.train import train_groups
+
+    capture = _open_capture(source, frames)
+    recipe = train_settings(preset, gop=gop, quality=quality)
+    _check_device(device)
+    groups = train_groups(capture, recipe, on_progress=lambda p: bar.update(p.stage, p.done, p.total))
+    sequence = GaussianSequence(capture.fps, list(groups), capture.cameras)
+    write_sequence(sequence, folder)
+    return sequence.frame_count
+
+
+def evaluate_stream(stream_path: Path, source: Path, *, split: str, frames: str | None, bar: Bar) -> dict:
+    """Measures a .gsv file against the capture or the splats it came from (keys: README, "Measures")."""
+    from gscodec.decode import open_stream
+    from gscodec.metrics.evaluate import evaluate_capture, evaluate_splats
+    from gscodec.splats import detect_input, open_sequence
+
+    stream = open_stream(stream_path)
+    on_progress = lambda done, total: bar.update("eval", done, total)  # noqa: E731
+    if detect_input(source) == "splats":
+        sequence = open_sequence(source)
+        chosen = frame_range(frames, min(stream.frame_count, sequence.frame_count))
+        result = evaluate_splats(stream.frame, sequence, frames=chosen, on_progress=on_progress)
+    else:
+        capture = _open_capture(source, None)
+        count = min(stream.frame_count, capture.frame_count)
+        chosen = frame_range(frames, count)
+        result = evaluate_capture(
+            stream.frame, capture.frames(chosen.start, chosen.stop), split=split, on_progress=on_progress
+        )
+    return result

@@ -1,0 +1,56 @@
+"""What is in a stream, for people and scripts: bytes by unit and attribute, and the attribute maps as images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gscodec.decode.stream import Stream
+from gscodec.render.png import write_png
+
+
+def describe(stream: Stream) -> dict:
+    """Facts of a whole file; `units` maps a unit's name to bytes, share of the file and bits per Gaussian and group."""
+    units: dict[str, int] = {}
+    groups, most, gaussian_frames = [], 0, 0
+    for i, g in enumerate(stream.groups):
+        decoded = stream.group(i)
+        most = max(most, decoded.count)
+        gaussian_frames += decoded.count * g["frames"]
+        groups.append(
+            {"start_frame": g["start_frame"], "frames": g["frames"], "bytes": g["size"], "gaussians": decoded.count}
+        )
+        for u in decoded.units():
+            name = " ".join(x for x in (u["type"], u["attribute"]) if x)
+            units[name] = units.get(name, 0) + u["bytes"]
+    total, frames = stream.byte_count, max(stream.frame_count, 1)
+    units["container"] = total - sum(units.values())
+    coded = max(sum(g["gaussians"] for g in groups), 1)
+    return {
+        "frames": stream.frame_count,
+        "fps": stream.fps,
+        "groups": len(groups),
+        "gaussians": most,
+        "bytes": total,
+        "kb_per_frame": total / frames / 1000,
+        "mbit_per_s": 8e-6 * total / frames * stream.fps,
+        "bits_per_gaussian_frame": 8 * total / max(gaussian_frames, 1),
+        "sh_degree": stream.config["sh_degree"],
+        "level": stream.config["level"],
+        "up": stream.config["up"],
+        "cameras": [c["name"] for c in stream.config["cameras"]],
+        "complete": stream.complete,
+        "units": {n: {"bytes": b, "share": b / total, "bits_per_gaussian": 8 * b / coded} for n, b in units.items()},
+        "per_group": groups,
+    }
+
+
+def write_maps(stream: Stream, folder: Path) -> None:
+    """Every channel of every group as a 16-bit grey PNG, its integers shifted so that the smallest is 0."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for i in range(len(stream.groups)):
+        for name, values in stream.group(i).maps().items():
+            shifted = np.clip(values.astype(np.int64) - values.min(initial=0), 0, 65535).astype(np.uint16)
+            write_png(folder / f"group{i:04d}_{name}.png", shifted)

@@ -1,0 +1,74 @@
+"""One form for each Gaussian: the (quaternion, scale) pair has 24 equal forms, of which one codes best.
+
+A covariance does not change when its axes are permuted or flipped. Axes are sorted by falling scale, so that a scale
+tells something about the next; of the four orientations left, the one with the largest real part is kept, so that
+the vector part of the quaternion says it all (w >= 1/2) and no index is sent. In -> out: Gaussians of T frames ->
+the same content, with the same choice made in every frame, so that trajectories stay smooth.
+"""
+
+from itertools import permutations
+
+import numpy as np
+
+_HALF = np.sqrt(0.5)
+
+
+def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Hamilton product of wxyz quaternions, [..., 4] x [..., 4] -> [..., 4]."""
+    aw, ax, ay, az = np.moveaxis(a, -1, 0)
+    bw, bx, by, bz = np.moveaxis(b, -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        -1,
+    )
+
+
+def quat_conjugate(q: np.ndarray) -> np.ndarray:
+    """Inverse of unit wxyz quaternions, [..., 4] -> [..., 4]."""
+    return q * np.array([1, -1, -1, -1], q.dtype)
+
+
+def _permutation_quat(order: tuple[int, ...]) -> np.ndarray:
+    """Quaternion of the rotation whose column j is +-axis order[j]."""
+    R = np.zeros((3, 3))
+    R[list(order), range(3)] = 1
+    if np.linalg.det(R) < 0:
+        R = -R  # an odd permutation needs one flip or three; the sign of an axis means nothing here
+    w = np.sqrt(max(0.0, 1 + np.trace(R))) / 2
+    if w > 0.1:
+        v = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w)
+        return np.array([w, *v])
+    i = int(np.argmax(np.diag(R)))
+    v = (R[:, i] + np.eye(3)[i]) / 2
+    return np.array([0.0, *(v / np.linalg.norm(v))])
+
+
+_ORDERS = list(permutations(range(3)))
+_PERMUTATION_QUATS = np.stack([_permutation_quat(o) for o in _ORDERS])  # [6, 4]
+_FLIPS = np.eye(4)  # right-multiplying by 1, i, j, k flips pairs of axes
+
+
+def canonical_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The form to code.
+
+    Args:
+        quats: [N, 4] unit, wxyz, at the frame that decides.
+        log_scales: [N, 3] at that frame.
+
+    Returns:
+        turn [N, 4] f64, by which quaternions of every frame are right-multiplied; order [N, 3] int, the axes by
+        falling scale.
+    """
+    order = np.argsort(-log_scales, axis=1, kind="stable")
+    code = np.array([o[0] * 9 + o[1] * 3 + o[2] for o in _ORDERS])
+    which = np.searchsorted(code, order[:, 0] * 9 + order[:, 1] * 3 + order[:, 2])
+    turn = _PERMUTATION_QUATS[which]
+    turned = quat_multiply(quats.astype(np.float64), turn)
+    # The real part of q * e_m is +-component m of q: flip by the component that is largest.
+    flip = _FLIPS[np.abs(turned).argmax(1)]
+    return quat_multiply(turn, flip), order

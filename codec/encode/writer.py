@@ -1,0 +1,96 @@
+"""The growing file: group payloads -> OUT.gsv.part, playable at any moment, then OUT.gsv with its index.
+
+OUT.gsv.part holds the init segment and whole fragments; OUT.gsv.part.json says what made it, so that a second run goes
+on where the first one stopped, and only if input and settings are the same. `finish` writes the indexed file beside
+it and renames; a file under the final name is always complete.
+"""
+
+from __future__ import annotations
+
+import json
+import mmap
+import os
+import shutil
+from pathlib import Path
+
+from gscodec import _native
+
+
+class StreamWriter:
+    """Appends groups to a .gsv file.
+
+    Args:
+        out: final path.
+        config: of `_native.init_segment` (fps, level, cameras, ...).
+        fingerprint: whatever must be equal for two runs to make the same groups (JSON-able).
+    """
+
+    def __init__(self, out: Path, config: dict, fingerprint: dict):
+        self.out, self.config = Path(out), config
+        self.part = self.out.with_name(self.out.name + ".part")
+        self.state = self.out.with_name(self.out.name + ".part.json")
+        self.init = _native.init_segment(config)
+        self.fragments: list[tuple[int, int, bool]] = []  # size, frames, sync
+        fingerprint = json.loads(json.dumps(fingerprint))
+        if not self._resume(fingerprint):
+            self.part.write_bytes(self.init)
+            self.state.write_text(json.dumps(fingerprint))
+        self._file = open(self.part, "ab")
+
+    def _resume(self, fingerprint: dict) -> bool:
+        if not (self.part.exists() and self.state.exists()):
+            return False
+        try:
+            if json.loads(self.state.read_text()) != fingerprint:
+                return False
+            with open(self.part, "rb") as f, mmap.mmap(f.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                if data[: len(self.init)] != self.init:
+                    return False
+                index = _native.demux(data)
+        except (OSError, ValueError):
+            return False
+        end = len(self.init)
+        for g in index["groups"]:
+            self.fragments.append((g["fragment_size"], g["frames"], g["sync"]))
+            end += g["fragment_size"]
+        os.truncate(self.part, end)  # a fragment cut short by kill -9
+        return True
+
+    @property
+    def groups(self) -> int:
+        """Groups written so far."""
+        return len(self.fragments)
+
+    @property
+    def frames(self) -> int:
+        """Frames written so far."""
+        return sum(f for _, f, _ in self.fragments)
+
+    @property
+    def bytes(self) -> int:
+        """Size of the file so far, without its index."""
+        return len(self.init) + sum(s for s, _, _ in self.fragments)
+
+    def append(self, payload: bytes, frames: int, *, sync: bool = True) -> None:
+        """Writes one group of `frames` frames; it is on disk when this returns."""
+        data = _native.fragment(payload, self.groups + 1, self.frames, frames, sync, self.config)
+        self._file.write(data)
+        self._file.flush()
+        self.fragments.append((len(data), frames, sync))
+
+    def finish(self, *, keep_part: bool = False) -> None:
+        """Writes OUT.gsv: init segment, index, fragments. `keep_part` leaves what a later run needs to go on."""
+        self._file.close()
+        indexed = self.out.with_name(self.out.name + ".indexed")
+        with open(self.part, "rb") as source, open(indexed, "wb") as target:
+            target.write(_native.finish(self.init, self.fragments))
+            source.seek(len(self.init))
+            shutil.copyfileobj(source, target, 1 << 20)
+        os.replace(indexed, self.out)
+        if not keep_part:
+            self.part.unlink()
+            self.state.unlink()
+
+    def close(self) -> None:
+        """Leaves the .part as it is."""
+        self._file.close()

@@ -1,0 +1,284 @@
+//! Multi-resolution hash grid (Instant-NGP, Mueller et al. 2022): [N, 3] in [0, 1] -> [N, L * F], trilinear at each level.
+//!
+//! A level whose vertices fit the table is dense, the others are hashed. The forward pass is parallel over points, the
+//! gradient of the table over levels: a level is one task that walks the points in order, so sums need no atomics and do
+//! not depend on the threads.
+
+use rayon::prelude::*;
+
+use crate::divide::divide;
+use crate::scene::{RasterError, check_length};
+
+const PRIMES: [u32; 3] = [1, 2_654_435_761, 805_459_861]; // x is not multiplied
+/// Points of one task; their features stay in the cache while the levels are walked.
+const POINTS: usize = 256;
+
+/// Shape of a grid; the table is [entries, F], level after level.
+pub struct HashGrid {
+    features: usize,
+    levels: Vec<Level>,
+    entries: usize,
+}
+
+#[derive(Clone, Copy)]
+struct Level {
+    cells: u32, // on a side
+    first: usize,
+    entries: usize,
+    dense: bool,
+}
+
+/// The cell around a point: table rows of its 8 corners, position in the cell, and whether each coordinate was in [0, 1].
+struct Cell {
+    rows: [u32; 8],
+    frac: [f32; 3],
+    inside: [bool; 3],
+}
+
+impl Level {
+    #[inline(always)]
+    fn cell(&self, point: &[f32; 3]) -> Cell {
+        let (mut low, mut frac, mut inside) = ([0u32; 3], [0.0; 3], [true; 3]);
+        for d in 0..3 {
+            inside[d] = (0.0..=1.0).contains(&point[d]);
+            let x = if inside[d] { point[d] } else { f32::from(point[d] > 0.5) }; // NaN becomes 0
+            let x = x * self.cells as f32;
+            low[d] = (x as u32).min(self.cells - 1);
+            frac[d] = x - low[d] as f32;
+        }
+        let side = self.cells + 1;
+        let [x, y, z] = low;
+        let mut rows = [0; 8];
+        if self.dense {
+            let first = (z * side + y) * side + x;
+            for (corner, row) in rows.iter_mut().enumerate() {
+                let c = corner as u32;
+                *row = first + (c & 1) + (c >> 1 & 1) * side + (c >> 2) * side * side;
+            }
+        } else {
+            let (y0, z0) = (y.wrapping_mul(PRIMES[1]), z.wrapping_mul(PRIMES[2]));
+            let hx = [x, x + 1];
+            let hy = [y0, y0.wrapping_add(PRIMES[1])];
+            let hz = [z0, z0.wrapping_add(PRIMES[2])];
+            let mask = self.entries as u32 - 1;
+            for (corner, row) in rows.iter_mut().enumerate() {
+                *row = (hx[corner & 1] ^ hy[corner >> 1 & 1] ^ hz[corner >> 2]) & mask;
+            }
+        }
+        Cell { rows, frac, inside }
+    }
+}
+
+impl Cell {
+    /// Trilinear weights of the corners.
+    #[inline(always)]
+    fn weights(&self) -> [f32; 8] {
+        let [x, y, z] = self.frac;
+        let (x0, y0, z0) = (1.0 - x, 1.0 - y, 1.0 - z);
+        let yz = [y0 * z0, y * z0, y0 * z, y * z];
+        [
+            x0 * yz[0],
+            x * yz[0],
+            x0 * yz[1],
+            x * yz[1],
+            x0 * yz[2],
+            x * yz[2],
+            x0 * yz[3],
+            x * yz[3],
+        ]
+    }
+
+    /// Derivative of the weight of a corner by coordinate `d`, in units of cells.
+    #[inline(always)]
+    fn slope(&self, corner: usize, d: usize) -> f32 {
+        let side = |d: usize| {
+            if corner >> d & 1 == 1 {
+                self.frac[d]
+            } else {
+                1.0 - self.frac[d]
+            }
+        };
+        let sign = if corner >> d & 1 == 1 { 1.0 } else { -1.0 };
+        sign * side((d + 1) % 3) * side((d + 2) % 3)
+    }
+}
+
+impl HashGrid {
+    /// `cells` on a side of each level; `table` entries at most a level, a power of two.
+    ///
+    /// # Errors
+    /// A number of features that is none of 1, 2, 4, 8; no cells; a table that is no power of two.
+    pub fn new(features: usize, cells: &[u32], table: usize) -> Result<HashGrid, RasterError> {
+        if !matches!(features, 1 | 2 | 4 | 8) {
+            return Err(RasterError::Shape {
+                name: "features of the hash grid",
+                expected: 4,
+                got: features,
+            });
+        }
+        if !table.is_power_of_two() || table > 1 << 24 {
+            return Err(RasterError::Shape {
+                name: "table of the hash grid",
+                expected: 1 << 15,
+                got: table,
+            });
+        }
+        let mut levels = Vec::with_capacity(cells.len());
+        let mut first = 0;
+        for &cells in cells {
+            if cells == 0 || cells > 1 << 20 {
+                return Err(RasterError::Shape {
+                    name: "level of the hash grid",
+                    expected: 16,
+                    got: cells as usize,
+                });
+            }
+            let vertices = (cells as usize + 1).pow(3);
+            let (dense, entries) = (vertices <= table, vertices.min(table));
+            levels.push(Level {
+                cells,
+                first,
+                entries,
+                dense,
+            });
+            first += entries;
+        }
+        Ok(HashGrid {
+            features,
+            levels,
+            entries: first,
+        })
+    }
+
+    /// Rows of the table.
+    pub fn entries(&self) -> usize {
+        self.entries
+    }
+
+    /// Values a point: L * F.
+    pub fn outputs(&self) -> usize {
+        self.levels.len() * self.features
+    }
+
+    /// `points` [N, 3], `table` [entries, F] -> `out` [N, L * F].
+    ///
+    /// # Errors
+    /// Wrong lengths.
+    pub fn forward(&self, points: &[f32], table: &[f32], out: &mut [f32]) -> Result<(), RasterError> {
+        self.check(points, table, out.len())?;
+        match self.features {
+            1 => self.forward_of::<1>(points, table, out),
+            2 => self.forward_of::<2>(points, table, out),
+            4 => self.forward_of::<4>(points, table, out),
+            _ => self.forward_of::<8>(points, table, out),
+        }
+        Ok(())
+    }
+
+    fn check(&self, points: &[f32], table: &[f32], outputs: usize) -> Result<(), RasterError> {
+        check_length("points", points.len(), points.len() / 3 * 3)?;
+        check_length("table", table.len(), self.entries * self.features)?;
+        check_length("features", outputs, points.len() / 3 * self.outputs())
+    }
+
+    fn forward_of<const F: usize>(&self, points: &[f32], table: &[f32], out: &mut [f32]) {
+        let stride = self.outputs().max(1);
+        let (table, _) = table.as_chunks::<F>();
+        out.par_chunks_mut(POINTS * stride)
+            .zip(points.par_chunks(3 * POINTS))
+            .for_each(|(out, points)| {
+                for (l, level) in self.levels.iter().enumerate() {
+                    let rows = &table[level.first..level.first + level.entries];
+                    for (out, point) in out.chunks_exact_mut(stride).zip(points.as_chunks::<3>().0) {
+                        let cell = level.cell(point);
+                        let weights = cell.weights();
+                        let mut sum = [0.0; F];
+                        for corner in 0..8 {
+                            let (w, row) = (weights[corner], &rows[cell.rows[corner] as usize]);
+                            for f in 0..F {
+                                sum[f] += w * row[f];
+                            }
+                        }
+                        out[l * F..(l + 1) * F].copy_from_slice(&sum);
+                    }
+                }
+            });
+    }
+
+    /// Gradients from `grad_out` [N, L * F]: `grad_table` is added to, `grad_points` (if wanted) overwritten.
+    ///
+    /// # Errors
+    /// Wrong lengths.
+    pub fn backward(
+        &self,
+        points: &[f32],
+        table: &[f32],
+        grad_out: &[f32],
+        grad_table: &mut [f32],
+        grad_points: Option<&mut [f32]>,
+    ) -> Result<(), RasterError> {
+        self.check(points, table, grad_out.len())?;
+        check_length("gradient of the table", grad_table.len(), table.len())?;
+        match self.features {
+            1 => self.table_backward::<1>(points, grad_out, grad_table),
+            2 => self.table_backward::<2>(points, grad_out, grad_table),
+            4 => self.table_backward::<4>(points, grad_out, grad_table),
+            _ => self.table_backward::<8>(points, grad_out, grad_table),
+        }
+        if let Some(grad_points) = grad_points {
+            check_length("gradient of the points", grad_points.len(), points.len())?;
+            self.points_backward(points, table, grad_out, grad_points);
+        }
+        Ok(())
+    }
+
+    fn table_backward<const F: usize>(&self, points: &[f32], grad_out: &[f32], grad_table: &mut [f32]) {
+        let stride = self.outputs().max(1);
+        let (rows, _) = grad_table.as_chunks_mut::<F>();
+        let cut = |rows, levels: &std::ops::Range<usize>, middle: usize| {
+            let n = self.levels[middle].first - self.levels[levels.start].first;
+            <[[f32; F]]>::split_at_mut(rows, n)
+        };
+        divide(0..self.levels.len(), 1, rows, &cut, &|l, rows: &mut [[f32; F]]| {
+            let level = self.levels[l.start];
+            for (g, point) in grad_out.chunks_exact(stride).zip(points.as_chunks::<3>().0) {
+                let g = &g[l.start * F..(l.start + 1) * F];
+                let cell = level.cell(point);
+                let weights = cell.weights();
+                for corner in 0..8 {
+                    let (w, row) = (weights[corner], &mut rows[cell.rows[corner] as usize]);
+                    for f in 0..F {
+                        row[f] += w * g[f];
+                    }
+                }
+            }
+        });
+    }
+
+    fn points_backward(&self, points: &[f32], table: &[f32], grad_out: &[f32], grad_points: &mut [f32]) {
+        let (stride, features) = (self.outputs().max(1), self.features);
+        let chunks = grad_points
+            .par_chunks_mut(3 * POINTS)
+            .zip(points.par_chunks(3 * POINTS));
+        chunks
+            .zip(grad_out.par_chunks(POINTS * stride))
+            .for_each(|((out, points), grad_out)| {
+                out.fill(0.0);
+                for (l, level) in self.levels.iter().enumerate() {
+                    let items = out.chunks_exact_mut(3).zip(points.as_chunks::<3>().0);
+                    for ((out, point), g) in items.zip(grad_out.chunks_exact(stride)) {
+                        let (cell, g) = (level.cell(point), &g[l * features..(l + 1) * features]);
+                        for corner in 0..8 {
+                            let at = (level.first + cell.rows[corner] as usize) * features;
+                            let dot: f32 = table[at..at + features].iter().zip(g).map(|(a, b)| a * b).sum();
+                            for d in 0..3 {
+                                if cell.inside[d] {
+                                    out[d] += dot * cell.slope(corner, d) * level.cells as f32;
+                                }
+                            }
+                        }
+                    }
+                }
+            });
+    }
+}

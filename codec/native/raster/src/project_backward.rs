@@ -1,0 +1,224 @@
+//! Sums over the pixels of a Gaussian -> gradients of its parameters; the mirror of project.rs, 16 Gaussians at a time.
+
+use std::sync::atomic::Ordering::Relaxed;
+
+use crate::backward::Sums;
+use crate::bin::Bins;
+use crate::project::{CHUNK, Ewa, Lens, Projected, Soa, WHITEN, colour, direction, dot3, ewa};
+use crate::scene::{Gradients, Splats};
+use crate::sh;
+use crate::simd::{Vector, c, dispatch};
+
+type Row = [f32; CHUNK];
+
+/// Rows of the chunk: means 0-2, quats 3-6, log_scales 7-9, logit 10, sh0 11-13, grad2d 14; and shN.
+pub struct GradientRows {
+    pub rows: [Row; 15],
+    pub sh_n: [[Row; 3]; 15],
+}
+
+impl GradientRows {
+    pub fn new() -> GradientRows {
+        GradientRows {
+            rows: [[0.0; CHUNK]; 15],
+            sh_n: [[[0.0; CHUNK]; 3]; 15],
+        }
+    }
+
+    /// To the Gaussians `at ..` of `out`; 0 for the invisible.
+    pub fn write(&self, projected: &[Projected], sums: &[Row; 12], at: usize, k: usize, out: &mut Gradients) {
+        for (lane, p) in projected.iter().enumerate() {
+            let g = at + lane;
+            let keep = |v: f32| if p.visible() { v } else { 0.0 };
+            for d in 0..3 {
+                out.means[3 * g + d] = keep(self.rows[d][lane]);
+                out.log_scales[3 * g + d] = keep(self.rows[7 + d][lane]);
+                out.sh0[3 * g + d] = keep(self.rows[11 + d][lane]);
+            }
+            for d in 0..4 {
+                out.quats[4 * g + d] = keep(self.rows[3 + d][lane]);
+            }
+            out.logit_opacities[g] = keep(self.rows[10][lane]);
+            for i in 0..3 * k {
+                out.sh_n[3 * k * g + i] = keep(self.sh_n[i / 3][i % 3][lane]);
+            }
+            out.grad2d[g] = keep(self.rows[14][lane]);
+            out.sum_weight[g] = sums[9][lane];
+            out.max_weight[g] = sums[10][lane];
+        }
+    }
+}
+
+/// Adds up the pairs of 16 Gaussians, in the order of their tiles. Lanes that are not visible become 0.
+pub fn gather(bins: &Bins, sums: &[Sums], projected: &[Projected], first: usize, n: usize) -> [Row; 12] {
+    let mut rows = [[0.0; CHUNK]; 12];
+    for lane in 0..n {
+        let g = first + lane;
+        if !projected[g].visible() {
+            continue;
+        }
+        let mut total = [0.0f32; 12];
+        for place in &bins.places[bins.owned[g] as usize..bins.owned[g + 1] as usize] {
+            let s = &sums[place.load(Relaxed) as usize];
+            for k in 0..10 {
+                total[k] += s[k];
+            }
+            total[10] = total[10].max(s[10]);
+        }
+        for (row, v) in rows.iter_mut().zip(total) {
+            row[lane] = v;
+        }
+    }
+    rows
+}
+
+/// Gradient by the camera-space mean and by M = J W R S, from those by the projected mean and the covariance.
+struct Screen<V> {
+    mean2d: [V; 2],
+    cov: [V; 3], // xx, xy (both halves together), yy
+}
+
+/// dL/dmean2d = C sum(a d), dL/dcov = C sum(a d d^T) C / 2, with C = 2 ln2 L L^T the inverse covariance and (u, v) = L^T d.
+#[inline(always)]
+fn screen<V: Vector>(e: &Ewa<V>, sums: &[Row; 12], at: usize) -> Screen<V> {
+    let r = (c::<V>(WHITEN) / (e.cov[2] * e.det)).sqrt();
+    let (l11, l21, l22) = (e.cov[2] * r, -(e.cov[1] * r), (c::<V>(WHITEN) / e.cov[2]).sqrt());
+    let k = c::<V>(2.0 * std::f32::consts::LN_2);
+    let (au, av) = (V::load(&sums[1][at..]), V::load(&sums[2][at..]));
+    let mean2d = [k * l11 * au, k * (l21 * au + l22 * av)];
+    let (uu, uv, vv) = (
+        V::load(&sums[3][at..]),
+        V::load(&sums[4][at..]),
+        V::load(&sums[5][at..]),
+    );
+    let half = c::<V>(0.5) * k * k;
+    // rows of L S: [l11 uu, l11 uv], [l21 uu + l22 uv, l21 uv + l22 vv]
+    let (p, q) = (l21 * uu + l22 * uv, l21 * uv + l22 * vv);
+    let cov = [
+        half * l11 * l11 * uu,
+        c::<V>(2.0) * half * l11 * p,
+        half * (p * l21 + q * l22),
+    ];
+    Screen { mean2d, cov }
+}
+
+/// Gradient by the quaternion before normalisation, from that by the rotation matrix.
+#[inline(always)]
+fn quat_backward<V: Vector>(e: &Ewa<V>, d: &[[V; 3]; 3]) -> [V; 4] {
+    let [w, x, y, z] = e.unit;
+    let two = c::<V>(2.0);
+    let dw = two * (x * (d[2][1] - d[1][2]) + y * (d[0][2] - d[2][0]) + z * (d[1][0] - d[0][1]));
+    let dx = two
+        * (y * (d[0][1] + d[1][0]) + z * (d[0][2] + d[2][0]) + w * (d[2][1] - d[1][2]) - two * x * (d[1][1] + d[2][2]));
+    let dy = two
+        * (x * (d[0][1] + d[1][0]) + z * (d[1][2] + d[2][1]) + w * (d[0][2] - d[2][0]) - two * y * (d[0][0] + d[2][2]));
+    let dz = two
+        * (x * (d[0][2] + d[2][0]) + y * (d[1][2] + d[2][1]) + w * (d[1][0] - d[0][1]) - two * z * (d[0][0] + d[1][1]));
+    let along = w * dw + x * dx + y * dy + z * dz;
+    let n = e.inv_norm;
+    [
+        n * (dw - w * along),
+        n * (dx - x * along),
+        n * (dy - y * along),
+        n * (dz - z * along),
+    ]
+}
+
+/// Writes rows 0-9 (means, quats, log_scales) except the part of means that comes from colour.
+#[inline(always)]
+fn geometry<V: Vector>(e: &Ewa<V>, lens: &Lens, s: &Screen<V>, at: usize, out: &mut GradientRows) {
+    let (two, w) = (c::<V>(2.0), &lens.rotation);
+    let mut dm = [[c::<V>(0.0); 3]; 2];
+    let mut drot = [[c::<V>(0.0); 3]; 3];
+    for j in 0..3 {
+        dm[0][j] = two * s.cov[0] * e.m[0][j] + s.cov[1] * e.m[1][j];
+        dm[1][j] = two * s.cov[2] * e.m[1][j] + s.cov[1] * e.m[0][j];
+        (dm[0][j] * e.m[0][j] + dm[1][j] * e.m[1][j]).store(&mut out.rows[7 + j][at..]);
+        dm[0][j] = dm[0][j] * e.scale[j];
+        dm[1][j] = dm[1][j] * e.scale[j];
+        for i in 0..3 {
+            drot[i][j] = e.jw[0][i] * dm[0][j] + e.jw[1][i] * dm[1][j];
+        }
+    }
+    for (i, v) in quat_backward(e, &drot).into_iter().enumerate() {
+        v.store(&mut out.rows[3 + i][at..]);
+    }
+    let mut dp = [c::<V>(0.0); 3];
+    for i in 0..2 {
+        let a = c::<V>(lens.focal[i]) * e.inv_z;
+        let djw = [dot3(dm[i], e.rot[0]), dot3(dm[i], e.rot[1]), dot3(dm[i], e.rot[2])];
+        let dslope = -(a * dot3(djw, [c(w[2][0]), c(w[2][1]), c(w[2][2])]));
+        let dslope = dslope.select(e.free[i], c(0.0));
+        dp[i] = a * s.mean2d[i] + dslope * e.inv_z;
+        // through a = f/z, the slope and the projected mean
+        let x = e.p[i] * e.inv_z;
+        dp[2] = dp[2] - e.inv_z * (dot3(djw, e.jw[i]) + dslope * x) - a * x * s.mean2d[i];
+    }
+    for j in 0..3 {
+        dot3([c(w[0][j]), c(w[1][j]), c(w[2][j])], dp).store(&mut out.rows[j][at..]);
+    }
+}
+
+/// Writes the gradients of sh0 and shN and adds the part of means that comes through the direction.
+#[inline(always)]
+fn colour_backward<V: Vector>(soa: &Soa, lens: &Lens, k: usize, sums: &[Row; 12], at: usize, out: &mut GradientRows) {
+    let rgb = colour::<V>(soa, lens, k, at);
+    let mut d = rgb;
+    for ch in 0..3 {
+        d[ch] = V::load(&sums[6 + ch][at..]).select(c::<V>(0.0).lt(rgb[ch]), c(0.0));
+        (d[ch] * c(sh::SH_C0)).store(&mut out.rows[11 + ch][at..]);
+    }
+    if k == 0 {
+        return;
+    }
+    let (dir, inv) = direction::<V>(soa, lens, at);
+    let basis = sh::basis(k, dir);
+    let mut dbasis = [c::<V>(0.0); 15];
+    for i in 0..k {
+        for ch in 0..3 {
+            (basis[i] * d[ch]).store(&mut out.sh_n[i][ch][at..]);
+            dbasis[i] = d[ch].mul_add(V::load(&soa.sh_n[i][ch][at..]), dbasis[i]);
+        }
+    }
+    let ddir = sh::basis_backward(k, dir, &dbasis);
+    let along = dot3(ddir, dir);
+    for j in 0..3 {
+        let mean = V::load(&out.rows[j][at..]) + inv * (ddir[j] - dir[j] * along);
+        mean.store(&mut out.rows[j][at..]);
+    }
+}
+
+#[inline(always)]
+fn project_backward_kernel<V: Vector>(
+    splats: &Splats,
+    lens: &Lens,
+    first: usize,
+    sums: &[Row; 12],
+    out: &mut GradientRows,
+) {
+    let mut soa = Soa::new();
+    soa.fill(splats, first);
+    for at in (0..CHUNK).step_by(V::LANES) {
+        let e = ewa::<V>(&soa, lens, at);
+        let s = screen(&e, sums, at);
+        geometry(&e, lens, &s, at, out);
+        colour_backward::<V>(&soa, lens, splats.sh_k, sums, at, out);
+        // d ln(sigmoid(x)) / dx = 1 - sigmoid(x)
+        let logit = V::load(&soa.logits[at..]).max(c(-55.0));
+        let up = crate::project::exp(-logit);
+        (V::load(&sums[0][at..]) * up / (c::<V>(1.0) + up)).store(&mut out.rows[10][at..]);
+        let gx = s.mean2d[0] * c(0.5 * lens.full[0]);
+        let gy = s.mean2d[1] * c(0.5 * lens.full[1]);
+        gx.mul_add(gx, gy * gy).sqrt().store(&mut out.rows[14][at..]);
+    }
+}
+dispatch!(
+    /// Gradients of Gaussians first .. first + 16 from their sums; lanes that are not visible hold garbage.
+    pub fn project_backward = project_backward_kernel(
+        splats: &Splats,
+        lens: &Lens,
+        first: usize,
+        sums: &[Row; 12],
+        out: &mut GradientRows,
+    )
+);

@@ -1,0 +1,244 @@
+//! What goes in and out of the rasterizer: Gaussians, a view, gradients; flat slices in the layout of the Python arrays.
+
+use std::fmt;
+
+/// N Gaussians, parameters before activation (exp, sigmoid and normalisation happen inside).
+#[derive(Clone, Copy)]
+pub struct Splats<'a> {
+    pub means: &'a [f32],           // [N, 3]
+    pub quats: &'a [f32],           // [N, 4] wxyz, any length but zero
+    pub log_scales: &'a [f32],      // [N, 3]
+    pub logit_opacities: &'a [f32], // [N]
+    pub sh0: &'a [f32],             // [N, 3]
+    pub sh_n: &'a [f32],            // [N, K, 3]
+    pub sh_k: usize,                // K = 0, 3, 8 or 15
+}
+
+impl Splats<'_> {
+    pub fn len(&self) -> usize {
+        self.logit_opacities.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.logit_opacities.is_empty()
+    }
+
+    /// # Errors
+    /// A length that does not belong to N Gaussians, or a K that is no SH degree.
+    pub fn check(&self) -> Result<(), RasterError> {
+        let n = self.len();
+        let k = self.sh_k;
+        if !matches!(k, 0 | 3 | 8 | 15) {
+            return Err(RasterError::Shape {
+                name: "shN",
+                expected: 15,
+                got: k,
+            });
+        }
+        if n > MAX_GAUSSIANS {
+            return Err(RasterError::TooMany {
+                what: "Gaussians",
+                limit: MAX_GAUSSIANS,
+            });
+        }
+        check_length("means", self.means.len(), 3 * n)?;
+        check_length("quats", self.quats.len(), 4 * n)?;
+        check_length("log_scales", self.log_scales.len(), 3 * n)?;
+        check_length("sh0", self.sh0.len(), 3 * n)?;
+        check_length("shN", self.sh_n.len(), 3 * k * n)
+    }
+}
+
+/// Gradients, same shapes as `Splats`; overwritten, not added to.
+pub struct Gradients<'a> {
+    pub means: &'a mut [f32],
+    pub quats: &'a mut [f32],
+    pub log_scales: &'a mut [f32],
+    pub logit_opacities: &'a mut [f32],
+    pub sh0: &'a mut [f32],
+    pub sh_n: &'a mut [f32],
+    /// [N] norm of the gradient of the projected mean, in units of half the image (3DGS's densification measure).
+    pub grad2d: &'a mut [f32],
+    /// [N] largest and summed blending weight alpha * transmittance over the pixels.
+    pub max_weight: &'a mut [f32],
+    pub sum_weight: &'a mut [f32],
+}
+
+impl<'a> Gradients<'a> {
+    pub fn reborrow(&mut self) -> Gradients<'_> {
+        Gradients {
+            means: self.means,
+            quats: self.quats,
+            log_scales: self.log_scales,
+            logit_opacities: self.logit_opacities,
+            sh0: self.sh0,
+            sh_n: self.sh_n,
+            grad2d: self.grad2d,
+            max_weight: self.max_weight,
+            sum_weight: self.sum_weight,
+        }
+    }
+
+    /// The first `n` Gaussians, and the others.
+    pub fn split_at(self, n: usize, sh_k: usize) -> (Gradients<'a>, Gradients<'a>) {
+        let (means, means2) = self.means.split_at_mut(3 * n);
+        let (quats, quats2) = self.quats.split_at_mut(4 * n);
+        let (log_scales, log_scales2) = self.log_scales.split_at_mut(3 * n);
+        let (logit_opacities, logit_opacities2) = self.logit_opacities.split_at_mut(n);
+        let (sh0, sh02) = self.sh0.split_at_mut(3 * n);
+        let (sh_n, sh_n2) = self.sh_n.split_at_mut(3 * sh_k * n);
+        let (grad2d, grad2d2) = self.grad2d.split_at_mut(n);
+        let (max_weight, max_weight2) = self.max_weight.split_at_mut(n);
+        let (sum_weight, sum_weight2) = self.sum_weight.split_at_mut(n);
+        (
+            Gradients {
+                means,
+                quats,
+                log_scales,
+                logit_opacities,
+                sh0,
+                sh_n,
+                grad2d,
+                max_weight,
+                sum_weight,
+            },
+            Gradients {
+                means: means2,
+                quats: quats2,
+                log_scales: log_scales2,
+                logit_opacities: logit_opacities2,
+                sh0: sh02,
+                sh_n: sh_n2,
+                grad2d: grad2d2,
+                max_weight: max_weight2,
+                sum_weight: sum_weight2,
+            },
+        )
+    }
+
+    /// # Errors
+    /// A length that differs from that of the parameter.
+    pub fn check(&self, splats: &Splats) -> Result<(), RasterError> {
+        let n = splats.len();
+        check_length("gradient of means", self.means.len(), 3 * n)?;
+        check_length("gradient of quats", self.quats.len(), 4 * n)?;
+        check_length("gradient of log_scales", self.log_scales.len(), 3 * n)?;
+        check_length("gradient of logit_opacities", self.logit_opacities.len(), n)?;
+        check_length("gradient of sh0", self.sh0.len(), 3 * n)?;
+        check_length("gradient of shN", self.sh_n.len(), splats.sh_n.len())?;
+        check_length("grad2d", self.grad2d.len(), n)?;
+        check_length("max_weight", self.max_weight.len(), n)?;
+        check_length("sum_weight", self.sum_weight.len(), n)
+    }
+}
+
+/// A pixel rectangle of the view; what is rendered.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Region {
+    pub x: usize,
+    pub y: usize,
+    pub width: usize,
+    pub height: usize,
+}
+
+impl Region {
+    pub fn pixels(&self) -> usize {
+        self.width * self.height
+    }
+}
+
+/// A pinhole camera (OpenCV axes, pixel centres at half-integers) and the part of its image that is wanted.
+#[derive(Clone, Copy, Debug)]
+pub struct View {
+    pub width: usize,
+    pub height: usize,
+    pub focal: [f32; 2],
+    pub center: [f32; 2],
+    pub rotation: [[f32; 3]; 3], // world to camera
+    pub translation: [f32; 3],
+    pub region: Region,
+}
+
+impl View {
+    /// # Errors
+    /// An empty or too large image, or a region that is not inside of it.
+    pub fn check(&self) -> Result<(), RasterError> {
+        let r = self.region;
+        let inside = r.x.saturating_add(r.width) <= self.width && r.y.saturating_add(r.height) <= self.height;
+        if !inside || r.width == 0 || r.height == 0 {
+            return Err(RasterError::Region {
+                region: r,
+                width: self.width,
+                height: self.height,
+            });
+        }
+        if self.width > MAX_SIDE || self.height > MAX_SIDE {
+            return Err(RasterError::TooMany {
+                what: "pixels on a side",
+                limit: MAX_SIDE,
+            });
+        }
+        Ok(())
+    }
+
+    /// Position of the camera in the world.
+    pub fn eye(&self) -> [f32; 3] {
+        let (r, t) = (&self.rotation, &self.translation);
+        std::array::from_fn(|j| -(r[0][j] * t[0] + r[1][j] * t[1] + r[2][j] * t[2]))
+    }
+}
+
+pub const MAX_SIDE: usize = 16384;
+pub const MAX_GAUSSIANS: usize = 1 << 26;
+/// Gaussian-tile pairs of one image; 2^28 of them take 16 GB in training.
+pub const MAX_PAIRS: usize = 1 << 28;
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum RasterError {
+    Shape {
+        name: &'static str,
+        expected: usize,
+        got: usize,
+    },
+    Region {
+        region: Region,
+        width: usize,
+        height: usize,
+    },
+    TooMany {
+        what: &'static str,
+        limit: usize,
+    },
+    NothingRendered,
+}
+
+impl fmt::Display for RasterError {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self {
+            RasterError::Shape { name, expected, got } => write!(f, "{name} has {got} values, expected {expected}"),
+            RasterError::Region {
+                region: r,
+                width,
+                height,
+            } => write!(
+                f,
+                "region {}x{} at ({}, {}) is empty or not inside of the {width}x{height} image",
+                r.width, r.height, r.x, r.y
+            ),
+            RasterError::TooMany { what, limit } => write!(f, "more than {limit} {what}"),
+            RasterError::NothingRendered => {
+                write!(f, "backward without a forward pass of these Gaussians and this view")
+            }
+        }
+    }
+}
+
+impl std::error::Error for RasterError {}
+
+pub(crate) fn check_length(name: &'static str, got: usize, expected: usize) -> Result<(), RasterError> {
+    if got == expected {
+        Ok(())
+    } else {
+        Err(RasterError::Shape { name, expected, got })
+    }
+}

@@ -1,0 +1,182 @@
+//! One vector interface for all kernels. A kernel is written once, generic over `Vector`; the instances are `f32` (the plain
+//! reference), AVX2 + FMA and AVX-512, chosen at run time by `Level`. `dispatch!` makes the entry point of a kernel: it
+//! compiles the instance inside a function that has the target features, which is what lets the intrinsics inline.
+
+#[cfg(target_arch = "x86_64")]
+pub mod avx2;
+#[cfg(target_arch = "x86_64")]
+pub mod avx512;
+mod scalar;
+
+use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
+
+/// LANES floats. `Mask` has one truth value a lane.
+pub trait Vector:
+    Copy
+    + Add<Output = Self>
+    + Sub<Output = Self>
+    + Mul<Output = Self>
+    + Div<Output = Self>
+    + Neg<Output = Self>
+    + Send
+    + Sync
+    + 'static
+{
+    const LANES: usize;
+    type Mask: Copy + BitAnd<Output = Self::Mask> + BitOr<Output = Self::Mask> + Not<Output = Self::Mask>;
+
+    fn splat(x: f32) -> Self;
+    /// The first LANES values of `s`, which must have as many.
+    fn load(s: &[f32]) -> Self;
+    fn store(self, d: &mut [f32]);
+    /// self * b + c
+    fn mul_add(self, b: Self, c: Self) -> Self;
+    /// c - self * b
+    fn neg_mul_add(self, b: Self, c: Self) -> Self;
+    /// The smaller one; `b` where either is NaN.
+    fn min(self, b: Self) -> Self;
+    /// The larger one; `b` where either is NaN.
+    fn max(self, b: Self) -> Self;
+    fn abs(self) -> Self;
+    fn sqrt(self) -> Self;
+    /// 1/x within 1e-6
+    fn recip(self) -> Self;
+    /// 2^x, relative error below 1e-6 for -126 <= x <= 126; 0 or infinity far outside.
+    fn exp2(self) -> Self;
+    /// (m, e) with x = m 2^e, m in [1, 2), for positive normal x.
+    fn split_exponent(self) -> (Self, Self);
+    fn ge(self, b: Self) -> Self::Mask;
+    fn lt(self, b: Self) -> Self::Mask;
+    /// `self` where the mask is set, `b` elsewhere.
+    fn select(self, m: Self::Mask, b: Self) -> Self;
+    fn any(m: Self::Mask) -> bool;
+    fn max_lane(self) -> f32;
+    /// The sum over the lanes of each of 12 vectors.
+    fn sum12(v: &[Self; 12], out: &mut [f32; 12]);
+
+    /// log2(x) for positive normal x, absolute error below 2e-7 (+ rounding of the exponent).
+    #[inline(always)]
+    fn log2(self) -> Self {
+        let (m, e) = self.split_exponent();
+        let high = m.ge(Self::splat(std::f32::consts::SQRT_2));
+        let m = (m * Self::splat(0.5)).select(high, m);
+        let e = (e + Self::splat(1.0)).select(high, e);
+        let one = Self::splat(1.0);
+        let t = (m - one) / (m + one);
+        let t2 = t * t;
+        let p = t2.mul_add(Self::splat(1.0 / 9.0), Self::splat(1.0 / 7.0));
+        let p = t2.mul_add(p, Self::splat(1.0 / 5.0));
+        let p = t2.mul_add(p, Self::splat(1.0 / 3.0));
+        let p = t2.mul_add(p, one);
+        (t * p).mul_add(Self::splat(2.0 * std::f32::consts::LOG2_E), e)
+    }
+
+    #[inline(always)]
+    fn finite(self) -> Self::Mask {
+        self.abs().lt(Self::splat(f32::INFINITY))
+    }
+}
+
+/// A constant in every lane. (Not a closure in the kernels: closures are compiled without the target features.)
+#[inline(always)]
+pub(crate) fn c<V: Vector>(x: f32) -> V {
+    V::splat(x)
+}
+
+/// Minimax polynomial of 2^f on [-0.5, 0.5], degree 5, relative error 8e-8 before rounding.
+#[inline(always)]
+pub(crate) fn exp2_poly<V: Vector>(f: V) -> V {
+    let p = f.mul_add(V::splat(1.327_646_7e-3), V::splat(9.675_541e-3));
+    let p = f.mul_add(p, V::splat(5.550_713_3e-2));
+    let p = f.mul_add(p, V::splat(2.402_212e-1));
+    let p = f.mul_add(p, V::splat(std::f32::consts::LN_2));
+    f.mul_add(p, V::splat(1.0))
+}
+
+/// An instruction set that this machine has been found to have. There is no other way to make one, so kernels may rely on it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Level(Isa);
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Isa {
+    Scalar,
+    #[cfg(target_arch = "x86_64")]
+    Avx2,
+    #[cfg(target_arch = "x86_64")]
+    Avx512,
+}
+
+impl Level {
+    pub const SCALAR: Level = Level(Isa::Scalar);
+
+    /// Fastest first.
+    pub fn available() -> Vec<Level> {
+        let mut found = Vec::new();
+        #[cfg(target_arch = "x86_64")]
+        {
+            let fma = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+            let f = is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq");
+            if fma && f && is_x86_feature_detected!("avx512vl") && is_x86_feature_detected!("avx512bw") {
+                found.push(Level(Isa::Avx512));
+            }
+            if fma {
+                found.push(Level(Isa::Avx2));
+            }
+        }
+        found.push(Level::SCALAR);
+        found
+    }
+
+    pub fn best() -> Level {
+        Level::available().first().copied().unwrap_or(Level::SCALAR)
+    }
+
+    pub fn name(self) -> &'static str {
+        match self.0 {
+            Isa::Scalar => "scalar",
+            #[cfg(target_arch = "x86_64")]
+            Isa::Avx2 => "avx2",
+            #[cfg(target_arch = "x86_64")]
+            Isa::Avx512 => "avx512",
+        }
+    }
+
+    pub(crate) fn isa(self) -> Isa {
+        self.0
+    }
+}
+
+/// `dispatch!(pub fn name = kernel(arg: Type, ...) -> Ret)`: a function that takes a `Level` first and runs
+/// `kernel::<V>` with the vector type of that level.
+macro_rules! dispatch {
+    ($(#[$doc:meta])* $vis:vis fn $name:ident = $kernel:ident($($arg:ident: $ty:ty),* $(,)?) $(-> $ret:ty)?) => {
+        $(#[$doc])*
+        #[allow(clippy::too_many_arguments)]
+        $vis fn $name(level: $crate::simd::Level, $($arg: $ty),*) $(-> $ret)? {
+            #[cfg(target_arch = "x86_64")]
+            {
+                #[target_feature(enable = "avx2,fma,avx512f,avx512dq,avx512vl,avx512bw")]
+                fn avx512($($arg: $ty),*) $(-> $ret)? {
+                    $kernel::<$crate::simd::avx512::F32x16>($($arg),*)
+                }
+                #[target_feature(enable = "avx2,fma")]
+                fn avx2($($arg: $ty),*) $(-> $ret)? {
+                    $kernel::<$crate::simd::avx2::F32x8>($($arg),*)
+                }
+                match level.isa() {
+                    // SAFETY: a Level of this value exists only after run-time detection of these features.
+                    $crate::simd::Isa::Avx512 => return unsafe { avx512($($arg),*) },
+                    // SAFETY: as above.
+                    $crate::simd::Isa::Avx2 => return unsafe { avx2($($arg),*) },
+                    $crate::simd::Isa::Scalar => {}
+                }
+            }
+            let _ = level;
+            $kernel::<f32>($($arg),*)
+        }
+    };
+}
+pub(crate) use dispatch;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,187 @@
+//! The image side of a training step in one call: draw, compare with an 8-bit target, differentiate.
+//!
+//! Target: unassociated 8-bit colour and optional alpha, composited on the same background as the Gaussians. Loss: the image
+//! loss plus mask_lambda * mean |alpha - target alpha|. Nothing a pixel large ever passes through the caller.
+
+use std::time::Instant;
+
+use rayon::prelude::*;
+
+use crate::loss::{ImageLoss, LossValue, Pair};
+use crate::rasterizer::{Rasterizer, Shade, ms};
+use crate::scene::{Gradients, RasterError, Splats, View, check_length};
+
+/// What the picture of a view should be: [H, W, 3], [H, W] and [H, W] of the whole image, not of the region.
+#[derive(Clone, Copy)]
+pub struct Target<'a> {
+    pub rgb: &'a [u8],
+    pub alpha: Option<&'a [u8]>,
+    pub weight: Option<&'a [f32]>,
+}
+
+#[derive(Clone, Copy)]
+pub struct Lambdas {
+    pub ssim: f32,
+    pub mask: f32,
+}
+
+#[derive(Clone, Copy, Default, Debug)]
+pub struct StepValue {
+    pub image: LossValue,
+    pub mask: f64,
+    pub loss: f64,
+    /// Gradient by the gain of `Shade`.
+    pub gain: [f64; 3],
+}
+
+/// Buffers of a step, [H, W, ...] of the region.
+#[derive(Default)]
+pub struct Step {
+    loss: ImageLoss,
+    target: Vec<f32>,
+    weight: Vec<f32>,
+    grad_image: Vec<f32>,
+    grad_alpha: Vec<f32>,
+    rows: Vec<[f64; 4]>, // mask and gain sums of each image row
+}
+
+impl Step {
+    /// # Errors
+    /// Wrong lengths, an empty or too large view, too many Gaussian-tile pairs.
+    #[allow(clippy::too_many_arguments)] // one training step has these inputs
+    pub fn run(
+        &mut self,
+        rasterizer: &mut Rasterizer,
+        splats: &Splats,
+        view: &View,
+        shade: Shade,
+        target: Target,
+        lambdas: Lambdas,
+        out: &mut Gradients,
+    ) -> Result<StepValue, RasterError> {
+        splats.check()?;
+        view.check()?;
+        let pixels = view.width * view.height;
+        check_length("target rgb", target.rgb.len(), 3 * pixels)?;
+        check_length("target alpha", target.alpha.map_or(pixels, <[u8]>::len), pixels)?;
+        check_length("weight", target.weight.map_or(pixels, <[f32]>::len), pixels)?;
+        rasterizer.run(|r| {
+            r.forward_here(splats, view, shade, true)?;
+            let start = Instant::now();
+            let value = self.compare(r, view, shade, target, lambdas)?;
+            r.timings.loss = ms(start);
+            r.backward_here(splats, &self.grad_image, &self.grad_alpha, out)?;
+            Ok(value)
+        })
+    }
+
+    fn compare(
+        &mut self,
+        r: &Rasterizer,
+        view: &View,
+        shade: Shade,
+        target: Target,
+        lambdas: Lambdas,
+    ) -> Result<StepValue, RasterError> {
+        let n = view.region.pixels();
+        self.target.resize(3 * n, 0.0);
+        self.grad_image.resize(3 * n, 0.0);
+        self.grad_alpha.resize(n, 0.0);
+        self.rows.resize(view.region.height, [0.0; 4]);
+        self.composite(r, view, shade, target, lambdas.mask);
+        let weight = target.weight.map(|w| {
+            let region = view.region;
+            self.weight.clear();
+            for y in region.y..region.y + region.height {
+                self.weight
+                    .extend_from_slice(&w[y * view.width + region.x..][..region.width]);
+            }
+            &self.weight[..]
+        });
+        let pair = Pair {
+            image: r.image(),
+            target: &self.target,
+            width: view.region.width,
+            weight,
+        };
+        let image = self.loss.run(r.level(), pair, lambdas.ssim, &mut self.grad_image)?;
+        let mask = self.rows.iter().map(|s| s[0]).sum::<f64>() / n as f64;
+        let gain = self.gain_gradient(r, view.region.width, shade);
+        Ok(StepValue {
+            image,
+            mask,
+            loss: image.loss + f64::from(lambdas.mask) * mask,
+            gain,
+        })
+    }
+
+    /// Fills `target` and `grad_alpha`, and the mask sums.
+    fn composite(&mut self, r: &Rasterizer, view: &View, shade: Shade, target: Target, mask_lambda: f32) {
+        let region = view.region;
+        let width = region.width;
+        let slope = mask_lambda / region.pixels() as f32;
+        let rows = self
+            .target
+            .par_chunks_mut(3 * width)
+            .zip(self.grad_alpha.par_chunks_mut(width));
+        let rows = rows.zip(r.alpha().par_chunks(width)).zip(&mut self.rows).enumerate();
+        rows.for_each(|(y, (((out, grad), drawn), sums))| {
+            let at = (region.y + y) * view.width + region.x;
+            let rgb = &target.rgb[3 * at..3 * (at + width)];
+            let Some(alpha) = target.alpha.map(|a| &a[at..at + width]) else {
+                out.iter_mut()
+                    .zip(rgb)
+                    .for_each(|(o, &v)| *o = f32::from(v) * (1.0 / 255.0));
+                grad.fill(0.0);
+                sums[0] = 0.0;
+                return;
+            };
+            let mut sum = 0.0;
+            for (x, &a) in alpha.iter().enumerate() {
+                let a = f32::from(a) * (1.0 / 255.0);
+                for ch in 0..3 {
+                    let v = f32::from(rgb[3 * x + ch]) * (1.0 / 255.0);
+                    out[3 * x + ch] = v * a + (1.0 - a) * shade.background[ch];
+                }
+                let d = drawn[x] - a;
+                sum += d.abs();
+                grad[x] = if d > 0.0 {
+                    slope
+                } else if d < 0.0 {
+                    -slope
+                } else {
+                    0.0
+                };
+            }
+            sums[0] = f64::from(sum);
+        });
+    }
+
+    /// sum over pixels of g . (image - T background) / gain
+    fn gain_gradient(&mut self, r: &Rasterizer, width: usize, shade: Shade) -> [f64; 3] {
+        let Some(gain) = shade.gain else { return [0.0; 3] };
+        let grads = self.grad_image.par_chunks(3 * width);
+        let drawn = r.image().par_chunks(3 * width).zip(r.alpha().par_chunks(width));
+        grads
+            .zip(drawn)
+            .zip(&mut self.rows)
+            .for_each(|((g, (image, alpha)), sums)| {
+                let mut s = [0.0f64; 3];
+                for (x, a) in alpha.iter().enumerate() {
+                    for ch in 0..3 {
+                        let own = image[3 * x + ch] - (1.0 - a) * shade.background[ch];
+                        s[ch] += f64::from(g[3 * x + ch] * own);
+                    }
+                }
+                sums[1..].copy_from_slice(&s);
+            });
+        let sum = |ch: usize| self.rows.iter().map(|s| s[1 + ch]).sum::<f64>();
+        std::array::from_fn(|ch| {
+            if gain[ch] == 0.0 {
+                0.0
+            } else {
+                sum(ch) / f64::from(gain[ch])
+            }
+        })
+    }
+}

@@ -1,0 +1,113 @@
+//! What the forward and backward tile kernels share: a tile is 16 blocks of 4 x 4 pixels, block by block in memory, so that
+//! a small ellipse touches few vectors; and for each Gaussian of the tile the 16-bit mask of the blocks its ellipse meets.
+
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+
+use crate::bin::{TILE, reach};
+use crate::project::{CHUNK, Projected};
+use crate::simd::{Vector, c};
+
+pub const BLOCKS: usize = 16;
+pub const BLOCK: usize = 16;
+
+/// One value a pixel, [block][pixel of the block].
+#[derive(Clone, Copy)]
+#[repr(align(64))]
+pub struct Plane(pub [[f32; BLOCK]; BLOCKS]);
+
+impl Plane {
+    pub const ZERO: Plane = Plane([[0.0; BLOCK]; BLOCKS]);
+}
+
+/// Pixel centres inside of the tile.
+pub static PIXEL_X: Plane = pixel_centres(true);
+pub static PIXEL_Y: Plane = pixel_centres(false);
+
+const fn pixel_centres(x: bool) -> Plane {
+    let mut p = [[0.0; BLOCK]; BLOCKS];
+    let mut i = 0;
+    while i < TILE * TILE {
+        let (b, k) = (i / BLOCK, i % BLOCK);
+        let v = if x { b % 4 * 4 + k % 4 } else { b / 4 * 4 + k / 4 };
+        p[b][k] = v as f32 + 0.5;
+        i += 1;
+    }
+    Plane(p)
+}
+
+/// Block and pixel of the block of a pixel of the tile.
+#[inline(always)]
+pub fn swizzle(x: usize, y: usize) -> (usize, usize) {
+    ((y / 4 * 4 + x / 4) & 15, (y % 4 * 4 + x % 4) & 15)
+}
+
+/// Up to 16 Gaussians of the tile, copied together, positions relative to the tile.
+pub struct Batch {
+    pub splats: [Projected; CHUNK],
+    rows: [[f32; CHUNK]; 6], // x y l11 l21 l22 reach
+}
+
+impl Batch {
+    pub fn new() -> Batch {
+        Batch {
+            splats: [Projected::default(); CHUNK],
+            rows: [[0.0; CHUNK]; 6],
+        }
+    }
+
+    #[inline(always)]
+    pub fn fill(&mut self, projected: &[Projected], pairs: &[AtomicU32], origin: [f32; 2]) {
+        for (lane, (s, pair)) in self.splats.iter_mut().zip(pairs).enumerate() {
+            *s = projected[pair.load(Relaxed) as usize];
+            s.x -= origin[0];
+            s.y -= origin[1];
+            let fields = [s.x, s.y, s.l11, s.l21, s.l22, reach(s.log2_opacity)];
+            for (row, v) in self.rows.iter_mut().zip(fields) {
+                row[lane] = v;
+            }
+        }
+    }
+
+    /// Exact test of each ellipse against the pixel centres of each block.
+    #[inline(always)]
+    pub fn masks<V: Vector>(&self, masks: &mut [u16; CHUNK]) {
+        for at in (0..CHUNK).step_by(V::LANES) {
+            let mut bits = [0.0; CHUNK];
+            self.mask_lanes::<V>(at).store(&mut bits);
+            for lane in 0..V::LANES {
+                masks[at + lane] = bits[lane] as u16;
+            }
+        }
+    }
+
+    /// The masks as exact small floats, which spares the vector interface integers.
+    #[inline(always)]
+    fn mask_lanes<V: Vector>(&self, at: usize) -> V {
+        let r = &self.rows;
+        let (x, y) = (V::load(&r[0][at..]), V::load(&r[1][at..]));
+        let (l11, l21, l22) = (V::load(&r[2][at..]), V::load(&r[3][at..]), V::load(&r[4][at..]));
+        let q = V::load(&r[5][at..]);
+        // y where the ellipse is widest to the right: l21 sqrt(q) / (l22 sqrt(l21^2 + l22^2)), downwards negative
+        let norm = l21.mul_add(l21, l22 * l22);
+        let peak = -(l21 * (q / norm).sqrt() / l22);
+        let mut bits = c::<V>(0.0);
+        for row in 0..4 {
+            let top = c::<V>(4.0 * row as f32 + 0.5) - y;
+            let bottom = top + c(3.0);
+            let (yr, yl) = (peak.max(top).min(bottom), (-peak).max(top).min(bottom));
+            let (vr, vl) = (l22 * yr, l22 * yl);
+            let (hr, hl) = (vr.neg_mul_add(vr, q), vl.neg_mul_add(vl, q));
+            let met = hr.ge(c(0.0)) & hl.ge(c(0.0));
+            // ends of the ellipse within the row of blocks, times l11
+            let right = l21.neg_mul_add(yr, hr.max(c(0.0)).sqrt());
+            let left = l21.neg_mul_add(yl, -hl.max(c(0.0)).sqrt());
+            for column in 0..4 {
+                let first = (c::<V>(4.0 * column as f32 + 0.5) - x) * l11;
+                let last = (c::<V>(4.0 * column as f32 + 3.5) - x) * l11;
+                let hit = met & right.ge(first) & last.ge(left);
+                bits = (bits + c((1u32 << (4 * row + column)) as f32)).select(hit, bits);
+            }
+        }
+        bits
+    }
+}

@@ -1,0 +1,52 @@
+"""Gaussians + Camera -> a picture as numpy arrays. No torch.
+
+The player's side: `gscodec render`, `eval` and the metrics.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gscodec.camera import Camera
+from gscodec.gaussians import Gaussians
+from gscodec.render.workspace import PARAMETERS, Workspace
+
+_shared: list[Workspace] = []  # one workspace for callers that bring none
+
+
+def render_rgba(gaussians: Gaussians, camera: Camera, *, workspace: Workspace | None = None) -> np.ndarray:
+    """Draws Gaussians over nothing.
+
+    Returns:
+        [H, W, 4] f32: colour premultiplied by alpha (not clamped at 1), and alpha.
+    """
+    image, alpha = _draw(gaussians, camera, (0.0, 0.0, 0.0), workspace)
+    return np.concatenate([image, alpha[..., None]], axis=2)
+
+
+def render_image(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: tuple[float, float, float] = (0.5, 0.5, 0.5),
+    *,
+    workspace: Workspace | None = None,
+) -> np.ndarray:
+    """Draws Gaussians over a background colour in [0, 1].
+
+    Returns:
+        [H, W, 3] uint8, rounded.
+    """
+    image, _ = _draw(gaussians, camera, background, workspace)
+    np.clip(image, 0.0, 1.0, out=image)
+    image *= 255.0
+    image += 0.5
+    return image.astype(np.uint8)
+
+
+def _draw(gaussians: Gaussians, camera: Camera, background, workspace: Workspace | None):
+    if workspace is None:
+        if not _shared:
+            _shared.append(Workspace())
+        workspace = _shared[0]
+    params = tuple(np.ascontiguousarray(getattr(gaussians, name), np.float32) for name in PARAMETERS)
+    return workspace.forward(params, camera, background)

@@ -1,0 +1,144 @@
+"""Frames of a stream to pictures: camera path -> CPU rasterizer -> .mp4 or a folder of .png."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from gscodec.camera import Camera, look_at
+from gscodec.errors import UsageError, require
+from gscodec.gaussians import Gaussians
+from gscodec.render.image import render_image
+from gscodec.render.png import write_png
+
+ORBIT_SECONDS = 8.0  # one turn
+FIELD_OF_VIEW = 40.0  # degrees, orbit camera
+
+
+def up_vector(axis: str) -> np.ndarray:
+    """ "z" or "-y" -> [3] unit vector."""
+    v = np.zeros(3)
+    v["xyz".index(axis[-1])] = -1.0 if axis.startswith("-") else 1.0
+    return v
+
+
+def orbit_camera(g: Gaussians, up: str, turn: float, width: int, height: int) -> Camera:
+    """A camera around the 1-99 % box of `g` with its bounding sphere in frame; `turn` in turns."""
+    low, high = np.percentile(g.means, [1, 99], axis=0) if len(g) else (np.zeros(3), np.ones(3))
+    centre, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    u = up_vector(up)
+    side = np.roll(u, 1)
+    ahead = np.cross(u, side)
+    half = np.radians(FIELD_OF_VIEW) / 2
+    angle = 2 * np.pi * turn
+    direction = np.cos(angle) * side + np.sin(angle) * ahead + 0.2 * u
+    eye = centre + direction / np.linalg.norm(direction) * radius / np.sin(half)
+    f = min(width, height) / 2 / np.tan(half)
+    K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
+    return Camera("orbit", K, look_at(eye, centre, u), width, height)
+
+
+def load_camera(path: Path) -> Camera:
+    """A camera from a .json file with K [3, 3], viewmat [4, 4] (world-to-camera, OpenCV), width and height.
+
+    Raises:
+        UsageError: it is not such a file.
+    """
+    try:
+        c = json.loads(Path(path).read_text())
+        return Camera("file", np.array(c["K"], float), np.array(c["viewmat"], float), int(c["width"]), int(c["height"]))
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise UsageError(f"--camera {path}: expected a JSON object with K, viewmat, width and height ({e})") from None
+
+
+def camera_path(stream, camera: str, size: str | None, frames: range) -> Iterator[Camera]:
+    """One camera per frame.
+
+    Raises:
+        UsageError: the camera or the size makes no sense.
+    """
+    wanted = parse_size(size)
+    if camera == "orbit":
+        width, height = wanted or (512, 512)
+        first = stream.frame(frames[0])
+        for t in frames:
+            yield orbit_camera(first, stream.config["up"], t / (stream.fps * ORBIT_SECONDS), width, height)
+        return
+    known = {c.name: c for c in stream.cameras}
+    if camera in known:
+        fixed = known[camera]
+    elif camera.endswith(".json"):
+        fixed = load_camera(Path(camera))
+    else:
+        names = ", ".join(known) or "none in this file"
+        raise UsageError(
+            f"--camera {camera} does not exist, expected orbit, a .json file or a reference camera ({names})"
+        )
+    fixed = fixed.resized(*wanted) if wanted else fixed
+    for _ in frames:
+        yield fixed
+
+
+def parse_size(size: str | None) -> tuple[int, int] | None:
+    """ "640x480" -> (640, 480).
+
+    Raises:
+        UsageError: not of that form, or outside 1 to 16384.
+    """
+    if size is None:
+        return None
+    try:
+        w, h = (int(v) for v in size.lower().split("x"))
+    except ValueError:
+        raise UsageError(f"--size {size} is not a size, expected WxH such as 640x480") from None
+    if not (1 <= w <= 16384 and 1 <= h <= 16384):
+        raise UsageError(f"--size {size} is out of range, expected 1 to 16384 pixels a side")
+    return w, h
+
+
+def render_stream(stream, dest: Path, *, camera: str, size: str | None, frames: range, bar) -> int:
+    """Renders `frames` of a stream to `dest`, a .mp4 file or a folder; returns how many."""
+    dest = Path(dest)
+    movie = dest.suffix.lower() == ".mp4"
+    if dest.suffix and not movie and not dest.is_dir():
+        raise UsageError(f"{dest}: expected a name that ends in .mp4, or a folder for .png images")
+    background = tuple(stream.config["background"])
+    cameras = camera_path(stream, camera, size, frames)
+    pictures = (render_image(stream.frame(t), c, background) for t, c in zip(frames, cameras, strict=True))
+    write = _write_movie if movie else _write_images
+    for done in write(pictures, dest, stream.fps, frames):
+        bar.update("render", done, len(frames))
+    return len(frames)
+
+
+def _write_images(pictures, folder: Path, fps: float, frames: range) -> Iterator[int]:
+    folder.mkdir(parents=True, exist_ok=True)
+    for done, (t, picture) in enumerate(zip(frames, pictures, strict=True), 1):
+        write_png(folder / f"{t:06d}.png", picture)
+        yield done
+
+
+def _write_movie(pictures, path: Path, fps: float, frames: range) -> Iterator[int]:
+    ffmpeg = require("imageio_ffmpeg", "writing .mp4 (a folder of .png needs nothing)")
+    part = path.with_name(path.stem + ".part.mp4")
+    first = next(pictures)
+    h, w = first.shape[0] // 2 * 2, first.shape[1] // 2 * 2  # yuv420p has even sides
+    writer = ffmpeg.write_frames(
+        str(part), (w, h), fps=fps, codec="libx264", quality=None, macro_block_size=1, output_params=["-crf", "16"]
+    )
+    writer.send(None)
+    try:
+        writer.send(np.ascontiguousarray(first[:h, :w]))
+        yield 1
+        for done, picture in enumerate(pictures, 2):
+            writer.send(np.ascontiguousarray(picture[:h, :w]))
+            yield done
+        writer.close()
+        os.replace(part, path)
+    finally:
+        writer.close()
+        part.unlink(missing_ok=True)

@@ -1,0 +1,107 @@
+"""The native rasterizer with its buffers: what `image`, `rasterize` and `step` share. Needs no torch.
+
+A workspace keeps its buffers from call to call: make one per thread of control and use it for all views.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gscodec import _native
+from gscodec.camera import Camera
+from gscodec.errors import UsageError
+
+PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
+STATISTICS = ("grad2d", "max_weight", "sum_weight")
+
+Region = tuple[int, int, int, int]  # x, y, width, height in pixels
+
+
+def simd_levels() -> list[str]:
+    """The instruction sets that this machine can use, fastest first; "scalar" is the plain reference."""
+    return list(_native.simd_levels())
+
+
+class Workspace:
+    """A native rasterizer and the arrays its gradients are written to.
+
+    Args:
+        threads: 0 for all cores. Results do not depend on it.
+        simd: "auto" or one of `simd_levels()`.
+
+    Raises:
+        UsageError: this machine does not have that instruction set.
+    """
+
+    def __init__(self, threads: int = 0, simd: str = "auto"):
+        try:
+            self.native = _native.Rasterizer(threads, simd)
+        except ValueError as e:
+            raise UsageError(str(e)) from None
+        self.calls = 0  # forward passes so far; tells whether the native state is still that of a given picture
+        self._grads: dict[str, np.ndarray] = {}
+
+    @property
+    def simd(self) -> str:
+        return self.native.simd
+
+    @property
+    def timings(self) -> dict[str, float]:
+        """Milliseconds of the last passes: project, bin, blend, loss, backward_tiles, backward_project."""
+        return dict(self.native.timings())
+
+    def forward(self, params, camera: Camera, background, region: Region | None = None, training: bool = False):
+        """Draws `params` (the six arrays in the order of PARAMETERS).
+
+        Returns:
+            image [H, W, 3] f32 and alpha [H, W] f32 of the region, new arrays.
+        """
+        self.calls += 1
+        region = region or (0, 0, camera.width, camera.height)
+        image, alpha = call(self.native.forward, params, view(camera, region), rgb(background), training)
+        return image.reshape(region[3], region[2], 3), alpha.reshape(region[3], region[2])
+
+    def gradients(self, params) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+        """Arrays in the shapes of `params`, and three statistics [N]; the same ones as long as the shapes stay."""
+        n = len(params[0])
+        shapes = {name: p.shape for name, p in zip(PARAMETERS, params, strict=True)}
+        shapes |= {name: (n,) for name in STATISTICS}
+        for name, shape in shapes.items():
+            if name not in self._grads or self._grads[name].shape != shape:
+                self._grads[name] = np.zeros(shape, np.float32)
+        return tuple(self._grads[k] for k in PARAMETERS), tuple(self._grads[k] for k in STATISTICS)
+
+
+def view(camera: Camera, region: Region) -> dict:
+    """The camera as the native side takes it.
+
+    Raises:
+        UsageError: the camera is no pinhole.
+    """
+    K, m = np.asarray(camera.K, np.float64), np.asarray(camera.viewmat, np.float64)
+    if np.any(np.asarray(camera.distortion)) or K[0, 1] != 0:
+        raise UsageError(
+            f"camera {camera.name} has lens distortion or skew; undistort the images and render a pinhole camera"
+        )
+    return {
+        "size": [camera.width, camera.height],
+        "intrinsics": [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
+        "viewmat": m[:3].tolist(),
+        "region": [int(v) for v in region],
+    }
+
+
+def rgb(colour) -> list[float]:
+    """Three floats from a sequence or a tensor."""
+    values = [float(v) for v in colour]
+    if len(values) != 3:
+        raise UsageError(f"a colour has 3 values, got {len(values)}")
+    return values
+
+
+def call(function, *args):
+    """Calls into the native side; what it refuses is a mistake in the arguments."""
+    try:
+        return function(*args)
+    except ValueError as e:
+        raise UsageError(f"rasterizer: {e}") from None

@@ -1,0 +1,127 @@
+"""First points of a keyframe: the visual hull of the masks, or a random box where there are none.
+
+In: capture, frame. Out: points and colours. The volume is found from the cameras alone (where their axes meet), carved
+coarsely, then again inside the box of what is left; only the hull's surface is kept, since nobody sees the inside.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+COARSE = 64  # voxels a side
+MISSES = 0  # masks that may disagree with a voxel
+SEEN_SHARE = 0.5  # of the views must see a voxel
+
+
+def meeting_point(cameras) -> np.ndarray:
+    """[3] f64, the point nearest to all optical axes (least squares)."""
+    A, b = 1e-6 * np.eye(3), np.zeros(3)
+    for c in cameras:
+        axis = c.viewmat[2, :3]
+        P = np.eye(3) - np.outer(axis, axis)
+        A, b = A + P, b + P @ c.center
+    return np.linalg.solve(A, b)
+
+
+def project(camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[N, 3] world -> [N, 2] pixels and [N] depth."""
+    x = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    p = x @ camera.K.T
+    return p[:, :2] / np.where(np.abs(p[:, 2:]) < 1e-9, 1e-9, p[:, 2:]), x[:, 2]
+
+
+def _lattice(low: np.ndarray, high: np.ndarray, step: float) -> tuple[np.ndarray, tuple[int, int, int]]:
+    axes = [np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True)]
+    shape = tuple(len(a) for a in axes)
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3), shape
+
+
+def _inside(points: np.ndarray, views) -> np.ndarray:
+    """[N] bool: in the mask of every view that sees the point, and seen by most (masks say nothing of what is off)."""
+    seen = np.zeros(len(points), np.int32)
+    missed = np.zeros(len(points), np.int32)
+    for camera, _, alpha in views:
+        p, depth = project(camera, points)
+        x, y = np.floor(p).astype(np.int64).T
+        on = (depth > 0.01) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+        seen += on
+        missed[on] += alpha[y[on], x[on]] < 128
+    return (seen >= max(2, SEEN_SHARE * len(views))) & (missed <= MISSES)
+
+
+def _colors(points: np.ndarray, views) -> np.ndarray:
+    """[N, 3] 0..1: median over the views that look at the subject there (occlusion is left to training)."""
+    colors = np.full((len(views), len(points), 3), np.nan, np.float32)
+    for i, (camera, rgb, alpha) in enumerate(views):
+        p, depth = project(camera, points)
+        x, y = np.floor(p).astype(np.int64).T
+        on = np.flatnonzero((depth > 0.01) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height))
+        if alpha is not None:
+            on = on[alpha[y[on], x[on]] >= 128]
+        colors[i, on] = rgb[y[on], x[on]] / 255
+    unseen = np.isnan(colors).all(0)
+    colors[:, unseen] = 0.5
+    return np.nanmedian(colors, axis=0)
+
+
+def carve(cameras, views, count: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Surface of the visual hull.
+
+    Args:
+        cameras: training cameras; views: (camera, rgb u8, alpha u8) of each.
+        count: about so many points.
+
+    Returns:
+        points [P, 3], colours [P, 3] in 0..1, spacing in world units. P may be 0 if the masks agree nowhere.
+    """
+    centre = meeting_point(cameras)
+    half = min(np.linalg.norm(c.center - centre) for c in cameras)
+    low, high = centre - half, centre + half
+    step = 2 * half / COARSE
+    occupied, _ = _lattice(low, high, step)
+    occupied = occupied[_inside(occupied, views)]
+    if len(occupied) == 0:
+        return np.zeros((0, 3)), np.zeros((0, 3)), step
+    low, high = occupied.min(0) - step, occupied.max(0) + step
+    # The surface of a hull with V voxels of size s has about 6 V^(2/3) of them: refine until it has `count`.
+    volume = len(occupied) * step**3
+    step = min(step, np.sqrt(6 * volume ** (2 / 3) / count))
+    for _ in range(4):
+        points, shape = _lattice(low, high, step)
+        inside = _inside(points, views).reshape(shape)
+        padded = np.pad(inside, 1)
+        core = padded[1:-1, 1:-1, 1:-1].copy()
+        for axis in range(3):
+            for shift in (-1, 1):
+                core &= np.roll(padded, shift, axis)[1:-1, 1:-1, 1:-1]
+        surface = points[(inside & ~core).ravel()]
+        if 0.7 * count < len(surface) < 1.4 * count or len(surface) == 0:
+            break
+        step *= np.sqrt(len(surface) / count)
+    return surface, _colors(surface, views), float(step)
+
+
+def random_box(cameras, views, count: int, seed: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Random points in what the cameras see, nearer ones denser; for captures without masks.
+
+    Depths along random pixels of random cameras are spread evenly in 1/depth between a quarter of and three times
+    the distance to where the axes meet; points that fewer than two cameras see are dropped.
+    """
+    rng = np.random.default_rng(seed)
+    centre = meeting_point(cameras)
+    distance = np.median([np.linalg.norm(c.center - centre) for c in cameras])
+    picked = []
+    for c in cameras:
+        n = 3 * count // len(cameras) + 1
+        pixels = rng.uniform(0, 1, (n, 2)) * [c.width, c.height]
+        depth = 1 / rng.uniform(1 / (3 * distance), 1 / (0.25 * distance), n)
+        rays = np.concatenate([pixels, np.ones((n, 1))], 1) @ np.linalg.inv(c.K).T
+        picked.append((rays * depth[:, None] - c.viewmat[:3, 3]) @ c.viewmat[:3, :3])
+    points = np.concatenate(picked)
+    seen = np.zeros(len(points), np.int32)
+    for c in cameras:
+        p, depth = project(c, points)
+        seen += (depth > 0.01) & (p >= 0).all(1) & (p < [c.width, c.height]).all(1)
+    points = points[seen >= min(2, len(cameras))]
+    points = points[rng.permutation(len(points))[:count]]
+    return points, _colors(points, views), float(distance / count ** (1 / 3))

@@ -1,0 +1,174 @@
+"""Joint fine-tuning of a group: one canonical set and sparse residual trajectories that fit all frames and views.
+
+The model is the codec's own: frame t = canonical carried by the motion + sum_k basis[k, t] * c_k for every attribute
+that may change. All frames share the canonical attributes, so each Gaussian is seen by frames x views images instead of
+views; what does not pay is pulled to zero by the rate term: the entropy of the coefficients under noise-relaxed
+quantization at the stream's own step sizes, with a learned Laplace scale for each attribute and temporal frequency
+(V3's residual-entropy loss, made differentiable). The temporal term keeps consecutive frames alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from gscodec.bitstream.quantization import Steps
+from gscodec.bitstream.transform import dct_basis
+from gscodec.gaussians import Gaussians
+from gscodec.render.step import Workspace, render_loss
+from gscodec.train.keyframe import RATES
+from gscodec.train.model import Model
+from gscodec.train.motion import quat_multiply
+from gscodec.train.settings import TrainSettings
+from gscodec.train.views import Views
+
+# attribute -> (channels, temporal frequencies that may be used)
+RESIDUALS = {"means": (3, 8), "quats": (3, 4), "sh0": (3, 4)}
+RESIDUAL_RATE = {"means": 0.02, "quats": 0.02, "sh0": 0.02}  # in steps of the stream a step of the optimiser
+MEANS_RATE = 4e-5  # of the canonical means, times the radius
+
+
+def laplace_bits(x: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
+    """Bits of integers under a Laplace law of scale exp(log_scale), at real x (the relaxed quantizer's output).
+
+    Probability of the unit interval around x (Balle et al. 2017), computed without cancellation.
+    """
+    b = torch.exp(log_scale)
+    a = x.abs()
+    inner = 1 - 0.5 * (torch.exp((a - 0.5) / b) + torch.exp(-(a + 0.5) / b))  # |x| < 1/2
+    tail = torch.exp(-(a - 0.5).clamp(min=0) / b) * 0.5 * (-torch.expm1(-1 / b))
+    p = torch.where(a < 0.5, inner, tail)
+    far = (a - 0.5).clamp(min=0) / b / np.log(2) + 1 - torch.log2(-torch.expm1(-1 / b))  # where p underflows
+    return torch.where(p > 1e-9, -torch.log2(p.clamp(min=1e-9)), far)
+
+
+class GroupModel:
+    """Canonical model, fixed carrying motion, and the coefficients of what is left.
+
+    Args:
+        key: canonical Gaussians.
+        means, turned: [T, N, 3] and [T, N, 4] of `motion.track`.
+        steps: the stream's quantization.
+    """
+
+    def __init__(self, key: Model, means: torch.Tensor, turned: torch.Tensor, steps: Steps):
+        self.key, self.turned = key, turned
+        self.moved = means - key.params["means"]  # [T, N, 3]
+        self.basis = torch.from_numpy(dct_basis(len(means))).float()  # [T, T]
+        self.unit = {"means": steps.motion, "quats": steps.quats, "sh0": steps.sh0}
+        n = len(key)
+        self.coefficients = {}  # in units of the quantization step
+        for name, (channels, most) in RESIDUALS.items():
+            self.coefficients[name] = torch.zeros(min(most, len(means)), n, channels, requires_grad=True)
+        self.log_scales = {
+            n: torch.full((len(c), 1, 1), -1.0, requires_grad=True) for n, c in self.coefficients.items()
+        }
+
+    def residual(self, name: str, t: int) -> torch.Tensor:
+        """[N, C] residual of an attribute at frame `t`, in its own units."""
+        c = self.coefficients[name]
+        return self.unit[name] * torch.einsum("k,knc->nc", self.basis[: len(c), t], c)
+
+    def frame(self, t: int) -> dict[str, torch.Tensor]:
+        """Attributes of frame `t`; differentiable in the coefficients."""
+        p = self.key.params
+        dq = self.residual("quats", t)
+        w = (1 - dq.square().sum(1, keepdim=True)).clamp(min=1e-6).sqrt()
+        quats = quat_multiply(torch.cat([w, dq], 1), quat_multiply(self.turned[t], p["quats"]))
+        # The canonical means move with fine-tuning; what they moved turns with the Gaussian only to first order.
+        return {
+            **p,
+            "means": p["means"] + self.moved[t] + self.residual("means", t),
+            "quats": quats,
+            "sh0": p["sh0"] + self.residual("sh0", t),
+        }
+
+    def bits(self, generator: torch.Generator) -> torch.Tensor:
+        """Estimated bits of all coefficients, with uniform noise in place of rounding."""
+        total = torch.zeros(())
+        for name, c in self.coefficients.items():
+            noise = torch.rand(c.shape, generator=generator) - 0.5
+            total = total + laplace_bits(c + noise, self.log_scales[name]).sum()
+        return total
+
+    def gaussians(self, t: int) -> Gaussians:
+        """Frame `t` in numpy."""
+        with torch.no_grad():
+            arrays = {n: p.detach().numpy().astype(np.float32) for n, p in self.frame(t).items()}
+        arrays["quats"] = arrays["quats"] / np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
+        return Gaussians(**arrays)
+
+
+def finetune(
+    group: GroupModel,
+    views: Views,
+    frames: range,
+    settings: TrainSettings,
+    *,
+    radius: float,
+    on_step: Callable[[int, float], None] | None = None,
+) -> None:
+    """Optimises canonical attributes and coefficients over all frames; `on_step` gets (step, loss)."""
+    steps = settings.finetune_steps * len(frames)
+    rng = np.random.default_rng([settings.seed, frames[0], 2])
+    generator = torch.Generator().manual_seed(settings.seed)
+    workspace = Workspace()
+    optimizer = torch.optim.Adam(
+        [{"params": [c], "lr": RESIDUAL_RATE[n], "base": RESIDUAL_RATE[n]} for n, c in group.coefficients.items()]
+        + [{"params": list(group.log_scales.values()), "lr": 0.02, "base": 0.02}],
+        betas=(0.9, 0.99),
+        fused=True,
+    )
+    group.key.restart()
+    rates = {"means": MEANS_RATE * radius, **{n: 0.3 * r for n, r in RATES.items()}}
+    order: list[int] = []
+    for step in range(steps):
+        fade = 0.05 ** (step / steps)
+        for g in optimizer.param_groups:
+            g["lr"] = g["base"] * fade
+        order = order or rng.permutation(len(frames)).tolist()
+        t = order.pop()
+        loss = _step(group, views, frames, t, settings, optimizer, rng, generator, workspace, rates, fade)
+        if on_step:
+            on_step(step, loss)
+
+
+RATE_EVERY = 4  # the rate term has every coefficient, an image few of them: once in so many steps, so much stronger
+
+
+def _step(group, views, frames, t, settings, optimizer, rng, generator, workspace, rates, fade) -> float:
+    params = group.frame(t)
+    target = views.draw(frames[t])
+    background = rng.uniform(0, 1, 3) if target.alpha is not None else np.zeros(3)
+    result = render_loss(
+        {n: p.detach() for n, p in params.items()},
+        target.camera,
+        target.rgb,
+        target.alpha,
+        background=tuple(background),
+        ssim_lambda=settings.ssim_lambda,
+        mask_lambda=settings.mask_lambda,
+        workspace=workspace,
+    )
+    optimizer.zero_grad()
+    heads = [params[n] for n in ("means", "quats", "sh0")]
+    seeds = [result.grads[n] for n in ("means", "quats", "sh0")]
+    penalty = torch.zeros(())
+    if t + 1 < len(frames):
+        for name in group.coefficients:
+            change = (group.residual(name, t + 1) - group.residual(name, t)) / group.unit[name]
+            penalty = penalty + settings.temporal_lambda * change.abs().sum() / (target.area * len(change[0]))
+    if rng.integers(RATE_EVERY) == 0:
+        per_frame = RATE_EVERY * settings.rate_lambda / (target.area * len(frames))
+        penalty = penalty + per_frame * group.bits(generator)
+    if penalty.requires_grad:
+        heads, seeds = [*heads, penalty], [*seeds, torch.ones(())]
+    torch.autograd.backward(heads, seeds)
+    optimizer.step()
+    grads = dict(result.grads)
+    turned = group.turned[t] * torch.tensor([1.0, -1, -1, -1])
+    grads["quats"] = quat_multiply(turned, result.grads["quats"])  # back to the canonical frame
+    group.key.adam(grads, {n: r * fade for n, r in rates.items()})
+    return result.loss

@@ -1,0 +1,136 @@
+"""Keyframe: one frame's Gaussians from its views. In: views, a starting model. Out: the model, densified and pruned.
+
+3D Gaussian Splatting's recipe (Kerbl et al. 2023) shortened: Gaussians that the image pulls at are cloned when small
+and split when large, those that hardly contribute to any view go. The background behind a mask is random, so that
+opacity is learned and not painted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from gscodec.render.step import Workspace, render_loss
+from gscodec.train.model import Model
+from gscodec.train.settings import TrainSettings
+from gscodec.train.views import Views
+
+RATES = {"quats": 2e-3, "log_scales": 5e-3, "logit_opacities": 3e-2, "sh0": 5e-3, "shN": 2.5e-4}
+MEANS_RATE = (4e-4, 4e-6)  # start, end, times the radius of the subject
+DENSIFY_EVERY = 100
+DENSIFY_FROM, DENSIFY_UNTIL = 0.1, 0.6  # of the steps
+GROWTH = 0.12  # share of the Gaussians that one round may add
+PRUNE_OPACITY = 0.02
+PRUNE_WEIGHT = 0.02  # a Gaussian whose largest blending weight in any view is below this is not seen
+SPLIT_SHRINK = np.log(1.6)
+
+
+class Statistics:
+    """What densification asks for, gathered over the steps since the last round."""
+
+    def __init__(self, count: int):
+        self.pull = torch.zeros(count)  # sum of the screen-space gradient
+        self.seen = torch.zeros(count)
+        self.weight = torch.zeros(count)  # largest blending weight
+
+    def add(self, result) -> None:
+        """One step's statistics."""
+        weight = torch.as_tensor(result.max_weight)
+        self.pull += torch.as_tensor(result.grad2d)
+        self.seen += weight > 0
+        torch.maximum(self.weight, weight, out=self.weight)
+
+
+def train_keyframe(
+    model: Model,
+    views: Views,
+    frame: int,
+    settings: TrainSettings,
+    *,
+    steps: int,
+    radius: float,
+    densify: bool = True,
+    on_step: Callable[[int, float], None] | None = None,
+) -> Model:
+    """Optimises `model` against the views of `frame`.
+
+    Args:
+        steps: optimisation steps, one view each.
+        radius: size of the subject in world units, scales the rate of the means.
+        densify: also clone, split and prune.
+        on_step: called with (step, loss).
+    """
+    rng = np.random.default_rng([settings.seed, frame])
+    workspace = Workspace()
+    stats = Statistics(len(model))
+    model.restart()
+    for step in range(steps):
+        target = views.draw(frame)
+        background = rng.uniform(0, 1, 3) if target.alpha is not None else np.zeros(3)
+        result = render_loss(
+            model.params,
+            target.camera,
+            target.rgb,
+            target.alpha,
+            background=tuple(background),
+            ssim_lambda=settings.ssim_lambda,
+            mask_lambda=settings.mask_lambda,
+            workspace=workspace,
+        )
+        stats.add(result)
+        fade = step / max(steps - 1, 1)
+        rate = radius * MEANS_RATE[0] * (MEANS_RATE[1] / MEANS_RATE[0]) ** fade
+        model.adam(result.grads, {"means": rate, **{n: r * 0.1**fade for n, r in RATES.items()}})
+        if densify and (step + 1) % DENSIFY_EVERY == 0:
+            if DENSIFY_FROM * steps < step < DENSIFY_UNTIL * steps:
+                grow(model, stats, settings.gaussians_max, radius, rng)
+            elif step >= DENSIFY_UNTIL * steps:
+                prune(model, stats)
+            stats = Statistics(len(model))
+        if on_step:
+            on_step(step, result.loss)
+    return model
+
+
+@torch.no_grad()
+def prune(model: Model, stats: Statistics) -> None:
+    """Drops Gaussians that are nearly transparent or hidden in every view they were tried in."""
+    keep = torch.sigmoid(model.params["logit_opacities"]) > PRUNE_OPACITY
+    keep &= (stats.weight > PRUNE_WEIGHT) | (stats.seen == 0)
+    if keep.any():
+        model.select(keep)
+
+
+@torch.no_grad()
+def grow(model: Model, stats: Statistics, most: int, radius: float, rng: np.random.Generator) -> None:
+    """One round of densification: the Gaussians with the strongest pull are split (large) or cloned (small)."""
+    keep = torch.sigmoid(model.params["logit_opacities"]) > PRUNE_OPACITY
+    keep &= (stats.weight > PRUNE_WEIGHT) | (stats.seen == 0)
+    pull = stats.pull / stats.seen.clamp(min=1)
+    pull[~keep] = 0
+    room = max(0, min(int(GROWTH * len(model)), most - int(keep.sum())))
+    chosen = torch.topk(pull, min(room, len(pull))).indices
+    chosen = chosen[pull[chosen] > 0]
+    children = {n: p[chosen].clone() for n, p in model.params.items()}
+    spread = torch.exp(children["log_scales"])
+    large = spread.max(1).values > torch.exp(model.params["log_scales"]).max(1).values.median()
+    noise = torch.from_numpy(rng.standard_normal((len(chosen), 3)).astype(np.float32))
+    offset = rotate(children["quats"], noise * spread)
+    children["means"] = children["means"] + offset * torch.where(large, 0.7, 0.3)[:, None]
+    parents = chosen[large]
+    model.params["means"][parents] -= 0.7 * offset[large]
+    model.params["log_scales"][parents] -= SPLIT_SHRINK
+    children["log_scales"][large] -= SPLIT_SHRINK
+    if keep.any():
+        model.select(keep)
+    model.append(children)
+
+
+def rotate(quats: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+    """[N, 4] wxyz (any length) applied to [N, 3]."""
+    q = torch.nn.functional.normalize(quats, dim=-1)
+    w, u = q[:, :1], q[:, 1:]
+    cross = torch.linalg.cross(u, v, dim=-1)
+    return v + 2 * (w * cross + torch.linalg.cross(u, cross, dim=-1))

@@ -1,0 +1,88 @@
+"""Trainable Gaussians: attribute tensors with their Adam moments, and the surgery that densification needs."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gscodec.gaussians import SH_C0, Gaussians
+
+NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
+BETAS = (0.9, 0.99)  # short schedules: a second moment that forgets in 100 steps
+EPS = 1e-15
+
+
+class Model:
+    """N Gaussians as tensors (`params[name]`, f32) with Adam moments of the same shapes."""
+
+    def __init__(self, params: dict[str, torch.Tensor]):
+        self.params = {n: params[n].detach().clone().float().contiguous() for n in NAMES}
+        self._first = {n: torch.zeros_like(p) for n, p in self.params.items()}
+        self._second = {n: torch.zeros_like(p) for n, p in self.params.items()}
+        self._steps = 0
+
+    def __len__(self) -> int:
+        return len(self.params["means"])
+
+    @torch.no_grad()
+    def adam(self, grads: dict[str, torch.Tensor], rates: dict[str, float]) -> None:
+        """One Adam step (Kingma and Ba 2015) on the attributes in `rates`."""
+        self._steps += 1
+        c1, c2 = 1 - BETAS[0] ** self._steps, 1 - BETAS[1] ** self._steps
+        for name, rate in rates.items():
+            if self.params[name].numel() == 0:
+                continue
+            g, m, v = grads[name], self._first[name], self._second[name]
+            m.lerp_(g, 1 - BETAS[0])
+            v.mul_(BETAS[1]).addcmul_(g, g, value=1 - BETAS[1])
+            self.params[name].addcdiv_(m, (v / c2).sqrt_().add_(EPS), value=-rate / c1)
+
+    def restart(self) -> None:
+        """Forgets the moments (a new frame, a new stage)."""
+        self._steps = 0
+        for store in (self._first, self._second):
+            for t in store.values():
+                t.zero_()
+
+    def select(self, index: torch.Tensor) -> None:
+        """Keeps the Gaussians at `index` ([M] int or [N] bool)."""
+        for store in (self.params, self._first, self._second):
+            for n in NAMES:
+                store[n] = store[n][index].contiguous()
+
+    def append(self, params: dict[str, torch.Tensor]) -> None:
+        """Adds Gaussians with fresh moments."""
+        for n in NAMES:
+            new = params[n].to(self.params[n].dtype)
+            self.params[n] = torch.cat([self.params[n], new])
+            for store in (self._first, self._second):
+                store[n] = torch.cat([store[n], torch.zeros_like(new)])
+
+    def gaussians(self) -> Gaussians:
+        """A copy in numpy, quaternions normalised."""
+        arrays = {n: p.detach().numpy().copy() for n, p in self.params.items()}
+        arrays["quats"] /= np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
+        return Gaussians(**arrays)
+
+
+def from_points(points: np.ndarray, colors: np.ndarray, spacing: float, sh_count: int = 0) -> Model:
+    """Round Gaussians as wide as their spacing, half opaque, in the given colours (0..1)."""
+    n = len(points)
+    tensor = lambda a: torch.tensor(np.ascontiguousarray(a), dtype=torch.float32)  # noqa: E731
+    quats = np.zeros((n, 4))
+    quats[:, 0] = 1
+    return Model(
+        {
+            "means": tensor(points),
+            "quats": tensor(quats),
+            "log_scales": torch.full((n, 3), float(np.log(0.5 * spacing))),
+            "logit_opacities": torch.full((n,), 0.0),
+            "sh0": tensor((colors - 0.5) / SH_C0),
+            "shN": torch.zeros(n, sh_count, 3),
+        }
+    )
+
+
+def from_gaussians(g: Gaussians) -> Model:
+    """A model that starts from given Gaussians."""
+    return Model({n: torch.from_numpy(np.array(getattr(g, n), np.float32)) for n in NAMES})

@@ -1,0 +1,155 @@
+"""Motion of a group: for each frame a smooth field from keyframe positions to translation and rotation.
+
+V3's motion model (Wang et al. 2024): a multi-resolution hash grid and a shallow MLP, here one field a frame on top of
+the extrapolated pose of the two frames before, so that it only has to learn the change. The field sees nothing but the
+keyframe position, hence neighbours move alike; an as-rigid-as-possible term over the k-NN graph does the rest.
+In: keyframe model, views. Out: means [T, N, 3] and quats [T, N, 4] of all frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from gscodec.render.step import Workspace, render_loss
+from gscodec.train.hashgrid import HashGrid
+from gscodec.train.keyframe import rotate
+from gscodec.train.model import Model
+from gscodec.train.settings import TrainSettings
+from gscodec.train.views import Views
+
+GRAPH_NEIGHBORS = 6
+FIELD_RATE = 4e-3
+TRANSLATION_UNIT = 0.02  # of the subject's radius: what an output of 1 means
+ROTATION_UNIT = 0.1  # radians
+
+
+class MotionField(torch.nn.Module):
+    """x in the unit cube [N, 3] -> translation [N, 3] in units of the radius and rotation vector [N, 3]."""
+
+    def __init__(self, resolution: int = 64):
+        super().__init__()
+        self.grid = HashGrid(levels=8, features=2, log2_table=14, base_resolution=4, max_resolution=resolution)
+        self.mlp = torch.nn.Sequential(
+            torch.nn.Linear(16, 32), torch.nn.ReLU(), torch.nn.Linear(32, 32), torch.nn.ReLU(), torch.nn.Linear(32, 6)
+        )
+        torch.nn.init.zeros_(self.mlp[-1].weight)
+        torch.nn.init.zeros_(self.mlp[-1].bias)
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Shapes as the class says; zero for a fresh field."""
+        out = self.mlp(self.grid(x))
+        return out[:, :3] * TRANSLATION_UNIT, out[:, 3:] * ROTATION_UNIT
+
+
+def quat_multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Hamilton product, [N, 4] wxyz."""
+    aw, au, bw, bu = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
+    w = aw * bw - (au * bu).sum(1, keepdim=True)
+    return torch.cat([w, aw * bu + bw * au + torch.linalg.cross(au, bu, dim=-1)], 1)
+
+
+def rotvec_to_quat(v: torch.Tensor) -> torch.Tensor:
+    """[N, 3] radians -> [N, 4] wxyz, smooth at zero."""
+    half = (v.square().sum(1, keepdim=True) + 1e-16).sqrt() / 2
+    return torch.cat([torch.cos(half), v * 0.5 * torch.sinc(half / torch.pi)], 1)
+
+
+class RigidGraph:
+    """As-rigid-as-possible over the k-NN graph of the keyframe (Sorkine and Alexa 2007)."""
+
+    def __init__(self, means: torch.Tensor, radius: float):
+        from scipy.spatial import cKDTree
+
+        x = means.numpy()
+        k = min(GRAPH_NEIGHBORS, len(x) - 1)
+        distance, index = cKDTree(x).query(x, k + 1) if k > 0 else (np.ones((len(x), 1)), np.zeros((len(x), 1)))
+        self.i = torch.arange(len(x)).repeat_interleave(k)
+        self.j = torch.from_numpy(index[:, 1:].astype(np.int64).ravel())
+        self.edge = means[self.j] - means[self.i]
+        # Far pairs (bridges across a gap) hold less: half at twice the median distance.
+        d = torch.from_numpy(distance[:, 1:].astype(np.float32).ravel())
+        self.weight = torch.exp2(-((d / (2 * d.median().clamp(min=1e-12))) ** 2))[:, None] / radius
+        self.median = float(d.median()) if len(d) else 1.0
+
+    def loss(self, means: torch.Tensor, turned: torch.Tensor) -> torch.Tensor:
+        """Mean weighted length by which edges miss their rotated selves; `turned` [N, 4] from the keyframe."""
+        if len(self.j) == 0:
+            return means.sum() * 0
+        miss = means[self.j] - means[self.i] - rotate(turned[self.i], self.edge)
+        return (self.weight * miss).square().sum(1).add(1e-12).sqrt().mean()
+
+
+def track(
+    key: Model,
+    views: Views,
+    frames: range,
+    settings: TrainSettings,
+    *,
+    radius: float,
+    on_step: Callable[[int, int, float], None] | None = None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Poses of the keyframe's Gaussians in all `frames` (the first one is the keyframe).
+
+    Args:
+        on_step: called with (frame, step, loss).
+
+    Returns:
+        means [T, N, 3] and turned [T, N, 4], the rotation of each Gaussian since the keyframe.
+    """
+    x0 = key.params["means"]
+    low, high = x0.min(0).values, x0.max(0).values
+    unit = ((x0 - low) / (high - low).max().clamp(min=1e-9)).clamp(0, 1)
+    identity = torch.tensor([1.0, 0, 0, 0]).repeat(len(x0), 1)
+    means, turned = [x0.clone()], [identity]
+    graph = RigidGraph(x0, radius)
+    for number, frame in enumerate(frames[1:], 1):
+        base, base_turned = means[-1], turned[-1]
+        if number > 1:  # constant velocity
+            base = 2 * means[-1] - means[-2]
+            back = turned[-2] * torch.tensor([1.0, -1, -1, -1])
+            base_turned = quat_multiply(quat_multiply(turned[-1], back), turned[-1])
+        pose = _fit_frame(key, views, frame, settings, radius, (unit, base, base_turned), graph, on_step)
+        means.append(pose[0])
+        turned.append(pose[1])
+    return torch.stack(means), torch.stack(turned)
+
+
+def _fit_frame(key, views, frame, settings, radius, start, graph, on_step):
+    unit, base, base_turned = start
+    torch.manual_seed(settings.seed * 1000003 + frame)
+    rng = np.random.default_rng([settings.seed, frame, 1])
+    field, workspace = MotionField(), Workspace()
+    optimizer = torch.optim.Adam(field.parameters(), lr=FIELD_RATE, betas=(0.9, 0.99), fused=True)
+    steps = settings.motion_steps
+    for step in range(steps):
+        for g in optimizer.param_groups:
+            g["lr"] = FIELD_RATE * 0.1 ** (step / steps)
+        move, turn = field(unit)
+        means = base + radius * move
+        turned = torch.nn.functional.normalize(quat_multiply(rotvec_to_quat(turn), base_turned), dim=1)
+        quats = quat_multiply(turned, key.params["quats"])
+        target = views.draw(frame)
+        background = rng.uniform(0, 1, 3) if target.alpha is not None else np.zeros(3)
+        result = render_loss(
+            {**key.params, "means": means.detach(), "quats": quats.detach()},
+            target.camera,
+            target.rgb,
+            target.alpha,
+            background=tuple(background),
+            ssim_lambda=settings.ssim_lambda,
+            mask_lambda=settings.mask_lambda,
+            workspace=workspace,
+        )
+        rigid = settings.rigidity * graph.loss(means, turned)
+        optimizer.zero_grad()
+        torch.autograd.backward([means, quats, rigid], [result.grads["means"], result.grads["quats"], torch.ones(())])
+        optimizer.step()
+        if on_step:
+            on_step(frame, step, result.loss)
+    with torch.no_grad():
+        move, turn = field(unit)
+        turned = torch.nn.functional.normalize(quat_multiply(rotvec_to_quat(turn), base_turned), dim=1)
+        return base + radius * move, turned

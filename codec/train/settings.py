@@ -1,0 +1,63 @@
+"""Training budgets. A preset is a set of step counts; everything else is the same for all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gscodec.errors import UsageError
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """Budgets and weights of one training run.
+
+    Attributes:
+        gop: frames in a group.
+        keyframe_steps: optimisation steps for the first keyframe; later ones start warm and take half.
+        motion_steps: steps a frame for the hash-grid motion.
+        finetune_steps: steps a frame for the joint fine-tuning of the group.
+        gaussians_max: bound on the count while densifying.
+        ssim_lambda: share of D-SSIM in the image loss (3D Gaussian Splatting: 0.2).
+        mask_lambda: weight of the alpha loss where the capture has masks.
+        rigidity: weight of the as-rigid-as-possible term.
+        rate_lambda: loss per bit and pixel of the residual trajectories.
+        temporal_lambda: weight of frame-to-frame change of the residuals.
+        quality: quantization the rate term assumes (0 to 100).
+        seed: of everything random.
+    """
+
+    gop: int = 20
+    keyframe_steps: int = 2000
+    motion_steps: int = 120
+    finetune_steps: int = 120
+    gaussians_max: int = 20000
+    initial_points: int = 8000
+    ssim_lambda: float = 0.2
+    mask_lambda: float = 0.1
+    rigidity: float = 30.0
+    rate_lambda: float = 1.0
+    temporal_lambda: float = 0.05
+    quality: float = 50.0
+    seed: int = 0
+
+    def __post_init__(self):
+        if self.gop < 1:
+            raise UsageError(f"--gop {self.gop} is out of range, expected at least 1 frame in a group")
+
+
+PRESETS = {
+    "fast": {"keyframe_steps": 800, "motion_steps": 50, "finetune_steps": 40, "gaussians_max": 10000},
+    "medium": {},
+    "slow": {"keyframe_steps": 5000, "motion_steps": 250, "finetune_steps": 400, "gaussians_max": 30000},
+}
+
+
+def train_settings(preset: str, **changes) -> TrainSettings:
+    """Settings of a preset, with changes.
+
+    Raises:
+        UsageError: the preset does not exist or a value is out of range.
+    """
+    if preset not in PRESETS:
+        raise UsageError(f"--preset {preset} does not exist, expected one of {', '.join(PRESETS)}")
+    return TrainSettings(**{**PRESETS[preset], **changes})

@@ -1,0 +1,83 @@
+"""Views of a capture as training targets: decoded on demand, kept while memory allows, drawn in random order.
+
+A view is drawn as a crop around the subject where there is a mask: outside it the target is known to be background,
+and the mask term needs only a margin of it.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+
+CACHE_BYTES = 2 << 30
+MARGIN = 24  # pixels of background kept around the subject
+
+
+@dataclass(frozen=True)
+class Target:
+    """One image to be matched.
+
+    Attributes:
+        camera: pinhole camera of the crop.
+        rgb: [H, W, 3] u8, unassociated.
+        alpha: [H, W] u8 or None.
+        area: H * W of the whole view, so that losses of crops add up as those of views.
+    """
+
+    camera: object
+    rgb: np.ndarray
+    alpha: np.ndarray | None
+    area: int
+
+
+class Views:
+    """The training views of a capture, `train_cameras` being their indices."""
+
+    def __init__(self, capture, seed: int):
+        self.capture = capture
+        self.train_cameras = [i for i, c in enumerate(capture.cameras) if c.split == "train"]
+        self._random = np.random.default_rng(seed)
+        self._held: OrderedDict[tuple[int, int], Target] = OrderedDict()
+        self._bytes = 0
+        self._order: dict[int, list[int]] = {}
+
+    def target(self, camera: int, frame: int) -> Target:
+        """View of camera index `camera` at `frame`, cropped to the subject."""
+        key = (camera, frame)
+        if key not in self._held:
+            self._held[key] = self._load(camera, frame)
+            self._bytes += self._size(self._held[key])
+            while self._bytes > CACHE_BYTES and len(self._held) > 1:
+                _, old = self._held.popitem(last=False)
+                self._bytes -= self._size(old)
+        self._held.move_to_end(key)
+        return self._held[key]
+
+    def draw(self, frame: int) -> Target:
+        """The next view of `frame`; every camera once before any comes again."""
+        order = self._order.get(frame)
+        if not order:
+            order = self._order[frame] = self._random.permutation(self.train_cameras).tolist()
+        return self.target(order.pop(), frame)
+
+    @staticmethod
+    def _size(t: Target) -> int:
+        return t.rgb.nbytes + (0 if t.alpha is None else t.alpha.nbytes)
+
+    def _load(self, camera: int, frame: int) -> Target:
+        view, cam = self.capture.view(camera, frame), self.capture.cameras[camera]
+        h, w = view.rgb.shape[:2]
+        if view.alpha is None or not view.alpha.any():
+            return Target(cam, np.ascontiguousarray(view.rgb), view.alpha, h * w)
+        rows, cols = np.flatnonzero(view.alpha.any(1)), np.flatnonzero(view.alpha.any(0))
+        top, bottom = max(rows[0] - MARGIN, 0), min(rows[-1] + 1 + MARGIN, h)
+        left, right = max(cols[0] - MARGIN, 0), min(cols[-1] + 1 + MARGIN, w)
+        crop = (slice(top, bottom), slice(left, right))
+        return Target(
+            cam.cropped(left, top, right - left, bottom - top),
+            np.ascontiguousarray(view.rgb[crop]),
+            np.ascontiguousarray(view.alpha[crop]),
+            h * w,
+        )

@@ -1,0 +1,64 @@
+"""Small Gaussian sequences with known motion, for tests."""
+
+import numpy as np
+
+from gscodec.encode.canonical import quat_multiply
+from gscodec.encode.motion import rotvec_to_matrix, rotvec_to_quat
+from gscodec.gaussians import Gaussians, GaussianSequence, Group
+
+
+def blob(n: int, seed: int = 0, sh_count: int = 0) -> Gaussians:
+    """N Gaussians on a unit sphere, with scales, turns and colours that vary smoothly and a little at random."""
+    r = np.random.default_rng(seed)
+    x = r.standard_normal((n, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    q = np.concatenate([np.ones((n, 1)), x + 0.2 * r.standard_normal((n, 3))], 1)
+    return Gaussians(
+        means=x.astype(np.float32),
+        quats=(q / np.linalg.norm(q, axis=1, keepdims=True)).astype(np.float32),
+        log_scales=(np.log(0.05) + 0.3 * r.standard_normal((n, 3)) - [0, 0, 1.5]).astype(np.float32),
+        logit_opacities=(2 + x[:, 0] + r.standard_normal(n)).astype(np.float32),
+        sh0=(x + 0.1 * r.standard_normal((n, 3))).astype(np.float32),
+        shN=(0.1 * r.standard_normal((n, sh_count, 3))).astype(np.float32),
+    )
+
+
+def moved(g: Gaussians, rotvec: np.ndarray, shift: np.ndarray) -> Gaussians:
+    """`g` turned about the origin and shifted."""
+    R = rotvec_to_matrix(np.asarray(rotvec, float))
+    q = quat_multiply(np.broadcast_to(rotvec_to_quat(np.asarray(rotvec, float)), g.quats.shape), g.quats.astype(float))
+    return Gaussians(
+        (g.means @ R.T + shift).astype(np.float32),
+        q.astype(np.float32),
+        g.log_scales,
+        g.logit_opacities,
+        g.sh0,
+        g.shN,
+    )
+
+
+def turning(n: int = 300, frames: int = 6, sh_count: int = 0, lifetimes: bool = False) -> GaussianSequence:
+    """One group in which a blob turns 0.1 rad a frame and drifts."""
+    g = blob(n, sh_count=sh_count)
+    group = [moved(g, np.array([0, 0.1 * t, 0.02 * t]), np.array([0.03 * t, 0, 0])) for t in range(frames)]
+    life = None
+    if lifetimes:
+        life = np.tile(np.array([0, frames], np.int32), (n, 1))
+        life[: n // 4, 0] = frames // 2
+        life[n // 4 : n // 2, 1] = frames // 2
+    return GaussianSequence(25.0, [Group(group, life)])
+
+
+def covariances(g: Gaussians) -> np.ndarray:
+    """[N, 3, 3], what a Gaussian's (quat, scale) means, whatever its form."""
+    w, x, y, z = g.quats.astype(np.float64).T
+    R = np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        -2,
+    )
+    M = R * np.exp(g.log_scales.astype(np.float64))[:, None, :]
+    return M @ M.transpose(0, 2, 1)

@@ -1,0 +1,143 @@
+"""The command line as a user meets it: help, results on stdout, one clear sentence for what went wrong."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from synthetic import turning
+
+from gscodec.gaussians import GaussianSequence, Group
+from gscodec.splats import write_sequence
+
+
+def run(*args, cwd=None):
+    """`gscodec ARGS`, as its own process."""
+    code = "import sys; from gscodec.cli import main; main()"
+    return subprocess.run([sys.executable, "-c", code, *map(str, args)], capture_output=True, text=True, cwd=cwd)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder of tracked .ply frames and the stream made of it."""
+    path = tmp_path_factory.mktemp("cli")
+    write_sequence(turning(300, frames=5), path / "plys")
+    done = run("encode", path / "plys", path / "a.gsv", "--json", path / "report.json")
+    assert done.returncode == 0, done.stderr
+    assert "5 frames" in done.stdout
+    return path
+
+
+def fails(result, *words, code=1):
+    """One sentence on stderr, no traceback, nothing on stdout."""
+    assert result.returncode == code, result.stderr
+    assert "Traceback" not in result.stderr
+    assert result.stdout == ""
+    for w in words:
+        assert w in result.stderr
+
+
+def test_help_names_every_command():
+    result = run("--help")
+    assert result.returncode == 0
+    for command in ("encode", "train", "decode", "render", "info", "eval"):
+        assert command in result.stdout
+        assert run(command, "--help").returncode == 0
+
+
+def test_report_holds_the_size(folder):
+    report = json.loads((folder / "report.json").read_text())
+    assert report["bytes"] == (folder / "a.gsv").stat().st_size
+    assert report["frames"] == 5
+    assert sum(report["units"].values()) < report["bytes"]
+
+
+def test_info_accounts_for_every_byte(folder):
+    facts = json.loads(run("info", folder / "a.gsv", "--json").stdout)
+    assert facts["frames"] == 5
+    assert facts["gaussians"] > 250
+    assert sum(u["bytes"] for u in facts["units"].values()) == facts["bytes"]
+    assert "kB/frame" in run("info", folder / "a.gsv").stdout
+
+
+def test_info_writes_two_dimensional_maps(folder, tmp_path):
+    assert run("info", folder / "a.gsv", "--maps", tmp_path / "maps").returncode == 0
+    maps = list((tmp_path / "maps").glob("*.png"))
+    assert len(maps) >= 13
+    header = maps[0].read_bytes()[16:26]
+    width, height, depth = int.from_bytes(header[:4], "big"), int.from_bytes(header[4:8], "big"), header[8]
+    assert depth == 16
+    assert width > 8
+    assert height > 8
+
+
+def test_decode_and_encode_again(folder, tmp_path):
+    assert run("decode", folder / "a.gsv", tmp_path / "plys").returncode == 0
+    assert len(list((tmp_path / "plys").glob("*.ply"))) == 5
+    assert run("encode", tmp_path / "plys", tmp_path / "b.gsv", "--frames", "1:4").returncode == 0
+    assert json.loads(run("info", tmp_path / "b.gsv", "--json").stdout)["frames"] == 3
+
+
+def test_eval_against_the_splats(folder):
+    result = run("eval", folder / "a.gsv", folder / "plys", "--frames", "0:2", "--json")
+    facts = json.loads(result.stdout)
+    assert facts["codec_psnr"] > 35, result.stderr
+    assert facts["frames"] == 2
+
+
+def test_render_images_and_video(folder, tmp_path):
+    assert run("render", folder / "a.gsv", tmp_path / "png", "--size", "64x48", "--frames", "0:2").returncode == 0
+    assert sorted(p.name for p in (tmp_path / "png").iterdir()) == ["000000.png", "000001.png"]
+    assert run("render", folder / "a.gsv", tmp_path / "a.mp4", "--size", "64x48").returncode == 0
+    assert (tmp_path / "a.mp4").stat().st_size > 500
+    assert not list(tmp_path.glob("*.part*"))
+
+
+def test_wrong_paths_and_values(folder, tmp_path):
+    gsv = folder / "a.gsv"
+    fails(run("encode", tmp_path / "nothing", tmp_path / "o.gsv"), "nothing")
+    fails(run("encode", folder / "plys", tmp_path / "o.mp4"), "*.gsv")
+    fails(run("encode", folder / "plys", tmp_path / "o.gsv", "--quality", "200"), "0 (small) to 100")
+    fails(run("encode", folder / "plys", tmp_path / "o.gsv", "--frames", "9:12"), "frames 0 to 4")
+    fails(run("encode", folder / "plys", tmp_path / "o.gsv", "--gop", "0"), "--gop")
+    fails(run("info", tmp_path / "no.gsv"), "no.gsv", "No such file")
+    fails(run("render", gsv, tmp_path / "o", "--camera", "cam99"), "cam99", "orbit")
+    fails(run("render", gsv, tmp_path / "o", "--size", "huge"), "WxH")
+    fails(run("render", gsv, tmp_path / "o.avi"), ".mp4")
+    fails(run("eval", gsv, folder), "")
+    fails(run("encode"), "SEQ", code=2)
+    assert not list(tmp_path.iterdir()), "nothing is left behind"
+
+
+def test_an_empty_folder_says_what_was_looked_for(tmp_path):
+    (tmp_path / "empty").mkdir()
+    fails(run("encode", tmp_path / "empty", tmp_path / "o.gsv"), "empty", "transforms.json", ".ply")
+
+
+def test_broken_files(folder, tmp_path):
+    data = (folder / "a.gsv").read_bytes()
+    broken = tmp_path / "b.gsv"
+    broken.write_bytes(b"")
+    fails(run("info", broken), "b.gsv", "empty")
+    broken.write_bytes(b"not a stream at all, but long enough to be one")
+    fails(run("info", broken), "b.gsv")
+    hurt = bytearray(data)
+    hurt[len(data) // 2] ^= 1
+    broken.write_bytes(hurt)
+    fails(run("decode", broken, tmp_path / "plys"), "b.gsv", "group 0")
+    broken.write_bytes(data[: len(data) - 10])
+    result = run("info", broken)
+    assert "ends inside a group" in result.stderr
+
+
+def test_untracked_frames_are_said_to_be(tmp_path):
+    from synthetic import blob
+
+    frames = [blob(40 + 7 * t, seed=t) for t in range(3)]
+    write_sequence(GaussianSequence(30, [Group([f]) for f in frames]), tmp_path / "plys")
+    (tmp_path / "plys" / "sequence.json").unlink()
+    result = run("encode", tmp_path / "plys", tmp_path / "o.gsv", "--keep-all")
+    assert "independent" in result.stderr
+    groups = json.loads(run("info", tmp_path / "o.gsv", "--json").stdout)["per_group"]
+    np.testing.assert_array_equal([g["gaussians"] for g in groups], [40, 47, 54])

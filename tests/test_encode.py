@@ -1,0 +1,224 @@
+"""Encoder: integers keep the content, motion is found, the file grows, stops and goes on."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+from synthetic import blob, covariances, turning
+
+from gscodec import _native
+from gscodec.bitstream.color import correlate, decorrelate
+from gscodec.bitstream.quantization import steps_for, subject_radius
+from gscodec.bitstream.transform import dct_basis
+from gscodec.decode import Stream, open_stream
+from gscodec.encode.canonical import canonical_axes, quat_multiply
+from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
+from gscodec.encode.group import group_integers, stack_group, visible_enough
+from gscodec.encode.motion import choose_nodes
+from gscodec.encode.writer import StreamWriter
+from gscodec.errors import UsageError
+from gscodec.gaussians import Gaussians, Group
+
+
+def write(sequence, out, quality=50.0, **settings):
+    config = stream_config(fps=sequence.fps, sh_degree=sequence.frame(0).sh_degree)
+    return encode_groups(
+        lambda done: iter(sequence.groups[done:]),
+        out,
+        config,
+        EncodeSettings(quality=quality, **settings),
+        fingerprint={"input": "test"},
+    )
+
+
+def nearest(a: Gaussians, b: Gaussians) -> np.ndarray:
+    """Index of the Gaussian of `b` nearest to each of `a`."""
+    return ((a.means[:, None] - b.means[None]) ** 2).sum(2).argmin(1)
+
+
+def test_canonical_form_keeps_the_covariance_and_sorts_the_axes():
+    g = blob(500)
+    turn, order = canonical_axes(g.quats, g.log_scales)
+    q = quat_multiply(g.quats.astype(float), turn)
+    scales = np.take_along_axis(g.log_scales, order, 1)
+    assert (np.diff(scales, axis=1) <= 0).all()
+    assert (np.abs(q[:, 0]) >= np.abs(q[:, 1:]).max(1) - 1e-9).all(), "the real part is the largest"
+    same = Gaussians(g.means, q.astype(np.float32), scales, g.logit_opacities, g.sh0, g.shN)
+    np.testing.assert_allclose(covariances(same), covariances(g), atol=1e-7)
+
+
+def test_dct_is_orthonormal_for_every_length():
+    for t in (1, 2, 7, 20):
+        np.testing.assert_allclose(dct_basis(t) @ dct_basis(t).T, np.eye(t), atol=1e-12)
+
+
+def test_colour_transform_inverts():
+    x = np.random.default_rng(0).standard_normal((5, 4, 3))
+    np.testing.assert_allclose(correlate(decorrelate(x)), x, atol=1e-12)
+
+
+def test_nodes_carry_a_rigid_motion():
+    sequence = turning(400, frames=8)
+    means = stack_group(sequence.groups[0]).means.astype(float)
+    steps = steps_for(60, 1.0)
+    positions = np.rint((means[4] + 3) / steps.means).astype(np.uint32)
+    order = _native.morton_order(positions)
+    positions, means = positions[order], means[:, order]
+    to_world = lambda p: p * steps.means - 3.0  # noqa: E731
+    motion = choose_nodes(positions, to_world(positions), means, steps, to_world)
+    assert len(motion.positions) == 1, "a rigid body needs one node"
+    moved = np.abs(means - means[4]).max()
+    left = np.abs(means - motion.carried).max()
+    assert left < 3 * steps.means < 0.1 * moved
+
+
+@pytest.mark.parametrize("sh_count", [0, 3, 8, 15])
+def test_stream_keeps_the_content_up_to_order_and_symmetry(tmp_path, sh_count):
+    sequence = turning(200, frames=5, sh_count=sh_count)
+    write(sequence, tmp_path / "a.gsv", quality=90, keep_all=True)
+    stream = open_stream(tmp_path / "a.gsv")
+    assert stream.frame_count == 5
+    assert stream.fps == 25
+    for t in range(5):
+        a, b = sequence.frame(t), stream.frame(t)
+        i = nearest(a, b)
+        assert len(np.unique(i)) == len(a) == len(b)
+        b = b.take(i)
+        steps = steps_for(90, subject_radius(a.means))
+        assert np.abs(a.means - b.means).max() < 4 * steps.means
+        assert np.abs(a.sh0 - b.sh0).max() < 2 * steps.sh0
+        assert np.abs(a.logit_opacities - b.logit_opacities).max() < 2 * steps.logit_opacities
+        ca, cb = covariances(a), covariances(b)
+        error = np.linalg.norm(ca - cb, axis=(1, 2)) / np.linalg.norm(ca, axis=(1, 2))
+        assert np.median(error) < 0.05
+        assert error.max() < 0.3
+        if sh_count:
+            assert np.abs(a.shN - b.shN).max() < 3 * steps.shN
+
+
+def test_higher_quality_costs_more_and_errs_less(tmp_path):
+    sequence = turning(400, frames=4)
+    sizes, errors = [], []
+    for quality in (20, 50, 80):
+        out = tmp_path / f"{quality}.gsv"
+        sizes.append(write(sequence, out, quality=quality, keep_all=True).bytes)
+        a, b = sequence.frame(2), open_stream(out).frame(2)
+        errors.append(float(np.sqrt(((a.means - b.means[nearest(a, b)]) ** 2).mean())))
+    assert sizes == sorted(sizes)
+    assert len(set(sizes)) == 3
+    assert errors == sorted(errors, reverse=True)
+
+
+def test_what_nobody_sees_is_dropped_unless_all_is_to_be_kept(tmp_path):
+    g = blob(100)
+    faint = g.logit_opacities.copy()
+    faint[:30] = -9
+    g = Gaussians(g.means, g.quats, g.log_scales, faint, g.sh0, g.shN)
+    group = Group([g])
+    assert not visible_enough(stack_group(group))[:30].any()
+    assert len(group_integers(group, 50)["positions"]) <= 70
+    assert len(group_integers(group, 50, keep_all=True)["positions"]) == 100
+
+
+def test_lifetimes_survive(tmp_path):
+    sequence = turning(120, frames=6, lifetimes=True)
+    write(sequence, tmp_path / "a.gsv", keep_all=True)
+    stream = open_stream(tmp_path / "a.gsv")
+    for t in range(6):
+        assert len(stream.frame(t)) == len(sequence.frame(t))
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_tiny_groups(tmp_path, count):
+    g = blob(5).take(np.arange(count))
+    sequence = turning().with_groups([Group([g, g, g]), Group([g])])
+    write(sequence, tmp_path / "a.gsv", keep_all=True)
+    stream = open_stream(tmp_path / "a.gsv")
+    assert [len(stream.frame(t)) for t in range(4)] == [count] * 4
+
+
+def test_frames_in_any_order_are_the_same(tmp_path):
+    sequence = turning(60, frames=4)
+    sequence = sequence.with_groups([sequence.groups[0]] * 3)
+    write(sequence, tmp_path / "a.gsv")
+    straight = [open_stream(tmp_path / "a.gsv").frame(t) for t in range(12)]
+    stream = open_stream(tmp_path / "a.gsv")
+    for t in (11, 0, 5, 6, 1, 10, 3):
+        np.testing.assert_array_equal(stream.frame(t).means, straight[t].means)
+
+
+def test_ctrl_c_leaves_a_playable_file_and_a_second_run_goes_on(tmp_path):
+    sequence = turning(60, frames=3)
+    groups = [sequence.groups[0]] * 4
+    config = stream_config(fps=25, sh_degree=0)
+    out = tmp_path / "a.gsv"
+
+    def interrupted(done):
+        assert done == 0
+        yield from groups[:2]
+        raise KeyboardInterrupt
+
+    first = encode_groups(interrupted, out, config, EncodeSettings(), fingerprint={"v": 1})
+    assert first.interrupted
+    assert open_stream(out).frame_count == 6
+    started = []
+
+    def rest(done):
+        started.append(done)
+        yield from groups[done:]
+
+    second = encode_groups(rest, out, config, EncodeSettings(), fingerprint={"v": 1})
+    assert started == [2]
+    assert not second.interrupted
+    assert open_stream(out).frame_count == 12
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.gsv"]
+    whole = tmp_path / "b.gsv"
+    encode_groups(lambda done: iter(groups), whole, config, EncodeSettings(), fingerprint={})
+    assert whole.read_bytes() == out.read_bytes()
+
+
+def test_other_settings_do_not_resume(tmp_path):
+    config = stream_config(fps=25, sh_degree=0)
+    payload, _ = _native.encode_group(group_integers(Group([blob(5)]), 50))
+    for fingerprint, found in (({"q": 1}, 0), ({"q": 1}, 1), ({"q": 2}, 0)):
+        writer = StreamWriter(tmp_path / "a.gsv", config, fingerprint)
+        assert writer.groups == found
+        if not found:
+            writer.append(payload, 1)
+        writer.close()
+
+
+def test_a_part_cut_anywhere_keeps_its_whole_groups(tmp_path):
+    sequence = turning(20, frames=2)
+    out = tmp_path / "a.gsv"
+    config = stream_config(fps=25, sh_degree=0)
+    payload, _ = _native.encode_group(group_integers(sequence.groups[0], 50))
+    writer = StreamWriter(out, config, {})
+    ends = [writer.bytes]
+    for _ in range(3):
+        writer.append(payload, 2)
+        ends.append(writer.bytes)
+    writer.close()
+    data = writer.part.read_bytes()
+    assert len(data) == ends[-1]
+    for cut in itertools.chain(range(ends[0], len(data), 7), [*ends]):
+        stream = Stream(data[:cut])
+        assert len(stream.groups) == sum(cut >= e for e in ends[1:])
+        writer.part.write_bytes(data[:cut])
+        again = StreamWriter(out, config, {})
+        assert again.groups == len(stream.groups)
+        again.close()
+        assert writer.part.stat().st_size == ends[again.groups]
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(UsageError, match="quality 101"):
+        EncodeSettings(quality=101)
+
+
+def test_report_is_json(tmp_path):
+    report = write(turning(50), tmp_path / "a.gsv")
+    facts = json.loads(json.dumps(report.to_json()))
+    assert facts["bytes"] == (tmp_path / "a.gsv").stat().st_size
+    assert facts["kb_per_frame"] == pytest.approx(facts["bytes"] / 6 / 1000)

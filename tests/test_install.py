@@ -1,0 +1,74 @@
+"""The wheel in a foreign folder, in an environment of the player's side: numpy, typer and rich, and no extra."""
+
+import os
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+from synthetic import turning
+
+from gscodec.splats import write_sequence
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def player(tmp_path_factory):
+    """Folder with a venv that has the wheel, and a stream."""
+    from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
+
+    path = tmp_path_factory.mktemp("player")
+    subprocess.run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", path, ROOT], check=True)
+    venv.create(path / "env", with_pip=True)
+    wheel = next(path.glob("gscodec-*.whl"))
+    subprocess.run([path / "env/bin/python", "-m", "pip", "install", "-q", wheel], check=True)
+    sequence = turning(100, frames=3)
+    write_sequence(sequence, path / "plys")
+    encode_groups(
+        lambda done: iter(sequence.groups),
+        path / "a.gsv",
+        stream_config(fps=25, sh_degree=0),
+        EncodeSettings(),
+        fingerprint={},
+    )
+    return path
+
+
+def run(player, *args):
+    env = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    return subprocess.run([player / "env/bin/gscodec", *args], cwd=player, capture_output=True, text=True, env=env)
+
+
+def test_the_environment_has_none_of_the_extra(player):
+    listed = subprocess.run(
+        [player / "env/bin/python", "-m", "pip", "list"], capture_output=True, text=True
+    ).stdout.lower()
+    for name in ("torch", "opencv", "openimageio", "scikit-image", "dracopy", "imageio", "scipy"):
+        assert name not in listed
+
+
+def test_it_decodes_renders_and_tells(player):
+    assert "3 frames" in run(player, "info", "a.gsv").stdout
+    done = run(player, "decode", "a.gsv", "out")
+    assert done.returncode == 0, done.stderr
+    assert len(list((player / "out").glob("*.ply"))) == 3
+    done = run(player, "render", "a.gsv", "png", "--size", "32x32")
+    assert done.returncode == 0, done.stderr
+    assert len(list((player / "png").glob("*.png"))) == 3
+
+
+def test_the_studios_commands_name_the_extra(player):
+    (player / "capture").mkdir(exist_ok=True)
+    (player / "capture" / "transforms.json").write_text("{}")
+    for args in (
+        ("render", "a.gsv", "a.mp4"),
+        ("eval", "a.gsv", "plys"),
+        ("encode", "capture", "b.gsv"),
+        ("train", "capture", "trained"),
+    ):
+        result = run(player, *args)
+        assert result.returncode == 1, args
+        assert "gscodec[encode]" in result.stderr, (args, result.stderr)
+        assert "Traceback" not in result.stderr
