@@ -34,8 +34,8 @@ A capture of an animated character walking on the spot: {train} training and {te
 {fps:g} frames a second, {width} x {height} RGBA, metres, exact calibration in transforms.json.
 
 Credit: "Low Poly Lumberjack" by Daz (sketchfab.com/Darren.Hogan), licensed under CC BY 4.0
-(https://creativecommons.org/licenses/by/4.0/); rendered and downscaled by us with `make_lumberjack.py`, which lies beside
-this folder. Images are lossless WebP; colours are even numbers, since the last bit was noise.
+(https://creativecommons.org/licenses/by/4.0/); rendered and downscaled by us with `make_lumberjack.py`, which lies
+beside this folder. Images are lossless WebP; colours are even numbers, since the last bit was noise.
 """
 
 

@@ -2,6 +2,8 @@
 
 import json
 import struct
+import subprocess
+import sys
 import threading
 import zipfile
 
@@ -495,3 +497,19 @@ def test_detect_input(tmp_path):
     assert detect_input(tmp_path) == detect_input(tmp_path / "a.ply") == "splats"
     (tmp_path / "transforms.json").write_text("{}")
     assert detect_input(tmp_path) == "capture"  # an initial point cloud may lie beside it
+
+
+def test_ply_needs_numpy_alone(tmp_path):
+    """The player's side has none of the libraries of the `encode` extra."""
+    write_splat(tmp_path / "a.ply", gaussians(4))
+    missing = ("cv2", "OpenImageIO", "skimage", "scipy", "torch", "imageio_ffmpeg", "plyfile")
+    code = f"import sys; sys.modules.update(dict.fromkeys({missing})); from gscodec.splats import *; "
+    code += "s = open_sequence(sys.argv[1]); write_splat(sys.argv[2], s.frame(0)); print(len(s.frame(0)))"
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "a.ply", tmp_path / "b.ply"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.stdout, done.stderr) == ("4\n", "")
+    assert_close(read_splat(tmp_path / "a.ply"), read_splat(tmp_path / "b.ply"))

@@ -1,0 +1,55 @@
+"""Frames of one camera -> temporal stability and flicker.
+
+PSNR is blind to whether an error stays or dances. `stability` is the PSNR of differences of consecutive frames.
+`flicker` looks where nothing should happen: pixels whose reference stays within a range of less than 2 levels over
+5 frames, and there at the standard deviation of the image over the same frames, in 8-bit levels.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from gscodec.metrics.image import psnr_of_mse
+
+WINDOW = 5  # frames
+STILL = 2  # 8-bit levels
+
+
+class TemporalMeter:
+    """Takes the frames of one camera in order and keeps no more than a window of them."""
+
+    def __init__(self):
+        self._references: deque[np.ndarray] = deque(maxlen=WINDOW)
+        self._images: deque[np.ndarray] = deque(maxlen=WINDOW)
+        self._differences: list[float] = []
+        self._deviation, self._samples = 0.0, 0
+
+    def add(self, reference: np.ndarray, image: np.ndarray, mask: np.ndarray | None = None) -> None:
+        """Adds a frame, [H, W, 3] u8; flicker is measured where `mask` ([H, W] bool) holds in the last frame."""
+        if self._images:
+            change = reference.astype(np.float32) - self._references[-1]
+            seen = image.astype(np.float32) - self._images[-1]
+            self._differences.append(psnr_of_mse(float(np.mean((change - seen) ** 2, dtype=np.float64))))
+        self._references.append(reference)
+        self._images.append(image)
+        if len(self._images) < WINDOW:
+            return
+        window = np.stack(self._references)
+        still = window.max(0) - window.min(0) < STILL  # [H, W, 3]
+        if mask is not None:
+            still &= mask[..., None]
+        deviation = np.stack(self._images).std(0, dtype=np.float32)[still]
+        self._deviation += float(deviation.sum(dtype=np.float64))
+        self._samples += deviation.size
+
+    @property
+    def stability(self) -> float | None:
+        """Mean PSNR of temporal differences in dB; None for a single frame."""
+        return float(np.mean(self._differences)) if self._differences else None
+
+    @property
+    def flicker(self) -> float | None:
+        """8-bit levels; None where fewer than 5 frames or no still pixel were seen."""
+        return self._deviation / self._samples if self._samples else None
