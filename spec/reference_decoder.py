@@ -538,19 +538,23 @@ KNOTS = [
 ]
 
 
-def squash(x):
+def curve(x):
     """Clause 6.3."""
     x = clip(x, -3071, 3071)
     i, f = abs(x) >> 7, abs(x) & 127
     p = (KNOTS[i] * (128 - f) + KNOTS[i + 1] * f + 64) >> 7
-    return clip(65536 - p if x < 0 else p, 16, 65520)
+    return 65536 - p if x < 0 else p
+
+
+def squash(x):
+    return clip(curve(x), 16, 65520)
 
 
 def stretch_table():
-    """Clause 6.3; squash never falls, so one sweep finds the smallest x of every entry (3071 where there is none)."""
+    """Clause 6.3; the curve never falls, so one sweep finds the smallest x of every entry."""
     table, x = [], -3071
     for i in range(4096):
-        while x < 3071 and squash(x) < 16 * i + 8:
+        while curve(x) < 16 * i + 8:
             x += 1
         table.append(x)
     return table
