@@ -1,2 +1,28 @@
-//! Bytes <-> integer maps.
+//! The bitstream core: bytes <-> integer maps (container, units, entropy coding), and integers -> attributes of a frame.
+//!
+//! No I/O, no unsafe, no panic on input. Clause numbers in comments are those of spec/gsv.md.
 #![forbid(unsafe_code)]
+
+pub mod attributes;
+pub mod blend;
+pub mod channels;
+pub mod container;
+mod crc;
+pub mod decode;
+pub mod encode;
+pub mod error;
+pub mod evaluate;
+pub mod fields;
+pub mod group;
+pub mod header;
+pub mod levels;
+pub mod lifetimes;
+pub mod map;
+mod model;
+pub mod morton;
+pub mod neighbors;
+pub mod positions;
+pub mod range_coder;
+pub mod trajectories;
+pub mod unit;
+mod values;

@@ -1,0 +1,142 @@
+//! gsvC (spec 2.3) and the frame rate: what holds for the whole file.
+
+use crate::error::{Error, Result};
+use crate::fields::{Fields, Reader, Writer};
+
+/// Names of `up_axis` values.
+pub const UP_AXES: [&str; 6] = ["x", "y", "z", "-x", "-y", "-z"];
+/// Names of `color_space` values.
+pub const COLOR_SPACES: [&str; 1] = ["srgb"];
+/// Names of `sh_frame` values.
+pub const SH_FRAMES: [&str; 2] = ["world", "body"];
+
+/// A reference camera: OpenCV axes, pixel centres at half-integers.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Camera {
+    pub name: String,
+    pub width: u32,
+    pub height: u32,
+    /// fx, skew, cx, fy, cy.
+    pub k: [f32; 5],
+    /// The upper three rows of world-to-camera.
+    pub viewmat: [f32; 12],
+}
+
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Config {
+    /// mdhd; a frame lasts `frame_duration` of its units.
+    pub timescale: u32,
+    pub frame_duration: u32,
+    pub level: u8,
+    pub metres_per_unit: f32,
+    pub up_axis: u8,
+    pub color_space: u8,
+    pub background: [f32; 3],
+    pub sh_degree: u8,
+    pub sh_frame: u8,
+    pub cameras: Vec<Camera>,
+}
+
+impl Config {
+    /// Parses the body of gsvC; the timescale is that of mdhd.
+    pub fn read(body: &[u8], timescale: u32) -> Result<Config> {
+        let mut config = Config {
+            timescale,
+            ..Config::default()
+        };
+        config.fields(&mut Reader::new(body))?;
+        Ok(config)
+    }
+
+    /// The body of gsvC.
+    pub fn write(&self) -> Result<Vec<u8>> {
+        let mut w = Writer::default();
+        self.clone().fields(&mut w)?;
+        w.must(self.timescale > 0, || "a timescale > 0".into())?;
+        Ok(w.0)
+    }
+
+    fn fields<F: Fields>(&mut self, f: &mut F) -> Result<()> {
+        let mut version = 1;
+        f.u8(&mut version)?;
+        f.must(version == 1, || format!("configuration_version 1, found {version}"))?;
+        f.u8(&mut self.level)?;
+        f.u32(&mut self.frame_duration)?;
+        f.must(self.frame_duration > 0, || "frame_duration > 0, found 0".into())?;
+        f.step(&mut self.metres_per_unit, "metres_per_unit")?;
+        choice(f, &mut self.up_axis, UP_AXES.len(), "up_axis")?;
+        choice(f, &mut self.color_space, COLOR_SPACES.len(), "color_space")?;
+        for v in &mut self.background {
+            f.f32(v, "background")?;
+            let value = *v;
+            f.must((0.0..=1.0).contains(&value), || {
+                format!("background of 0 to 1, found {value}")
+            })?;
+        }
+        choice(f, &mut self.sh_degree, 4, "sh_degree")?;
+        choice(f, &mut self.sh_frame, SH_FRAMES.len(), "sh_frame")?;
+        let mut count = self.cameras.len() as u16;
+        f.must(usize::from(count) == self.cameras.len(), || {
+            "at most 65535 cameras".into()
+        })?;
+        f.u16(&mut count)?;
+        for i in 0..usize::from(count) {
+            // one at a time: a false count ends with the bytes, not with the memory
+            if i == self.cameras.len() {
+                self.cameras.push(Camera::default());
+            }
+            camera(f, &mut self.cameras[i])?;
+        }
+        Ok(())
+    }
+}
+
+fn choice<F: Fields>(f: &mut F, v: &mut u8, count: usize, what: &str) -> Result<()> {
+    f.u8(v)?;
+    let value = *v;
+    f.must(usize::from(value) < count, || {
+        format!("{what} of 0 to {}, found {value}", count - 1)
+    })
+}
+
+fn camera<F: Fields>(f: &mut F, c: &mut Camera) -> Result<()> {
+    let mut name = std::mem::take(&mut c.name).into_bytes();
+    let mut length = name.len() as u8;
+    f.must(usize::from(length) == name.len(), || {
+        "camera names of at most 255 bytes".into()
+    })?;
+    f.u8(&mut length)?;
+    name.resize(usize::from(length), 0);
+    f.bytes(&mut name)?;
+    match String::from_utf8(name) {
+        Ok(name) => c.name = name,
+        Err(_) => return f.fail("camera names in UTF-8".into()),
+    }
+    f.u32(&mut c.width)?;
+    f.u32(&mut c.height)?;
+    f.must(c.width > 0 && c.height > 0, || "cameras of at least one pixel".into())?;
+    for v in c.k.iter_mut().chain(&mut c.viewmat) {
+        f.f32(v, "camera matrices")?;
+    }
+    Ok(())
+}
+
+/// Frames a second as (timescale, frame_duration): exact for integers and the n * 1000/1001 family, else within 1e-6.
+pub fn rate(fps: f64) -> Result<(u32, u32)> {
+    if !(fps.is_finite() && (1e-3..=1e5).contains(&fps)) {
+        return Err(Error::Input(format!("expected fps of 0.001 to 100000, got {fps}")));
+    }
+    for (scale, duration) in [(1.0, 1), (1000.0, 1000), (1001.0, 1001)] {
+        let n = (fps * scale).round();
+        let n = if duration == 1001 {
+            (fps * 1.001).round() * 1000.0
+        } else {
+            n
+        };
+        if n >= 1.0 && (n / f64::from(duration) - fps).abs() < fps * if duration == 1001 { 2e-5 } else { 1e-9 } {
+            return Ok((n as u32, duration));
+        }
+    }
+    let duration = if fps > 1000.0 { 10_000 } else { 1_000_000 };
+    Ok(((fps * f64::from(duration)).round() as u32, duration))
+}

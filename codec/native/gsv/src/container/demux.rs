@@ -1,0 +1,243 @@
+//! Push parser of the container (spec 2): bytes in any pieces -> config and groups.
+//!
+//! No I/O inside, so that it serves files, HTTP ranges and a growing file alike. Media data is never copied: a caller that
+//! can seek asks `skippable` and leaves it out. Waiting for more bytes is a state, not an error.
+
+use super::config::Config;
+use super::movie::{self, Track};
+use crate::error::{Error, Result};
+
+/// Largest box that is read as a whole.
+const HEADER_BOX_MAX: u64 = 16 << 20;
+
+/// A group in the file.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Entry {
+    /// Of the sample's first byte, from the start of the file.
+    pub offset: u64,
+    pub size: u64,
+    pub start_frame: u64,
+    pub frames: u32,
+    pub sync: bool,
+}
+
+enum State {
+    /// Collecting the header of a box.
+    Head,
+    /// Collecting the body of a box that is read as a whole.
+    Body {
+        kind: [u8; 4],
+        start: u64,
+        head: u64,
+        size: usize,
+    },
+    /// Passing over a body.
+    Skip { left: u64 },
+}
+
+pub struct Demuxer {
+    state: State,
+    buffer: Vec<u8>,
+    position: u64,
+    first: bool,
+    track: Option<Track>,
+    pending: Option<Entry>,
+    groups: Vec<Entry>,
+    /// Where the fragments end according to sidx.
+    end: Option<u64>,
+}
+
+impl Default for Demuxer {
+    fn default() -> Self {
+        Demuxer {
+            state: State::Head,
+            buffer: Vec::new(),
+            position: 0,
+            first: true,
+            track: None,
+            pending: None,
+            groups: Vec::new(),
+            end: None,
+        }
+    }
+}
+
+impl Demuxer {
+    /// Known once moov has passed.
+    pub fn config(&self) -> Option<&Config> {
+        self.track.as_ref().map(|t| &t.config)
+    }
+
+    /// Groups whose bytes have all passed.
+    pub fn groups(&self) -> &[Entry] {
+        &self.groups
+    }
+
+    /// The group whose header has passed and whose bytes have not.
+    pub fn pending(&self) -> Option<&Entry> {
+        self.pending.as_ref()
+    }
+
+    /// Bytes consumed so far: where the next `push` is taken to start.
+    pub fn position(&self) -> u64 {
+        self.position
+    }
+
+    /// True if everything that the index announces has passed.
+    pub fn complete(&self) -> bool {
+        self.pending.is_none() && matches!(self.state, State::Head) && self.end.is_some_and(|end| self.position >= end)
+    }
+
+    /// Bytes from `position` that need not be pushed.
+    pub fn skippable(&self) -> u64 {
+        if let State::Skip { left } = self.state { left } else { 0 }
+    }
+
+    /// Passes over `n` bytes, at most `skippable`.
+    pub fn skip(&mut self, n: u64) {
+        let State::Skip { left } = &mut self.state else { return };
+        let n = n.min(*left);
+        self.position = self.position.saturating_add(n);
+        *left -= n;
+        if *left == 0 {
+            self.state = State::Head;
+        }
+        if let Some(group) = self
+            .pending
+            .take_if(|g| g.offset.saturating_add(g.size) <= self.position)
+        {
+            self.groups.push(group);
+        }
+    }
+
+    /// Takes the next bytes of the file.
+    pub fn push(&mut self, mut data: &[u8]) -> Result<()> {
+        while !data.is_empty() {
+            if let State::Skip { left } = self.state {
+                let n = left.min(data.len() as u64);
+                self.skip(n);
+                data = &data[n as usize..];
+                continue;
+            }
+            let want = match self.state {
+                State::Body { size, .. } => size,
+                _ if self.buffer.starts_with(&[0, 0, 0, 1]) => 16, // largesize
+                _ => 8,
+            };
+            let n = (want - self.buffer.len()).min(data.len());
+            self.buffer.extend_from_slice(&data[..n]);
+            self.position += n as u64;
+            data = &data[n..];
+            self.advance()?;
+        }
+        Ok(())
+    }
+
+    /// Acts on what is in the buffer, if it is whole.
+    fn advance(&mut self) -> Result<()> {
+        match self.state {
+            State::Head => self.head(),
+            State::Body {
+                kind,
+                start,
+                head,
+                size,
+            } if self.buffer.len() == size => {
+                let body = std::mem::take(&mut self.buffer);
+                self.state = State::Head;
+                self.body(&kind, start, &body)
+                    .map_err(|e| e.at((start + head) as usize, &name(&kind)))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn head(&mut self) -> Result<()> {
+        let Some(([size @ .., a, b, c, d], large)) = self.buffer.split_first_chunk::<8>() else {
+            return Ok(());
+        };
+        let (kind, size) = ([*a, *b, *c, *d], u64::from(u32::from_be_bytes(*size)));
+        let (head, size) = match (size, large.first_chunk::<8>()) {
+            (1, Some(large)) => (16, u64::from_be_bytes(*large)),
+            (1, None) => return Ok(()),
+            (size, _) => (8, size),
+        };
+        let start = self.position - head;
+        let fail = |expected: &str| Err(Error::bitstream(start as usize, name(&kind), expected));
+        if std::mem::take(&mut self.first) && &kind != b"ftyp" {
+            return fail("a .gsv file, which starts with an ftyp box");
+        }
+        let body = match size {
+            0 if &kind == b"mdat" => u64::MAX,
+            _ if size >= head && start.checked_add(size).is_some() => size - head,
+            _ => return fail("a box size that covers the header of the box"),
+        };
+        self.buffer.clear();
+        if &kind == b"mdat" {
+            self.sample_within(body)
+                .map_err(|expected| Error::bitstream(start as usize, "mdat box", expected))?;
+        }
+        if !matches!(&kind, b"ftyp" | b"moov" | b"moof" | b"sidx") {
+            self.state = State::Skip { left: body };
+            self.skip(0);
+        } else if body > HEADER_BOX_MAX {
+            return Err(Error::limit(
+                name(&kind),
+                format!("{body} bytes, at most {HEADER_BOX_MAX} are allowed"),
+            ));
+        } else {
+            self.state = State::Body {
+                kind,
+                start,
+                head,
+                size: body as usize,
+            };
+            self.advance()?;
+        }
+        Ok(())
+    }
+
+    /// Spec 2.4: the sample that a moof announced lies in the next mdat.
+    fn sample_within(&self, body: u64) -> std::result::Result<(), &'static str> {
+        let Some(g) = &self.pending else { return Ok(()) };
+        let end = g.offset.checked_add(g.size);
+        let inside = g.offset >= self.position && end.is_some_and(|e| e <= self.position.saturating_add(body));
+        if inside {
+            Ok(())
+        } else {
+            Err("the sample of the moof before to lie within it")
+        }
+    }
+
+    fn body(&mut self, kind: &[u8; 4], start: u64, body: &[u8]) -> Result<()> {
+        match kind {
+            b"ftyp" => movie::brands(body),
+            b"moov" if self.track.is_some() => Err(Error::bitstream(0, "", "one moov box")),
+            b"moov" => {
+                self.track = Some(movie::movie(body)?);
+                Ok(())
+            }
+            b"sidx" => {
+                self.end = movie::index(body).and_then(|size| self.position.checked_add(size));
+                Ok(())
+            }
+            _ => self.fragment(start, body),
+        }
+    }
+
+    fn fragment(&mut self, start: u64, body: &[u8]) -> Result<()> {
+        let Some(track) = &self.track else {
+            return Err(Error::bitstream(0, "", "a moov box before the first moof"));
+        };
+        if self.pending.is_some() {
+            return Err(Error::bitstream(0, "", "the mdat box of the moof before"));
+        }
+        self.pending = movie::fragment(body, track, start)?;
+        Ok(())
+    }
+}
+
+/// For messages.
+pub fn name(kind: &[u8; 4]) -> String {
+    format!("{} box", kind.escape_ascii())
+}

@@ -1,0 +1,8 @@
+//! The container (spec 2): fragmented MP4 with one fragment per group.
+//!
+//! `config` is the gsvC box, `write` makes boxes, `demux` finds groups in bytes that arrive in any pieces.
+
+pub mod config;
+pub mod demux;
+mod movie;
+pub mod write;

@@ -1,0 +1,115 @@
+//! Headers are declared once: a function over `Fields` reads them, writes them, and says where they break.
+//!
+//! The writer takes each value from the place that the reader stores it to.
+
+use crate::error::{Error, Result};
+
+pub trait Fields {
+    fn bytes(&mut self, v: &mut [u8]) -> Result<()>;
+    /// Reading only: the error that a field just passed broke a rule.
+    fn fail<T>(&self, expected: String) -> Result<T>;
+
+    fn u8(&mut self, v: &mut u8) -> Result<()> {
+        let mut b = [*v];
+        self.bytes(&mut b)?;
+        *v = b[0];
+        Ok(())
+    }
+
+    fn u16(&mut self, v: &mut u16) -> Result<()> {
+        let mut b = v.to_be_bytes();
+        self.bytes(&mut b)?;
+        *v = u16::from_be_bytes(b);
+        Ok(())
+    }
+
+    fn u32(&mut self, v: &mut u32) -> Result<()> {
+        let mut b = v.to_be_bytes();
+        self.bytes(&mut b)?;
+        *v = u32::from_be_bytes(b);
+        Ok(())
+    }
+
+    fn u64(&mut self, v: &mut u64) -> Result<()> {
+        let mut b = v.to_be_bytes();
+        self.bytes(&mut b)?;
+        *v = u64::from_be_bytes(b);
+        Ok(())
+    }
+
+    /// A finite f32.
+    fn f32(&mut self, v: &mut f32, what: &str) -> Result<()> {
+        let mut b = v.to_be_bytes();
+        self.bytes(&mut b)?;
+        *v = f32::from_be_bytes(b);
+        self.must(v.is_finite(), || format!("{what} to be finite"))
+    }
+
+    /// A finite f32 above zero.
+    fn step(&mut self, v: &mut f32, what: &str) -> Result<()> {
+        self.f32(v, what)?;
+        let value = *v;
+        self.must(value > 0.0, || format!("{what} > 0, found {value}"))
+    }
+
+    fn must(&self, holds: bool, expected: impl FnOnce() -> String) -> Result<()> {
+        if holds { Ok(()) } else { self.fail(expected()) }
+    }
+}
+
+/// Appends fields to a buffer.
+#[derive(Default)]
+pub struct Writer(pub Vec<u8>);
+
+impl Fields for Writer {
+    fn bytes(&mut self, v: &mut [u8]) -> Result<()> {
+        self.0.extend_from_slice(v);
+        Ok(())
+    }
+
+    fn fail<T>(&self, expected: String) -> Result<T> {
+        Err(Error::Input(format!("expected {expected}")))
+    }
+}
+
+/// Takes fields from a slice; offsets in errors count from its start.
+pub struct Reader<'a> {
+    data: &'a [u8],
+    position: usize,
+}
+
+impl<'a> Reader<'a> {
+    pub fn new(data: &'a [u8]) -> Self {
+        Reader { data, position: 0 }
+    }
+
+    pub fn position(&self) -> usize {
+        self.position
+    }
+
+    pub fn rest(&self) -> usize {
+        self.data.len() - self.position
+    }
+
+    /// The next `n` bytes, without a copy.
+    pub fn take(&mut self, n: usize) -> Result<&'a [u8]> {
+        match self.data.get(self.position..).and_then(|d| d.get(..n)) {
+            Some(d) => {
+                self.position += n;
+                Ok(d)
+            }
+            None => self.fail(format!("{n} more bytes, found {}", self.rest())),
+        }
+    }
+}
+
+impl Fields for Reader<'_> {
+    fn bytes(&mut self, v: &mut [u8]) -> Result<()> {
+        v.copy_from_slice(self.take(v.len())?);
+        Ok(())
+    }
+
+    fn fail<T>(&self, expected: String) -> Result<T> {
+        Err(Error::bitstream(self.position, "", expected))
+    }
+}

@@ -1,0 +1,113 @@
+//! Probability models (spec 6.2 to 6.4): bins in context -> probabilities, in integers only.
+//!
+//! A bin is predicted by two counters, each chosen by its own context, mixed in the logistic domain with weights that are
+//! learned as well (after Mahoney's PAQ). Two sparse views of the past beat one joint context, which would dilute.
+
+use crate::range_coder::Bins;
+use std::sync::LazyLock;
+
+/// 65536 / (1 + exp(-x/2)), x = 0..=24: knots of the logistic curve at half units (spec 6.3).
+#[rustfmt::skip]
+const KNOTS: [i32; 25] = [
+    32768, 40793, 47911, 53581, 57724, 60565, 62428, 63615, 64357, 64816, 65097, 65269, 65374, 65438, 65476, 65500,
+    65514, 65523, 65528, 65531, 65533, 65534, 65535, 65535, 65536,
+];
+/// The logistic domain: units of 1/256, -12 to 12 exclusive.
+const STRETCH_MAX: i32 = 12 * 256 - 1;
+/// Probabilities of mixed bins, times 65536, stay in `P_MIN..=65536 - P_MIN`.
+const P_MIN: i32 = 16;
+/// Bins after which a counter stops slowing down.
+const AGE_MAX: u32 = 255;
+/// Initial weight of each counter, 0.4, and the range of weights, in 1/65536.
+const WEIGHT_NEW: i32 = 26214;
+const WEIGHT_MAX: i32 = 4 << 16;
+
+/// Logistic domain -> probability times 65536, 0 to 65536.
+fn curve(x: i32) -> i32 {
+    let x = x.clamp(-STRETCH_MAX, STRETCH_MAX);
+    let (i, f) = ((x.unsigned_abs() >> 7) as usize, x.abs() & 127);
+    let p = (KNOTS[i] * (128 - f) + KNOTS[i + 1] * f + 64) >> 7;
+    if x < 0 { 65536 - p } else { p }
+}
+
+/// Probability in 4096ths -> logistic domain (spec 6.3).
+static STRETCH: LazyLock<[i16; 4096]> = LazyLock::new(|| {
+    let mut x = -STRETCH_MAX;
+    std::array::from_fn(|i| {
+        while x < STRETCH_MAX && curve(x) < 16 * i as i32 + 8 {
+            x += 1;
+        }
+        x as i16
+    })
+});
+
+/// Step of a counter that has seen n bins: 1 / (n + 1.5), in 1/65536.
+static RATE: LazyLock<[u32; 256]> = LazyLock::new(|| std::array::from_fn(|n| 131_072 / (2 * n as u32 + 3)));
+
+/// Probability of 1 (22 bits) above the number of bins seen (10 bits).
+#[derive(Clone, Copy)]
+struct Counter(u32);
+
+impl Counter {
+    const NEW: Counter = Counter(1 << 31);
+
+    #[inline]
+    fn update(&mut self, bin: bool, rate: &[u32; 256]) {
+        let (p, n) = (i64::from(self.0 >> 10), self.0 & 255);
+        let target = if bin { (1 << 22) - 1 } else { 0 };
+        let p = p + (((target - p) * i64::from(rate[n as usize])) >> 16);
+        self.0 = (p as u32) << 10 | (n + u32::from(n < AGE_MAX));
+    }
+
+    /// How much the counter can be trusted, 0 to 3.
+    #[inline]
+    fn age(self) -> usize {
+        match self.0 & 255 {
+            0..=3 => 0,
+            4..=15 => 1,
+            16..=63 => 2,
+            _ => 3,
+        }
+    }
+}
+
+/// Counters and mixing weights for the syntax elements of one kind.
+pub struct Model {
+    a: Vec<Counter>,
+    b: Vec<Counter>,
+    weights: Vec<[i32; 2]>,
+    stretch: &'static [i16; 4096],
+    rate: &'static [u32; 256],
+}
+
+impl Model {
+    /// `a` and `b` contexts and `sets` weight sets.
+    pub fn new(a: usize, b: usize, sets: usize) -> Self {
+        Model {
+            a: vec![Counter::NEW; a],
+            b: vec![Counter::NEW; b],
+            weights: vec![[WEIGHT_NEW; 2]; sets * 16],
+            stretch: &STRETCH,
+            rate: &RATE,
+        }
+    }
+
+    /// Codes one bin in contexts `a` and `b`, mixed with weight set `w` (spec 6.4).
+    ///
+    /// Contexts are made of what the caller counted, never of raw input, so they are in range by construction.
+    #[inline]
+    pub fn bin<C: Bins>(&mut self, c: &mut C, bin: bool, a: usize, b: usize, w: usize) -> bool {
+        let (ca, cb) = (&mut self.a[a], &mut self.b[b]);
+        let sa = i32::from(self.stretch[(ca.0 >> 20) as usize]);
+        let sb = i32::from(self.stretch[(cb.0 >> 20) as usize]);
+        let weight = &mut self.weights[16 * w + 4 * ca.age() + cb.age()];
+        let p = curve((weight[0] * sa + weight[1] * sb) >> 16).clamp(P_MIN, 65536 - P_MIN);
+        let bin = c.bin(bin, p as u32);
+        let err = if bin { 65536 - p } else { -p };
+        weight[0] = (weight[0] + ((sa * err + 16384) >> 15)).clamp(-WEIGHT_MAX, WEIGHT_MAX);
+        weight[1] = (weight[1] + ((sb * err + 16384) >> 15)).clamp(-WEIGHT_MAX, WEIGHT_MAX);
+        ca.update(bin, self.rate);
+        cb.update(bin, self.rate);
+        bin
+    }
+}

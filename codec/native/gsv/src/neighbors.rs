@@ -1,0 +1,50 @@
+//! Neighbours (spec 7.3): grid points in Morton order -> for each the nearest among those just before it.
+//!
+//! Contexts of all channels come from them. The search is brute force over a window: exact, cheap and easy to repeat.
+
+use rayon::prelude::*;
+
+const WINDOW: usize = 32;
+/// Neighbours per index.
+pub const NEAR: usize = 4;
+
+/// Up to four indices, nearest first; index i has min(i, 4).
+pub type Near = [u32; NEAR];
+
+/// Squared distance in grid units.
+#[inline]
+pub fn distance(p: [u32; 3], q: [u32; 3]) -> u64 {
+    let d = |a: usize| u64::from(p[a].abs_diff(q[a]));
+    d(0) * d(0) + d(1) * d(1) + d(2) * d(2)
+}
+
+/// For each point the four before it, within the window, that are nearest; ties go to the most recent.
+pub fn nearest(points: &[[u32; 3]]) -> Vec<Near> {
+    (0..points.len())
+        .into_par_iter()
+        .with_min_len(4096)
+        .map(|i| nearest_before(points, i))
+        .collect()
+}
+
+fn nearest_before(points: &[[u32; 3]], i: usize) -> Near {
+    let from = i.saturating_sub(WINDOW);
+    let mut best = [u64::MAX; NEAR]; // distance << 5 | how far back, less one
+    for (back, q) in points[from..i].iter().rev().enumerate() {
+        let mut key = distance(points[i], *q) << 5 | back as u64;
+        if key < best[NEAR - 1] {
+            for b in &mut best {
+                if key < *b {
+                    std::mem::swap(&mut key, b);
+                }
+            }
+        }
+    }
+    best.map(|k| {
+        if k == u64::MAX {
+            u32::MAX
+        } else {
+            (i - 1 - (k & 31) as usize) as u32
+        }
+    })
+}

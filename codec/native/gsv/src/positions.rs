@@ -1,0 +1,250 @@
+//! Positions (spec 8): a sorted multiset of grid points <-> bins.
+//!
+//! An octree, breadth first, whose nodes know how many points they hold: emptiness, single points and duplicates are all
+//! one question, how many are in the lower half. Contexts ask where the face neighbours have their points. A point
+//! without neighbours leaves the tree, since nothing is known about its remaining bits.
+
+use crate::model::Model;
+use crate::range_coder::Bins;
+
+const NONE: u32 = u32::MAX;
+const BUCKETS: usize = 16; // of the number of points to split
+const TREE: usize = 32; // adaptive bins of one split; later ones are bypass bins
+const EVIDENCE: usize = 144;
+
+/// A cube of one level that holds `count` points.
+struct Node {
+    code: u64,
+    count: u32,
+    start: u32,      // encoder: index of its first point
+    lower: [u32; 3], // face neighbours at the side of 0 of x, y, z: already split
+    upper: [u32; 3], // and at the other side: still to be split
+}
+
+impl Node {
+    fn new(code: u64, count: u32, start: u32) -> Node {
+        Node {
+            code,
+            count,
+            start,
+            lower: [NONE; 3],
+            upper: [NONE; 3],
+        }
+    }
+
+    fn occupied(&self) -> usize {
+        self.lower.iter().chain(&self.upper).filter(|q| **q != NONE).count()
+    }
+}
+
+/// Points per child (bit 2: half along x, bit 1: y, bit 0: z), at most 255, as contexts see them.
+type Seen = [u8; 8];
+
+/// Where the children of a node are in the next level.
+#[derive(Clone, Copy, Default)]
+struct Children {
+    first: u32,
+    mask: u8,
+}
+
+impl Children {
+    fn find(self, k: u8) -> Option<u32> {
+        let before = self.mask & ((1u8 << k) - 1);
+        (self.mask >> k & 1 != 0).then(|| self.first + before.count_ones())
+    }
+}
+
+/// Codes `count` points of `bits` bits an axis. `points`: their sorted Morton codes (encoder). Returns these.
+pub fn code<C: Bins>(c: &mut C, points: &[u64], count: u32, bits: u32) -> Vec<u64> {
+    let mut out = Vec::with_capacity(count as usize);
+    let mut coder = Coder {
+        c,
+        model: Model::new(BUCKETS * TREE * EVIDENCE, BUCKETS * TREE * 3 * 7 * 8, BUCKETS * TREE),
+    };
+    let mut level = if count > 0 {
+        vec![Node::new(0, count, 0)]
+    } else {
+        Vec::new()
+    };
+    for rest in (1..=bits).rev() {
+        level = coder.level(&level, points, rest, &mut out);
+    }
+    for node in &level {
+        out.extend((0..node.count).map(|_| node.code));
+    }
+    out.sort_unstable();
+    out
+}
+
+struct Coder<'a, C> {
+    c: &'a mut C,
+    model: Model,
+}
+
+impl<C: Bins> Coder<'_, C> {
+    /// Splits the nodes of one level, of which `rest` bits an axis are unknown; the next level.
+    fn level(&mut self, level: &[Node], points: &[u64], rest: u32, out: &mut Vec<u64>) -> Vec<Node> {
+        let mut seen: Vec<Seen> = Vec::with_capacity(level.len());
+        let mut children: Vec<Children> = Vec::with_capacity(level.len());
+        let mut next = Vec::with_capacity(level.len() * 2);
+        for node in level {
+            if !self.c.alive() {
+                break;
+            }
+            let (first, mut mask, mut mine) = (next.len() as u32, 0, [0; 8]);
+            if node.count == 1 && node.occupied() == 0 {
+                let known = points.get(node.start as usize).copied().unwrap_or(0);
+                out.push(node.code << (3 * rest) | self.c.bits(known & ((1 << (3 * rest)) - 1), 3 * rest));
+            } else {
+                let mut start = node.start;
+                let counts = Split::new(node, level, &seen, points, rest).children(self);
+                for (k, &n) in counts.iter().enumerate().filter(|(_, n)| **n > 0) {
+                    mine[k] = n.min(255) as u8;
+                    mask |= 1 << k;
+                    next.push(Node::new(node.code << 3 | k as u64, n, start));
+                    start += n;
+                }
+            }
+            seen.push(mine);
+            children.push(Children { first, mask });
+        }
+        link(level, &children, &mut next);
+        next
+    }
+}
+
+/// What the contexts of one node's seven splits are made of.
+struct Split {
+    want: [u32; 8],   // encoder: points per child
+    lower: [Seen; 3], // children of the face neighbours at the side of 0
+    upper: [u32; 3],  // points of those at the other side
+    own: Seen,        // children of this node, as far as known
+    count: u32,
+    occupied: usize,
+    depth: usize,
+}
+
+impl Split {
+    fn new(node: &Node, level: &[Node], seen: &[Seen], points: &[u64], rest: u32) -> Split {
+        let mut want = [0; 8];
+        let mine = points
+            .get(node.start as usize..)
+            .and_then(|p| p.get(..node.count as usize));
+        for p in mine.unwrap_or(&[]) {
+            want[(p >> (3 * (rest - 1)) & 7) as usize] += 1;
+        }
+        Split {
+            want,
+            lower: node.lower.map(|q| seen.get(q as usize).copied().unwrap_or([0; 8])),
+            upper: node.upper.map(|q| level.get(q as usize).map_or(0, |n| n.count)),
+            own: [0; 8],
+            count: node.count,
+            occupied: node.occupied(),
+            depth: (rest as usize - 1).min(7),
+        }
+    }
+
+    /// Points per child: along x, then y, then z.
+    fn children<C: Bins>(mut self, coder: &mut Coder<C>) -> [u32; 8] {
+        let mut counts = [0; 8];
+        let [lx, ly, lz] = self.lower;
+        let c = context(halves(&ly, 4, 0), halves(&lz, 4, 0), sum(&lx, 4, 4), self.upper[0]);
+        let low = self.split(coder, 4, 0, self.count, c, 0);
+        for (x, n) in [(0, low), (4, self.count - low)].into_iter().filter(|(_, n)| *n > 0) {
+            let sx = if x == 0 {
+                halves(&lx, 2, 4)
+            } else {
+                halves(&self.own, 2, 0)
+            };
+            let c = context(sx, halves(&lz, 2, x), sum(&ly, 6, x | 2), self.upper[1]);
+            let low = self.split(coder, 6, x, n, c, 1);
+            for (y, n) in [(0, low), (2, n - low)].into_iter().filter(|(_, n)| *n > 0) {
+                let k = x | y;
+                let sx = if x == 0 {
+                    halves(&lx, 1, 4 | y)
+                } else {
+                    halves(&self.own, 1, y)
+                };
+                let sy = if y == 0 {
+                    halves(&ly, 1, k | 2)
+                } else {
+                    halves(&self.own, 1, x)
+                };
+                let c = context(sx, sy, u32::from(lz[k | 1]), self.upper[2]);
+                let low = self.split(coder, 7, k, n, c, 2);
+                (counts[k], counts[k | 1]) = (low, n - low);
+                (self.own[k], self.own[k | 1]) = (low.min(255) as u8, (n - low).min(255) as u8);
+            }
+        }
+        counts
+    }
+
+    /// Of `n` points, how many lie in the lower half: the children k with k & mask = half.
+    fn split<C: Bins>(&self, coder: &mut Coder<C>, mask: usize, half: usize, n: u32, c: usize, axis: usize) -> u32 {
+        let want: u32 = (0..8).filter(|k| k & mask == half).map(|k| self.want[k]).sum();
+        let bucket = if n <= 8 {
+            n as usize - 1
+        } else {
+            (4 + 32 - n.leading_zeros() as usize).min(BUCKETS - 1)
+        };
+        let (mut lo, mut hi, mut tree) = (0, n, 1);
+        while lo < hi {
+            let mid = (lo + hi) >> 1;
+            let high = if tree < TREE {
+                let t = bucket * TREE + tree;
+                let b = ((t * 3 + axis) * 7 + self.occupied) * 8 + self.depth;
+                coder.model.bin(coder.c, want > mid, t * EVIDENCE + c, b, t)
+            } else {
+                coder.c.bits(u64::from(want > mid), 1) != 0
+            };
+            tree = (tree * 2 + usize::from(high)).min(TREE * 2 - 1);
+            (lo, hi) = if high { (mid + 1, hi) } else { (lo, mid) };
+        }
+        lo
+    }
+}
+
+/// Points of the children whose bits under `mask` are `half`.
+#[inline]
+fn sum(seen: &Seen, mask: usize, half: usize) -> u32 {
+    (0..8).filter(|k| k & mask == half).map(|k| u32::from(seen[k])).sum()
+}
+
+/// On which side of the axis `bit` a neighbour has more points, of the part of it given by the bits above `bit`:
+/// 0: it has none, 1: on the low side, 2: on the high side, 3: as many.
+#[inline]
+fn halves(seen: &Seen, bit: usize, part: usize) -> usize {
+    let mask = [7, 7, 6, 6, 4][bit]; // the axis and those split before it
+    match (sum(seen, mask, part), sum(seen, mask, part | bit)) {
+        (0, 0) => 0,
+        (l, h) if l > h => 1,
+        (l, h) if l < h => 2,
+        _ => 3,
+    }
+}
+
+#[inline]
+fn context(s: usize, t: usize, low: u32, up: u32) -> usize {
+    ((low.min(2) * 3 + up.min(2)) as usize * 4 + s) * 4 + t
+}
+
+/// Face neighbours of the children, from those of their parents.
+fn link(level: &[Node], children: &[Children], next: &mut [Node]) {
+    for (parent, mine) in level.iter().zip(children) {
+        for k in 0..8u8 {
+            let Some(at) = mine.find(k) else { continue };
+            for axis in 0..3 {
+                let bit = 4u8 >> axis;
+                let across = if k & bit != 0 {
+                    Some(mine)
+                } else {
+                    children.get(parent.lower[axis] as usize)
+                };
+                if let Some(q) = across.and_then(|c| c.find(k ^ bit)) {
+                    next[at as usize].lower[axis] = q;
+                    next[q as usize].upper[axis] = at;
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,167 @@
+//! Trajectories (spec 11, 12): DCT-II coefficients of Gaussians or nodes <-> bins.
+//!
+//! Most Gaussians have none, so storage is sparse: coding, keeping and evaluating cost what is there.
+
+use crate::model::Model;
+use crate::neighbors::{NEAR, Near};
+use crate::range_coder::Bins;
+use crate::values::ValueModel;
+
+const LENGTHS: usize = 32; // lengths with a model of their own
+
+/// Coefficients of N Gaussians or nodes, `channels` values each, lowest frequency first.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Trajectories {
+    pub channels: usize,
+    /// N + 1 places, in coefficients: those of i are `start[i]..start[i + 1]`.
+    start: Vec<u32>,
+    /// `channels` values per coefficient.
+    values: Vec<i32>,
+}
+
+impl Trajectories {
+    pub fn new(channels: usize) -> Self {
+        Trajectories {
+            channels,
+            start: vec![0],
+            values: Vec::new(),
+        }
+    }
+
+    /// Appends one Gaussian: `coefficients` holds its values, `channels` per coefficient; zeros at the end are left out.
+    pub fn push(&mut self, coefficients: &[i32]) {
+        let used = coefficients
+            .iter()
+            .rposition(|v| *v != 0)
+            .map_or(0, |last| last / self.channels.max(1) + 1);
+        self.values.extend_from_slice(&coefficients[..used * self.channels]);
+        self.start.push((self.values.len() / self.channels.max(1)) as u32);
+    }
+
+    pub fn len(&self) -> usize {
+        self.start.len().saturating_sub(1)
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Number of values present.
+    pub fn symbols(&self) -> usize {
+        self.values.len()
+    }
+
+    /// The values of `i`, `channels` per coefficient; none if there is no `i`.
+    #[inline]
+    pub fn get(&self, i: usize) -> &[i32] {
+        let place = |i: usize| self.start.get(i).map(|s| *s as usize * self.channels);
+        match (place(i), place(i + 1)) {
+            (Some(from), Some(to)) => self.values.get(from..to).unwrap_or(&[]),
+            _ => &[],
+        }
+    }
+
+    /// Number of coefficients of the longest.
+    pub fn max_length(&self) -> usize {
+        self.start.windows(2).map(|w| (w[1] - w[0]) as usize).max().unwrap_or(0)
+    }
+}
+
+/// How values are told apart.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    Gaussians,
+    Nodes,
+}
+
+impl Kind {
+    fn class(self, k: usize, channel: usize) -> usize {
+        match self {
+            Kind::Gaussians => 3 * k.min(3) + channel % 3,
+            Kind::Nodes => 6 * k.min(3) + channel,
+        }
+    }
+}
+
+/// Why decoding stopped.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Stop {
+    /// A forbidden value, or the payload is over.
+    Broken,
+    /// More symbols than allowed.
+    Symbols,
+}
+
+/// Codes trajectories of up to `k_max` coefficients. Decoding takes at most `budget` values; `source` is the encoder's input.
+pub fn code<C: Bins>(
+    c: &mut C,
+    kind: Kind,
+    k_max: usize,
+    near: &[Near],
+    source: &Trajectories,
+    budget: u64,
+) -> Result<Trajectories, Stop> {
+    let channels = source.channels;
+    let mut coder = Coder {
+        kind,
+        lengths: Model::new(16 * LENGTHS, 16 * LENGTHS, LENGTHS),
+        values: ValueModel::new(if kind == Kind::Nodes { 24 } else { 12 }),
+    };
+    let mut out = Trajectories::new(channels);
+    for (i, near) in near.iter().enumerate() {
+        let length = coder.length(c, near, &out, source.get(i).len() / channels.max(1), k_max);
+        if (out.values.len() + length * channels) as u64 > budget {
+            return Err(Stop::Symbols);
+        }
+        coder.coefficients(c, near, &mut out, source.get(i), length);
+        if coder.values.broken || !c.alive() {
+            return Err(Stop::Broken);
+        }
+    }
+    Ok(out)
+}
+
+struct Coder {
+    kind: Kind,
+    lengths: Model,
+    values: ValueModel,
+}
+
+impl Coder {
+    fn length<C: Bins>(&mut self, c: &mut C, near: &Near, out: &Trajectories, want: usize, k_max: usize) -> usize {
+        let l = near.map(|j| out.get(j as usize).len() / out.channels.max(1));
+        let a = 4 * l[0].min(3) + l[1].min(3);
+        let b = (2 * l[0] + l[1] + l[2] + l[3]).min(15);
+        let mut length = 0;
+        while length < k_max {
+            let z = length.min(LENGTHS - 1);
+            if !self.lengths.bin(c, want > length, LENGTHS * a + z, LENGTHS * b + z, z) {
+                break;
+            }
+            length += 1;
+        }
+        length
+    }
+
+    fn coefficients<C: Bins>(&mut self, c: &mut C, near: &Near, out: &mut Trajectories, want: &[i32], length: usize) {
+        let (channels, base) = (out.channels, out.values.len());
+        for place in 0..length * channels {
+            let mut around = [0; NEAR];
+            let mut present = 0;
+            for j in near.iter().filter(|j| **j != u32::MAX) {
+                around[present] = out.get(*j as usize).get(place).copied().unwrap_or(0);
+                present += 1;
+            }
+            let (k, channel) = (place / channels, place % channels);
+            let own = &out.values[base..];
+            let before = place.checked_sub(channels).map_or(0, |p| own[p]);
+            let left = if channel > 0 { own[place - 1] } else { 0 };
+            let x = want.get(place).copied().unwrap_or(0);
+            let v = self
+                .values
+                .value(c, self.kind.class(k, channel), x, &around[..present], [before, left]);
+            out.values.push(v);
+        }
+        out.start.push((out.values.len() / channels.max(1)) as u32);
+    }
+}

@@ -1,0 +1,206 @@
+//! Units (spec 3): a group payload <-> typed, checksummed pieces.
+
+use crate::attributes::Attribute;
+use crate::crc::crc32;
+use crate::error::{Error, Result};
+use crate::fields::{Fields, Reader, Writer};
+
+/// Known unit types (spec 3.1).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub enum UnitType {
+    GroupHeader = 0,
+    Positions = 1,
+    Channels = 2,
+    Lifetimes = 3,
+    NodePositions = 4,
+    NodeTrajectories = 5,
+    Trajectories = 6,
+    StepClasses = 7,
+    Deaths = 8,
+    LayerCorrection = 9,
+}
+
+use UnitType::*;
+
+impl UnitType {
+    const ALL: [UnitType; 10] = [
+        GroupHeader,
+        Positions,
+        Channels,
+        Lifetimes,
+        NodePositions,
+        NodeTrajectories,
+        Trajectories,
+        StepClasses,
+        Deaths,
+        LayerCorrection,
+    ];
+
+    pub fn from_number(n: u8) -> Option<UnitType> {
+        Self::ALL.get(usize::from(n)).copied()
+    }
+
+    pub fn name(self) -> &'static str {
+        match self {
+            GroupHeader => "group_header",
+            Positions => "positions",
+            Channels => "channels",
+            Lifetimes => "lifetimes",
+            NodePositions => "node_positions",
+            NodeTrajectories => "node_trajectories",
+            Trajectories => "trajectories",
+            StepClasses => "step_classes",
+            Deaths => "deaths",
+            LayerCorrection => "layer_correction",
+        }
+    }
+
+    /// The unit type that must be among the dependencies.
+    fn needs(self) -> Option<UnitType> {
+        match self {
+            Channels | Lifetimes | Trajectories => Some(Positions),
+            NodeTrajectories => Some(NodePositions),
+            _ => None,
+        }
+    }
+}
+
+/// One unit of a group; `kind` is None for a type that this version skips.
+#[derive(Debug, Clone)]
+pub struct Unit<'a> {
+    pub number: u8,
+    pub kind: Option<UnitType>,
+    pub layer: u8,
+    pub attribute: Option<Attribute>,
+    attribute_number: u8,
+    /// Of the unit in the group payload, and of its payload.
+    pub offset: usize,
+    pub payload_offset: usize,
+    pub size: usize,
+    pub payload: &'a [u8],
+    dependencies: Vec<u8>,
+}
+
+impl Unit<'_> {
+    /// For messages: "unit 3 (channels sh0)".
+    pub fn label(&self, index: usize) -> String {
+        let kind = self.kind.map_or("unknown", UnitType::name);
+        match self.attribute {
+            Some(a) => format!("unit {index} ({kind} {})", a.name()),
+            None => format!("unit {index} ({kind})"),
+        }
+    }
+}
+
+const UNITS_MAX: usize = 255;
+
+/// Splits a group payload; every CRC and dependency is checked.
+pub fn split(payload: &[u8]) -> Result<Vec<Unit<'_>>> {
+    let mut units: Vec<Unit> = Vec::new();
+    let mut offset = 0;
+    while offset < payload.len() || units.is_empty() {
+        let index = units.len();
+        let name = format!("unit {index}");
+        let unit = read(&payload[offset..], offset).map_err(|e| e.at(offset, &name))?;
+        check(&unit, &units).map_err(|expected| Error::bitstream(offset, unit.label(index), expected))?;
+        offset += unit.size;
+        units.push(unit);
+    }
+    Ok(units)
+}
+
+fn read(data: &[u8], offset: usize) -> Result<Unit<'_>> {
+    let mut r = Reader::new(data);
+    let mut h = [0u8; 4];
+    r.bytes(&mut h)?;
+    let [number, layer, attribute, dependency_count] = h;
+    let dependencies = r.take(usize::from(dependency_count))?.to_vec();
+    let (mut length, mut crc) = (0, 0);
+    r.u32(&mut length)?;
+    let head = &data[..r.position()];
+    r.u32(&mut crc)?;
+    let payload_offset = r.position();
+    let payload = r.take(length as usize)?;
+    let computed = crc32(&[head, payload]);
+    if crc != computed {
+        return Err(Error::bitstream(
+            0,
+            "",
+            format!("CRC-32 {computed:08x}, found {crc:08x}: the unit is damaged"),
+        ));
+    }
+    let kind = UnitType::from_number(number);
+    Ok(Unit {
+        number,
+        kind,
+        layer,
+        attribute: Attribute::from_number(attribute).filter(|_| kind.is_some()),
+        attribute_number: attribute,
+        offset,
+        payload_offset: offset + payload_offset,
+        size: r.position(),
+        payload,
+        dependencies,
+    })
+}
+
+/// The rules of spec 3 on a unit after those in `before`; what was expected if one is broken.
+fn check(unit: &Unit, before: &[Unit]) -> std::result::Result<(), String> {
+    let index = before.len();
+    if index >= UNITS_MAX {
+        return Err(format!("at most {UNITS_MAX} units in a group"));
+    }
+    if (index == 0) != (unit.kind == Some(GroupHeader)) {
+        return Err("unit 0, and no other, to be the group header".into());
+    }
+    if !unit.dependencies.is_sorted_by(|a, b| a < b) || unit.dependencies.iter().any(|d| usize::from(*d) >= index) {
+        return Err("dependencies on earlier units in increasing order".into());
+    }
+    if before.iter().any(|u| u.layer > unit.layer) {
+        return Err("layers in increasing order".into());
+    }
+    let Some(kind) = unit.kind else { return Ok(()) };
+    if matches!(kind, StepClasses | Deaths | LayerCorrection) {
+        return Err(format!("no {} unit: not yet supported by this version", kind.name()));
+    }
+    if unit.layer > 0 {
+        return Err("units of layer 0: more layers are not yet supported by this version".into());
+    }
+    let allowed = match kind {
+        Channels => 2..=6,
+        Trajectories => 1..=6,
+        _ => 0..=0,
+    };
+    if !allowed.contains(&unit.attribute_number) {
+        return Err(format!("an attribute of {allowed:?}, found {}", unit.attribute_number));
+    }
+    if before
+        .iter()
+        .any(|u| (u.number, u.layer, u.attribute) == (unit.number, unit.layer, unit.attribute))
+    {
+        return Err("one unit of each type, layer and attribute".into());
+    }
+    let found = |need| {
+        unit.dependencies
+            .iter()
+            .any(|d| before[usize::from(*d)].kind == Some(need))
+    };
+    match kind.needs().filter(|need| !found(*need)) {
+        Some(need) => Err(format!("a dependency on the {} unit", need.name())),
+        None => Ok(()),
+    }
+}
+
+/// Appends a unit of layer 0; `dependencies` are indices of earlier units.
+pub fn write(out: &mut Vec<u8>, number: u8, attribute: u8, dependencies: &[u8], payload: &[u8]) -> Result<()> {
+    let length = u32::try_from(payload.len()).map_err(|_| Error::Input("a unit of more than 4 GiB".into()))?;
+    let mut w = Writer(vec![number, 0, attribute, dependencies.len() as u8]);
+    w.0.extend_from_slice(dependencies);
+    w.0.extend_from_slice(&length.to_be_bytes());
+    let crc = crc32(&[&w.0, payload]);
+    w.0.extend_from_slice(&crc.to_be_bytes());
+    out.extend_from_slice(&w.0);
+    out.extend_from_slice(payload);
+    Ok(())
+}

@@ -1,0 +1,102 @@
+//! Values (spec 6.5): an integer of a channel or trajectory <-> bins, given what its neighbours hold.
+//!
+//! The value is coded around 0 while the neighbours' mean is small, so that contexts learn how far to trust it (most
+//! channels are noise around a mean of their own), and around the mean where that is large.
+
+use crate::model::Model;
+use crate::neighbors::NEAR;
+use crate::range_coder::Bins;
+
+/// Integers stay within +-MAX_VALUE, which f32 holds exactly.
+pub const MAX_VALUE: i32 = 1 << 24;
+
+const SLOTS: usize = 64; // bins of a value: zero, sign, 16 magnitudes of each sign, escape
+const UNARY: i32 = 16;
+const ESCAPE_SLOT: usize = 34;
+const ESCAPE_MAX: u32 = 25;
+const NEAR_WEIGHT: [i32; NEAR] = [4, 3, 2, 2];
+
+/// Adaptive model of the values of one unit.
+pub struct ValueModel {
+    model: Model,
+    /// A value that the spec forbids was read.
+    pub broken: bool,
+}
+
+fn spread_bucket(s: i32) -> usize {
+    match s {
+        0..=2 => s as usize,
+        3..=4 => 3,
+        5..=6 => 4,
+        7..=9 => 5,
+        10..=14 => 6,
+        15..=24 => 7,
+        25..=40 => 8,
+        _ => 9,
+    }
+}
+
+impl ValueModel {
+    pub fn new(classes: usize) -> Self {
+        ValueModel {
+            model: Model::new(classes * 230 * SLOTS, classes * 675 * SLOTS, classes * SLOTS),
+            broken: false,
+        }
+    }
+
+    /// Codes `x`; `near` are the neighbours' values, nearest first, `prev` two values of the same Gaussian.
+    #[inline]
+    pub fn value<C: Bins>(&mut self, c: &mut C, class: usize, x: i32, near: &[i32], prev: [i32; 2]) -> i32 {
+        let (s, g) = near
+            .iter()
+            .zip(NEAR_WEIGHT)
+            .fold((0, 0), |(s, g), (v, w)| (s + w * v, g + w));
+        let p = if g == 0 { 0 } else { (2 * s + g).div_euclid(2 * g) };
+        let spread: i32 = near.iter().map(|v| (v - p).abs()).sum();
+        let centre = p - p.clamp(-7, 7);
+        let m = if p.abs() <= 6 {
+            p.abs()
+        } else {
+            (7 + (p.abs() - 7) / 4).min(11)
+        };
+        let a = (class * 23 + (11 + m * p.signum()) as usize) * 10 + spread_bucket(spread);
+        let [p1, p2] = prev.map(|v| (v.clamp(-7, 7) + 7) as usize);
+        let b = ((class * 15 + p1) * 15 + p2) * 3 + (p.clamp(-1, 1) + 1) as usize;
+        let v = self.residual(c, x - centre, [a * SLOTS, b * SLOTS, class * SLOTS]);
+        let value = centre + v;
+        if value.abs() > MAX_VALUE {
+            self.broken = true;
+            return 0;
+        }
+        value
+    }
+
+    #[inline]
+    fn residual<C: Bins>(&mut self, c: &mut C, v: i32, [a, b, w]: [usize; 3]) -> i32 {
+        let mut bin = |c: &mut C, j: usize, bin: bool| self.model.bin(c, bin, a + j, b + j, w + j);
+        if !bin(c, 0, v != 0) {
+            return 0;
+        }
+        let negative = bin(c, 1, v < 0);
+        let slot = if negative { 2 + UNARY as usize } else { 2 };
+        let want = v.abs() - 1;
+        let mut got = 0;
+        while got < UNARY && bin(c, slot + got as usize, want > got) {
+            got += 1;
+        }
+        if got == UNARY {
+            let rest = (want - UNARY + 1).max(1) as u32; // Exp-Golomb of rest - 1
+            let mut e = 0;
+            while bin(c, ESCAPE_SLOT + e as usize, rest.ilog2() > e) {
+                e += 1;
+                if e > ESCAPE_MAX {
+                    self.broken = true;
+                    return 0;
+                }
+            }
+            let mantissa = c.bits(u64::from(rest) & ((1 << e) - 1), e) as i32;
+            got = UNARY + (1 << e) + mantissa - 1;
+        }
+        if negative { -got - 1 } else { got + 1 }
+    }
+}
