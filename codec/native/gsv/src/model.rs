@@ -44,19 +44,20 @@ static STRETCH: LazyLock<[i16; 4096]> = LazyLock::new(|| {
 /// Step of a counter that has seen n bins: 1 / (n + 1.5), in 1/65536.
 static RATE: LazyLock<[u32; 256]> = LazyLock::new(|| std::array::from_fn(|n| 131_072 / (2 * n as u32 + 3)));
 
-/// Probability of 1 (22 bits) above the number of bins seen (10 bits).
+/// A counter: probability of 1 (22 bits) above the number of bins seen (10 bits). Tables hold it xor `NEW`, so that a new
+/// table is all zeros: untouched pages of it cost nothing.
 #[derive(Clone, Copy)]
 struct Counter(u32);
 
-impl Counter {
-    const NEW: Counter = Counter(1 << 31);
+const NEW: u32 = 1 << 31;
 
+impl Counter {
     #[inline]
-    fn update(&mut self, bin: bool, rate: &[u32; 256]) {
+    fn updated(self, bin: bool, rate: &[u32; 256]) -> u32 {
         let (p, n) = (i64::from(self.0 >> 10), self.0 & 255);
         let target = if bin { (1 << 22) - 1 } else { 0 };
         let p = p + (((target - p) * i64::from(rate[n as usize])) >> 16);
-        self.0 = (p as u32) << 10 | (n + u32::from(n < AGE_MAX));
+        ((p as u32) << 10 | (n + u32::from(n < AGE_MAX))) ^ NEW
     }
 
     /// How much the counter can be trusted, 0 to 3.
@@ -73,9 +74,9 @@ impl Counter {
 
 /// Counters and mixing weights for the syntax elements of one kind.
 pub struct Model {
-    a: Vec<Counter>,
-    b: Vec<Counter>,
-    weights: Vec<[i32; 2]>,
+    a: Vec<u32>,
+    b: Vec<u32>,
+    weights: Vec<[i32; 2]>, // less WEIGHT_NEW
     stretch: &'static [i16; 4096],
     rate: &'static [u32; 256],
 }
@@ -84,9 +85,9 @@ impl Model {
     /// `a` and `b` contexts and `sets` weight sets.
     pub fn new(a: usize, b: usize, sets: usize) -> Self {
         Model {
-            a: vec![Counter::NEW; a],
-            b: vec![Counter::NEW; b],
-            weights: vec![[WEIGHT_NEW; 2]; sets * 16],
+            a: vec![0; a],
+            b: vec![0; b],
+            weights: vec![[0; 2]; sets * 16],
             stretch: &STRETCH,
             rate: &RATE,
         }
@@ -97,17 +98,19 @@ impl Model {
     /// Contexts are made of what the caller counted, never of raw input, so they are in range by construction.
     #[inline]
     pub fn bin<C: Bins>(&mut self, c: &mut C, bin: bool, a: usize, b: usize, w: usize) -> bool {
-        let (ca, cb) = (&mut self.a[a], &mut self.b[b]);
+        let (slot_a, slot_b) = (&mut self.a[a], &mut self.b[b]);
+        let (ca, cb) = (Counter(*slot_a ^ NEW), Counter(*slot_b ^ NEW));
         let sa = i32::from(self.stretch[(ca.0 >> 20) as usize]);
         let sb = i32::from(self.stretch[(cb.0 >> 20) as usize]);
-        let weight = &mut self.weights[16 * w + 4 * ca.age() + cb.age()];
+        let slot = &mut self.weights[16 * w + 4 * ca.age() + cb.age()];
+        let weight = slot.map(|v| v + WEIGHT_NEW);
         let p = curve((weight[0] * sa + weight[1] * sb) >> 16).clamp(P_MIN, 65536 - P_MIN);
         let bin = c.bin(bin, p as u32);
         let err = if bin { 65536 - p } else { -p };
-        weight[0] = (weight[0] + ((sa * err + 16384) >> 15)).clamp(-WEIGHT_MAX, WEIGHT_MAX);
-        weight[1] = (weight[1] + ((sb * err + 16384) >> 15)).clamp(-WEIGHT_MAX, WEIGHT_MAX);
-        ca.update(bin, self.rate);
-        cb.update(bin, self.rate);
+        let learned = |w: i32, s: i32| (w + ((s * err + 16384) >> 15)).clamp(-WEIGHT_MAX, WEIGHT_MAX) - WEIGHT_NEW;
+        *slot = [learned(weight[0], sa), learned(weight[1], sb)];
+        *slot_a = ca.updated(bin, self.rate);
+        *slot_b = cb.updated(bin, self.rate);
         bin
     }
 }

@@ -121,21 +121,18 @@ fn camera<F: Fields>(f: &mut F, c: &mut Camera) -> Result<()> {
     Ok(())
 }
 
-/// Frames a second as (timescale, frame_duration): exact for integers and the n * 1000/1001 family, else within 1e-6.
+/// Frames a second as (timescale, frame_duration): exact for whole numbers and for n * 1000/1001 (29.97), else within 1e-6.
 pub fn rate(fps: f64) -> Result<(u32, u32)> {
-    if !(fps.is_finite() && (1e-3..=1e5).contains(&fps)) {
+    if !(1e-3..=1e5).contains(&fps) {
         return Err(Error::Input(format!("expected fps of 0.001 to 100000, got {fps}")));
     }
-    for (scale, duration) in [(1.0, 1), (1000.0, 1000), (1001.0, 1001)] {
-        let n = (fps * scale).round();
-        let n = if duration == 1001 {
-            (fps * 1.001).round() * 1000.0
-        } else {
-            n
-        };
-        if n >= 1.0 && (n / f64::from(duration) - fps).abs() < fps * if duration == 1001 { 2e-5 } else { 1e-9 } {
-            return Ok((n as u32, duration));
-        }
+    let whole = fps.round();
+    if (whole - fps).abs() < fps * 1e-9 {
+        return Ok((whole as u32, 1));
+    }
+    let ntsc = (fps * 1.001).round() * 1000.0;
+    if (ntsc / 1001.0 - fps).abs() < fps * 5e-5 {
+        return Ok((ntsc as u32, 1001));
     }
     let duration = if fps > 1000.0 { 10_000 } else { 1_000_000 };
     Ok(((fps * f64::from(duration)).round() as u32, duration))

@@ -1,0 +1,182 @@
+//! Random groups for the tests: every optional part, and the extremes of every range.
+#![allow(dead_code)] // each test takes what it needs
+
+use gsv::attributes::Attribute;
+use gsv::group::Group;
+use gsv::header::{Header, NodeHeader, Scale, TrajectoryHeader};
+use gsv::morton;
+use gsv::trajectories::Trajectories;
+use proptest::prelude::*;
+
+/// What shapes a random group.
+#[derive(Debug, Clone)]
+pub struct Shape {
+    pub count: usize,
+    pub frames: u16,
+    pub bits: u8,
+    pub sh_degree: u8,
+    pub nodes: usize,
+    /// Bits of magnitude of channels and coefficients.
+    pub magnitude: u32,
+    pub lifetimes: bool,
+    /// Bit a: trajectories of attribute a.
+    pub moving: u8,
+    pub seed: u64,
+}
+
+pub fn shape() -> impl Strategy<Value = Shape> {
+    let sizes = (
+        prop_oneof![Just(0usize), Just(1), 2..200usize],
+        1..40u16,
+        1..=21u8,
+        0..=3u8,
+    );
+    let rest = (
+        prop_oneof![Just(0usize), 1..20usize],
+        0..=24u32,
+        any::<bool>(),
+        any::<u8>(),
+        any::<u64>(),
+    );
+    (sizes, rest).prop_map(
+        |((count, frames, bits, sh_degree), (nodes, magnitude, lifetimes, moving, seed))| Shape {
+            count,
+            frames,
+            bits,
+            sh_degree,
+            nodes,
+            magnitude,
+            lifetimes,
+            moving,
+            seed,
+        },
+    )
+}
+
+/// SplitMix64.
+pub struct Random(pub u64);
+
+impl Random {
+    pub fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let z = (self.0 ^ self.0 >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        let z = (z ^ z >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
+        z ^ z >> 31
+    }
+
+    pub fn below(&mut self, n: u64) -> u64 {
+        self.next() % n.max(1)
+    }
+
+    /// A value of up to `magnitude` bits; often small, sometimes an extreme.
+    pub fn value(&mut self, magnitude: u32) -> i32 {
+        let top = 1i64 << magnitude;
+        let v = match self.below(8) {
+            0 => top,
+            1 => -top,
+            2..=4 => (self.below(5) as i64 - 2).clamp(-top, top),
+            _ => self.below(2 * top as u64 + 1) as i64 - top,
+        };
+        v as i32
+    }
+}
+
+fn points(r: &mut Random, count: usize, bits: u8) -> Vec<[u32; 3]> {
+    let side = 1u64 << bits;
+    let spread = if r.below(3) == 0 { side.min(4) } else { side }; // crowded: duplicates
+    let mut p: Vec<[u32; 3]> = (0..count)
+        .map(|_| [0; 3].map(|_| (side - 1 - r.below(spread)) as u32))
+        .collect();
+    p.sort_by_key(|p| morton::encode(*p));
+    p
+}
+
+fn trajectories(r: &mut Random, count: usize, channels: usize, k: u16, magnitude: u32) -> Trajectories {
+    let mut t = Trajectories::new(channels);
+    for _ in 0..count {
+        let length = if r.below(3) == 0 {
+            r.below(u64::from(k) + 1) as usize
+        } else {
+            0
+        };
+        let own: Vec<i32> = (0..length * channels).map(|_| r.value(magnitude)).collect();
+        t.push(&own);
+    }
+    t
+}
+
+pub fn group(s: &Shape) -> Group {
+    let mut r = Random(s.seed);
+    let mut header = Header {
+        frames: s.frames,
+        origin: [-1.5, 0.25, 1e6],
+        grid_step: 0.002,
+        grid_bits: s.bits,
+        sh_degree: s.sh_degree,
+        count: s.count as u32,
+        ..Header::default()
+    };
+    let mut g = Group {
+        positions: points(&mut r, s.count, s.bits),
+        ..Group::default()
+    };
+    for a in header.attributes() {
+        let c = a.channels(s.sh_degree);
+        header.scales.push(Scale {
+            steps: vec![0.5; c],
+            offsets: vec![-1.0; c],
+        });
+        g.channels
+            .push((0..c * s.count).map(|_| r.value(s.magnitude)).collect());
+    }
+    for attribute in Attribute::ALL {
+        let channels = attribute.channels(s.sh_degree);
+        if channels > 0 && s.moving >> attribute as u8 & 1 != 0 {
+            let coefficients = 1 + r.below(u64::from(s.frames)) as u16;
+            header.trajectories.push(TrajectoryHeader {
+                attribute,
+                coefficients,
+                step: 0.01,
+            });
+            g.trajectories
+                .push(trajectories(&mut r, s.count, channels, coefficients, s.magnitude));
+        }
+    }
+    if s.nodes > 0 {
+        let coefficients = 1 + r.below(u64::from(s.frames)) as u16;
+        let neighbors = 1 + r.below(8) as u8;
+        header.nodes = NodeHeader {
+            count: s.nodes as u32,
+            neighbors,
+            coefficients,
+            rotation_step: 0.01,
+            translation_step: 0.002,
+        };
+        g.node_positions = points(&mut r, s.nodes, s.bits);
+        g.node_trajectories = trajectories(&mut r, s.nodes, 6, coefficients, s.magnitude);
+    }
+    if s.lifetimes {
+        let mut life = || {
+            let t0 = r.below(u64::from(s.frames)) as u16;
+            [t0, t0 + 1 + r.below(u64::from(s.frames - t0)) as u16]
+        };
+        g.lifetimes = Some((0..s.count).map(|_| life()).collect());
+    }
+    g.header = header;
+    g
+}
+
+/// A group with a bit of everything, small enough to damage byte by byte.
+pub fn small() -> Group {
+    group(&Shape {
+        count: 12,
+        frames: 5,
+        bits: 6,
+        sh_degree: 1,
+        nodes: 3,
+        magnitude: 6,
+        lifetimes: true,
+        moving: 0xFF,
+        seed: 7,
+    })
+}

@@ -1,0 +1,207 @@
+//! The demuxer gives the same result however its input is split, keeps whole groups of what was cut, and never panics.
+
+mod common;
+
+use common::Random;
+use gsv::container::config::{Camera, Config, rate};
+use gsv::container::demux::{Demuxer, Entry};
+use gsv::container::write::{Reference, finish, fragment, init_segment};
+use proptest::prelude::*;
+
+fn config() -> Config {
+    let camera = Camera {
+        name: "cam é".into(),
+        width: 1920,
+        height: 1080,
+        k: [1.0; 5],
+        viewmat: [0.5; 12],
+    };
+    Config {
+        timescale: 30_000,
+        frame_duration: 1001,
+        level: 2,
+        metres_per_unit: 1.0,
+        up_axis: 4,
+        color_space: 0,
+        background: [0.0, 0.5, 1.0],
+        sh_degree: 3,
+        sh_frame: 1,
+        cameras: vec![camera.clone(), camera],
+    }
+}
+
+/// A finished file of three groups, and where its samples are.
+fn file() -> (Vec<u8>, Vec<Entry>) {
+    let config = config();
+    let init = init_segment(&config).unwrap();
+    let groups = [
+        (vec![1u8; 100], 20, true),
+        (vec![2; 0], 1, false),
+        (vec![3; 5000], 7, true),
+    ];
+    let (mut fragments, mut index, mut start) = (Vec::new(), Vec::new(), 0);
+    for ((payload, frames, sync), number) in groups.iter().zip(1..) {
+        let f = fragment(payload, number, start, *frames, *sync, &config).unwrap();
+        index.push(Reference {
+            size: f.len() as u64,
+            frames: *frames,
+            sync: *sync,
+        });
+        fragments.extend(f);
+        start += u64::from(*frames);
+    }
+    let mut out = finish(&init, &config, &index).unwrap();
+    let (mut end, mut start, mut entries) = (out.len() as u64, 0, Vec::new());
+    for ((payload, frames, sync), r) in groups.iter().zip(&index) {
+        end += r.size;
+        let size = payload.len() as u64;
+        entries.push(Entry {
+            offset: end - size,
+            size,
+            start_frame: start,
+            frames: *frames,
+            sync: *sync,
+        });
+        start += u64::from(*frames);
+    }
+    out.extend(fragments);
+    (out, entries)
+}
+
+fn parsed(pieces: &[&[u8]]) -> Demuxer {
+    let mut d = Demuxer::default();
+    pieces.iter().for_each(|p| d.push(p).unwrap());
+    d
+}
+
+#[test]
+fn everything_comes_back() {
+    let (bytes, entries) = file();
+    let d = parsed(&[&bytes]);
+    assert_eq!(d.config(), Some(&config()));
+    assert_eq!(d.groups(), entries);
+    assert!(d.complete() && d.pending().is_none());
+}
+
+#[test]
+fn byte_by_byte_and_by_skipping() {
+    let (bytes, entries) = file();
+    let d = parsed(&bytes.chunks(1).collect::<Vec<_>>());
+    assert_eq!((d.groups(), d.complete()), (entries.as_slice(), true));
+    let mut d = Demuxer::default();
+    let mut seen = 0;
+    while (d.position() as usize) < bytes.len() {
+        let skip = d.skippable();
+        if skip > 0 {
+            d.skip(skip);
+        } else {
+            let at = d.position() as usize;
+            d.push(&bytes[at..at + 1]).unwrap();
+            seen += 1;
+        }
+    }
+    assert_eq!((d.groups(), d.complete()), (entries.as_slice(), true));
+    assert!(seen < 2500, "{seen} bytes of headers");
+}
+
+#[test]
+fn a_cut_file_keeps_its_whole_groups() {
+    let (bytes, entries) = file();
+    for n in 0..bytes.len() {
+        let d = parsed(&[&bytes[..n]]);
+        let whole: Vec<Entry> = entries
+            .iter()
+            .copied()
+            .filter(|e| (e.offset + e.size) as usize <= n)
+            .collect();
+        assert_eq!(d.groups(), whole, "{n}");
+        assert!(!d.complete());
+    }
+}
+
+#[test]
+fn a_growing_file_has_no_index() {
+    let config = config();
+    let init = init_segment(&config).unwrap();
+    let f = fragment(b"group", 1, 40, 20, true, &config).unwrap();
+    let d = parsed(&[&init, &f]);
+    assert_eq!(d.groups().len(), 1);
+    assert_eq!(d.groups()[0].start_frame, 40);
+    assert!(!d.complete());
+}
+
+#[test]
+fn unknown_boxes_are_skipped() {
+    let (bytes, entries) = file();
+    let free = [0u8, 0, 0, 12, b'f', b'r', b'e', b'e', 1, 2, 3, 4];
+    let large = [&[0u8, 0, 0, 1][..], b"wxyz", &20u64.to_be_bytes(), &[9; 4]].concat();
+    let ftyp = 28;
+    let d = parsed(&[&bytes[..ftyp], &free, &large, &bytes[ftyp..], &free]);
+    let moved: Vec<Entry> = entries
+        .iter()
+        .map(|e| Entry {
+            offset: e.offset + 32,
+            ..*e
+        })
+        .collect();
+    assert_eq!(d.groups(), moved);
+    assert!(d.complete());
+}
+
+#[test]
+fn other_files_are_named() {
+    let message = |bytes: &[u8]| Demuxer::default().push(bytes).unwrap_err().to_string();
+    assert!(message(b"\x89PNG\r\n\x1a\n").contains("starts with an ftyp box"));
+    let mut mp4 = file().0;
+    mp4[8..12].copy_from_slice(b"isom");
+    mp4[16..20].copy_from_slice(b"isom");
+    assert!(message(&mp4).contains("gsv1"));
+    let (bytes, _) = file();
+    let init = init_segment(&config()).unwrap();
+    assert!(message(&[&bytes[..28], &bytes[init.len()..]].concat()).contains("moov"));
+}
+
+proptest! {
+    #[test]
+    fn any_split_gives_the_same(seed in any::<u64>()) {
+        let (bytes, entries) = file();
+        let mut r = Random(seed);
+        let mut d = Demuxer::default();
+        let mut rest = bytes.as_slice();
+        while !rest.is_empty() {
+            let (a, b) = rest.split_at(1 + r.below(rest.len().min(300) as u64) as usize);
+            d.push(a).unwrap();
+            rest = b;
+        }
+        prop_assert_eq!(d.groups(), entries);
+        prop_assert!(d.complete());
+    }
+
+    #[test]
+    fn damage_never_panics(seed in any::<u64>()) {
+        let (mut bytes, _) = file();
+        let mut r = Random(seed);
+        for _ in 0..1 + r.below(6) {
+            let i = r.below(900.min(bytes.len() as u64)) as usize;
+            bytes[i] = r.next() as u8;
+        }
+        let mut d = Demuxer::default();
+        if d.push(&bytes).is_ok() {
+            for g in d.groups() {
+                prop_assert!(g.offset + g.size <= bytes.len() as u64);
+            }
+        }
+    }
+}
+
+#[test]
+fn frame_rates() {
+    assert_eq!(rate(30.0).unwrap(), (30, 1));
+    assert_eq!(rate(29.97).unwrap(), (30_000, 1001));
+    assert_eq!(rate(30_000.0 / 1001.0).unwrap(), (30_000, 1001));
+    assert_eq!(rate(23.976).unwrap(), (24_000, 1001));
+    assert_eq!(rate(12.5).unwrap(), (12_500_000, 1_000_000));
+    let (n, d) = rate(0.1234567).unwrap();
+    assert!((f64::from(n) / f64::from(d) - 0.1234567).abs() < 1e-6);
+    assert!(rate(f64::NAN).is_err() && rate(0.0).is_err());
+}

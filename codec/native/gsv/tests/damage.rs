@@ -1,0 +1,205 @@
+//! Damaged bytes end in an error or, below the checksum, in some group; never in a panic, a hang or too much memory.
+
+mod common;
+
+use common::{Random, group, small};
+use gsv::decode::{decode_group, decode_units};
+use gsv::encode::encode_group;
+use gsv::error::Error;
+use gsv::levels::Level;
+use gsv::unit;
+
+fn level() -> Level {
+    Level::get(1).unwrap()
+}
+
+#[test]
+fn any_flipped_bit_is_noticed() {
+    let payload = encode_group(&small()).unwrap();
+    for i in 0..payload.len() {
+        for bit in 0..8 {
+            let mut bad = payload.clone();
+            bad[i] ^= 1 << bit;
+            assert!(decode_group(&bad, &level()).is_err(), "byte {i}, bit {bit}");
+        }
+    }
+}
+
+#[test]
+fn any_truncation_is_noticed() {
+    let payload = encode_group(&small()).unwrap();
+    for n in 0..payload.len() {
+        match decode_group(&payload[..n], &level()) {
+            // what is left may be whole units: then one is missing, unless only the optional last one is
+            Ok(g) => assert!(g.lifetimes.is_none()),
+            Err(Error::Bitstream { offset, .. }) => assert!(offset <= n as u64),
+            Err(e) => panic!("{e}"),
+        }
+    }
+}
+
+/// Mutates unit payloads and repairs the checksums: what the entropy decoders see from a hostile writer.
+#[test]
+fn mutated_units_never_panic() {
+    let mut r = Random(99);
+    let started = std::time::Instant::now();
+    let (mut rounds, mut accepted) = (0, 0);
+    while started.elapsed().as_secs() < 3 {
+        let shape = common::Shape {
+            seed: r.next(),
+            count: r.below(80) as usize,
+            ..small_shape()
+        };
+        let payload = encode_group(&group(&shape)).unwrap();
+        for _ in 0..16 {
+            let mut units = unit::split(&payload).unwrap();
+            let mut copies: Vec<Vec<u8>> = units.iter().map(|u| u.payload.to_vec()).collect();
+            let victim = r.below(copies.len() as u64) as usize;
+            mutate(&mut copies[victim], &mut r);
+            for (u, copy) in units.iter_mut().zip(&copies) {
+                u.payload = copy;
+            }
+            accepted += u64::from(decode_units(&units, &level()).is_ok());
+            rounds += 1;
+        }
+    }
+    assert!(rounds >= 16 && accepted < rounds);
+}
+
+fn small_shape() -> common::Shape {
+    common::Shape {
+        count: 0,
+        frames: 9,
+        bits: 8,
+        sh_degree: 0,
+        nodes: 4,
+        magnitude: 5,
+        lifetimes: true,
+        moving: 0b11110,
+        seed: 0,
+    }
+}
+
+fn mutate(bytes: &mut Vec<u8>, r: &mut Random) {
+    for _ in 0..1 + r.below(4) {
+        let n = bytes.len() as u64;
+        match r.below(5) {
+            0 => bytes.truncate(r.below(n + 1) as usize),
+            1 => bytes.extend((0..r.below(9)).map(|_| r.next() as u8)),
+            2 if n > 0 => bytes.fill(r.next() as u8),
+            _ if n > 0 => bytes[r.below(n) as usize] = r.next() as u8,
+            _ => {}
+        }
+    }
+}
+
+/// A header of a hundred bytes that announces the largest group must not get its memory.
+#[test]
+fn limits_come_before_memory() {
+    let mut g = small();
+    let over = |g: &gsv::group::Group, part: &str| {
+        let payload = header_only(g);
+        match decode_group(&payload, &level()) {
+            Err(Error::Limit { expected, .. }) => assert!(expected.contains(part), "{expected}"),
+            other => panic!("{part}: {other:?}"),
+        }
+    };
+    g.header.count = u32::MAX;
+    over(&g, "Gaussians");
+    g = small();
+    g.header.frames = 65;
+    over(&g, "frames");
+    g = small();
+    g.header.nodes.count = 1025;
+    over(&g, "nodes");
+    assert!(matches!(Level::get(9), Err(Error::Limit { .. })));
+}
+
+fn header_only(g: &gsv::group::Group) -> Vec<u8> {
+    let mut w = gsv::fields::Writer::default();
+    g.header.clone().fields(&mut w).unwrap();
+    let mut out = Vec::new();
+    unit::write(&mut out, 0, 0, &[], &w.0).unwrap();
+    out
+}
+
+/// Many trajectories from a few bytes: the cap on symbols holds while they are decoded.
+#[test]
+fn symbols_are_counted_while_they_grow() {
+    let mut g = small();
+    let mut level = level();
+    level.symbols = g.header.check(&level).unwrap();
+    let payload = encode_group(&g).unwrap();
+    assert!(matches!(decode_group(&payload, &level), Err(Error::Limit { .. })));
+    g.header.trajectories.clear();
+    g.trajectories.clear();
+    let payload = encode_group(&g).unwrap();
+    assert!(decode_group(&payload, &level).is_ok());
+}
+
+/// Reserved tools are named; unknown unit types are skipped.
+#[test]
+fn later_versions() {
+    let payload = encode_group(&small()).unwrap();
+    let flags = unit::split(&payload).unwrap()[0].payload_offset + 2;
+    for (bit, tool) in [(1u8, "prediction"), (2, "step classes")] {
+        let mut header = unit::split(&payload).unwrap()[0].payload.to_vec();
+        header[flags - unit::split(&payload).unwrap()[0].payload_offset] = bit;
+        let mut bad = Vec::new();
+        unit::write(&mut bad, 0, 0, &[], &header).unwrap();
+        let message = decode_group(&bad, &level()).unwrap_err().to_string();
+        assert!(
+            message.contains(tool) && message.contains("not yet supported"),
+            "{message}"
+        );
+    }
+    for (number, ok) in [(7, false), (8, false), (9, false), (10, true), (255, true)] {
+        let mut more = payload.clone();
+        unit::write(
+            &mut more,
+            number,
+            if number == 7 || number == 9 { 2 } else { 0 },
+            &[],
+            b"later",
+        )
+        .unwrap();
+        let result = decode_group(&more, &level());
+        assert_eq!(result.is_ok(), ok, "{number}");
+        if !ok {
+            assert!(result.unwrap_err().to_string().contains("not yet supported"));
+        }
+    }
+}
+
+/// The rules on units, one by one.
+#[test]
+fn broken_units() {
+    let payload = encode_group(&small()).unwrap();
+    let first = unit::split(&payload).unwrap()[0].size;
+    let with = |number, attribute, dependencies: &[u8], part: &str| {
+        let mut bad = payload[..first].to_vec();
+        unit::write(&mut bad, number, attribute, dependencies, b"").unwrap();
+        let message = decode_group(&bad, &level()).unwrap_err().to_string();
+        assert!(message.contains(part), "{message}");
+    };
+    with(0, 0, &[], "no other");
+    with(1, 0, &[1], "earlier units");
+    with(1, 0, &[0, 0], "earlier units");
+    with(1, 3, &[], "attribute of");
+    with(2, 2, &[], "dependency on the positions unit");
+    with(1, 0, &[], "a node_positions unit");
+    let twice = [payload.as_slice(), &payload[first..]].concat();
+    assert!(
+        decode_group(&twice, &level())
+            .unwrap_err()
+            .to_string()
+            .contains("one unit of each")
+    );
+    assert!(decode_group(&[], &level()).is_err());
+    assert!(
+        decode_group(&payload[first..], &level())
+            .unwrap_err()
+            .to_string()
+            .contains("group header")
+    );
+}

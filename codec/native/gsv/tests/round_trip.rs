@@ -1,0 +1,131 @@
+//! decode(encode(x)) = x for every group that can be expressed; what cannot is refused by name.
+
+mod common;
+
+use common::{Random, Shape, group, shape, small};
+use gsv::decode::decode_group;
+use gsv::encode::encode_group;
+use gsv::error::Error;
+use gsv::evaluate::{Evaluator, Frame};
+use gsv::group::Group;
+use gsv::levels::Level;
+use proptest::prelude::*;
+
+fn decoded(g: &Group) -> Group {
+    let payload = encode_group(g).unwrap();
+    let out = decode_group(&payload, &Level::get(4).unwrap()).unwrap();
+    assert_eq!(encode_group(g).unwrap(), payload, "encoding must not depend on threads");
+    out
+}
+
+/// Trajectories hold the channels even where they are empty.
+fn same(a: &Group, b: &Group) {
+    assert_eq!(a.header, b.header);
+    assert_eq!(a.positions, b.positions);
+    assert_eq!(a.channels, b.channels);
+    assert_eq!(a.lifetimes, b.lifetimes);
+    assert_eq!(a.node_positions, b.node_positions);
+    assert_eq!(a.trajectories, b.trajectories);
+    assert_eq!(a.node_trajectories.len(), b.node_trajectories.len());
+    (0..a.node_trajectories.len()).for_each(|i| assert_eq!(a.node_trajectories.get(i), b.node_trajectories.get(i)));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(60))]
+
+    #[test]
+    fn groups_come_back(s in shape()) {
+        let g = group(&s);
+        same(&g, &decoded(&g));
+    }
+
+    #[test]
+    fn frames_are_finite(s in shape()) {
+        let g = group(&s);
+        let frames = g.header.frames;
+        let e = Evaluator::new(g);
+        let mut f = Frame::default();
+        for t in [0, frames / 2, frames - 1] {
+            e.frame(t, &mut f);
+            prop_assert!(f.means.iter().flatten().all(|v| v.is_finite()));
+            for q in &f.quats {
+                prop_assert!((q.iter().map(|v| v * v).sum::<f32>() - 1.0).abs() < 1e-3);
+            }
+        }
+    }
+}
+
+#[test]
+fn all_points_in_one_place() {
+    let mut g = group(&Shape {
+        count: 5000,
+        nodes: 0,
+        moving: 0,
+        lifetimes: false,
+        ..tiny()
+    });
+    for corner in [0, 63] {
+        g.positions.fill([corner; 3]);
+        same(&g, &decoded(&g));
+    }
+}
+
+#[test]
+fn many_points_and_longest_trajectories() {
+    let s = Shape {
+        count: 20_000,
+        frames: 256,
+        moving: 0b10,
+        magnitude: 2,
+        bits: 11,
+        ..tiny()
+    };
+    let mut g = group(&s);
+    g.header.trajectories[0].coefficients = 256;
+    let mut r = Random(1);
+    let mut t = gsv::trajectories::Trajectories::new(3);
+    for i in 0..s.count {
+        let own: Vec<i32> = (0..if i % 997 == 0 { 768 } else { 0 }).map(|_| r.value(24)).collect();
+        t.push(&own);
+    }
+    g.trajectories[0] = t;
+    same(&g, &decoded(&g));
+}
+
+fn tiny() -> Shape {
+    Shape {
+        count: 1,
+        frames: 1,
+        bits: 6,
+        sh_degree: 0,
+        nodes: 0,
+        magnitude: 3,
+        lifetimes: false,
+        moving: 0,
+        seed: 3,
+    }
+}
+
+/// Every input error has one sentence that names what is wrong.
+#[test]
+fn impossible_groups_are_refused() {
+    let refused = |change: fn(&mut Group), part: &str| {
+        let mut g = small();
+        change(&mut g);
+        match encode_group(&g) {
+            Err(Error::Input(m)) => assert!(m.contains(part), "{m}"),
+            other => panic!("{part}: {other:?}"),
+        }
+    };
+    refused(|g| g.positions.reverse(), "Morton order");
+    refused(|g| g.positions[11] = [64, 0, 0], "below 2^6");
+    refused(|g| g.header.frames = 0, "frames");
+    refused(|g| g.header.grid_bits = 22, "grid_bits");
+    refused(|g| g.header.grid_step = f32::NAN, "grid_step");
+    refused(|g| g.header.count += 1, "positions");
+    refused(|g| g.channels[1][0] = (1 << 24) + 1, "quats");
+    refused(|g| g.header.trajectories[0].coefficients = 6, "coefficients");
+    refused(|g| g.header.nodes.neighbors = 9, "neighbors");
+    refused(|g| g.lifetimes = Some(vec![[3, 3]; 12]), "lifetime of Gaussian 0");
+    refused(|g| g.header.frames = 300, "frames, level 4");
+}
