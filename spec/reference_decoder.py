@@ -88,7 +88,7 @@ HEADER_BOXES = {name.replace("_", " ").encode() for name in HEADER_BOXES.split()
 
 
 def boxes(data, position, end, top_level=False):
-    """Yields (type, offset, body, end) of each box. A top-level box that the file ends in is left out."""
+    """Yields (type, offset, body, end) of each box. A top-level box that the file ends in is left out but for mdat."""
     while position < end:
         offset, header = position, 8
         if end - offset < header:
@@ -103,12 +103,11 @@ def boxes(data, position, end, top_level=False):
             size = struct.unpack_from(">Q", data, offset + 8)[0]
         elif size == 0:
             require(kind == b"mdat" and top_level, f"box {kind!r} at byte {offset}: size 0 is for mdat only")
-            size = end - offset
+            size = 2**64  # to the end, which may be still to come
         require(size >= header, f"box {kind!r} at byte {offset}: size {size} is less than its header")
-        require(
-            kind not in HEADER_BOXES or size <= 2**24, f"box {kind!r} at byte {offset}: {size} bytes, at most 16 MiB"
-        )
-        if offset + size > end:
+        if kind in HEADER_BOXES and size - header > 2**24:
+            raise LimitError(f"box {kind!r} at byte {offset}: {size} bytes, at most 16 MiB are allowed")
+        if offset + size > end and not (top_level and kind == b"mdat"):
             require(top_level, f"box {kind!r} at byte {offset}: {size} bytes, but its container ends at {end}")
             return
         yield kind, offset, offset + header, offset + size
@@ -162,37 +161,34 @@ class Sample:
 
 def read_container(data):
     """Clause 2: bytes of a file -> (Config, [Sample])."""
-    config, brands, pending, samples = None, None, [], []
+    config, pending, samples, first = None, [], [], True
     for box in boxes(data, 0, len(data), top_level=True):
-        kind, _, body, end = box
-        if kind == b"ftyp":
-            brands = read_ftyp(data, body, end)
-        elif kind == b"moov":
-            require(brands is not None, "moov before ftyp")
-            config = read_moov(data, box) if config is None else config
+        kind, offset, body, end = box
+        require(kind == b"ftyp" or not first, f"the first box is {kind!r}, expected ftyp: not a gsv file")
+        if first:
+            read_ftyp(data, body, end)
+        elif kind == b"moov" and config is None:
+            config = read_moov(data, box)
         elif kind == b"moof":
-            require(config is not None, "moof before moov")
+            require(config is not None, f"moof at byte {offset} before moov")
             pending += read_moof(data, box, config)
         elif kind == b"mdat":
             for start, size, *timing in pending:
-                require(
-                    body <= start and start + size <= end,
-                    f"sample at byte {start}, {size} bytes: outside the next mdat",
-                )
-                samples.append(Sample(*timing, bytes(data[start : start + size])))
+                inside = body <= start and start + size <= end
+                require(inside, f"sample at byte {start}, {size} bytes: outside the next mdat")
+                if start + size <= len(data):
+                    samples.append(Sample(*timing, bytes(data[start : start + size])))
             pending = []
-    require(brands is not None, "no ftyp box: not a gsv file")
-    require(config is not None, "no moov box")
+        first = False
+    require(config is not None, "no moov box: not a whole gsv file")
     return config, samples
 
 
 def read_ftyp(data, body, end):
     """Clause 2.1."""
     reader = Reader(data, body, end, "ftyp")
-    reader.take(8)  # major_brand, minor_version
-    brands = [reader.take(4) for _ in range((end - reader.position) // 4)]
-    require(b"gsv1" in brands, f"ftyp: compatible_brands are {brands}, expected gsv1 among them")
-    return brands
+    brands = [reader.take(4) for _ in range((end - body) // 4)]
+    require(b"gsv1" in brands[:1] + brands[2:], f"ftyp: brands {brands} (and version), expected gsv1")
 
 
 def read_moov(data, moov):
@@ -242,7 +238,8 @@ def read_gsvc(r):
     version = r.u8()
     require(version == 1, f"gsvC: configuration_version is {version}, expected 1")
     level, frame_duration = r.u8(), r.u32()
-    require(level in LEVELS, f"gsvC: level is {level}, expected 1 to {max(LEVELS)}")
+    if level not in LEVELS:
+        raise LimitError(f"gsvC: level is {level}, expected 1 to {max(LEVELS)}")
     require(frame_duration > 0, "gsvC: frame_duration is 0")
     metres_per_unit = r.f32("metres_per_unit", positive=True)
     up_axis, color_space = r.u8(), r.u8()

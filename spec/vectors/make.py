@@ -27,6 +27,7 @@ from parts import (  # noqa: E402
     header,
     insert,
     left_over_empty,
+    major_brand_only,
     make_group,
     other_mdat_sizes,
     other_top,
@@ -40,6 +41,7 @@ from parts import (  # noqa: E402
     tied_nodes,
     traj,
     truncated,
+    truncated_after_sample,
     u32,
     unit_dict,
     units_file,
@@ -68,7 +70,7 @@ VALID = {  # name: (what it is about, bytes)
     "sh_degree_1": ("sh_degree 1", lambda: groups_file(make_group(80, 2, sh_degree=1), sh_degree=1)),
     "sh_degree_2": (
         "sh_degree 2, SH turn",
-        lambda: groups_file(make_group(80, 2, sh_degree=2, nodes=4), sh_degree=2, sh_frame=1),
+        lambda: groups_file(make_group(80, 2, sh_degree=2, nodes=4), sh_degree=2, sh_frame="body"),
     ),
     "sh_degree_3": (
         "sh_degree 3 with trajectories of shN",
@@ -86,7 +88,7 @@ VALID = {  # name: (what it is about, bytes)
     ),
     "frame_rate": (
         "29.97 frames per second",
-        lambda: groups_file(make_group(30, 3), timescale=30000, frame_duration=1001),
+        lambda: groups_file(make_group(30, 3), fps=(30000, 1001)),
     ),
     "cameras": (
         "reference cameras, other gsvC fields",
@@ -95,7 +97,7 @@ VALID = {  # name: (what it is about, bytes)
             cameras=[CAMERA, CAMERA | {"name": ""}],
             level=4,
             metres_per_unit=0.01,
-            up_axis=5,
+            up="-z",
             background=[1.0, 0.5, 0.25],
         ),
     ),
@@ -107,7 +109,9 @@ VALID = {  # name: (what it is about, bytes)
         "dependencies beyond the necessary",
         lambda: units_file(lambda u: u[2].update(dependencies=[0, 1])),
     ),
-    "truncated": ("the file ends in the second mdat", truncated),
+    "truncated": ("the file ends in the second sample", truncated),
+    "truncated_after_sample": ("the file ends in an mdat, after the sample", truncated_after_sample),
+    "major_brand_only": ("gsv1 is the major brand, but no compatible one", major_brand_only),
     "no_groups": ("a stream without groups yet", lambda: groups_file(finish=False)),
 }
 
@@ -126,15 +130,15 @@ INVALID = {  # name: (error, part of the package's message, bytes)
     "container_no_config": (B, "gsvC", patched(b"gsvC", -4, b"none")),
     "container_small_box": (B, "size", patched(b"moof", -8, u32(4))),
     "container_zero_size": (B, "", patched(b"moof", -8, u32(0))),
-    "container_huge_header_box": (B, "", patched(b"moof", -8, u32(2**24 + 1))),
+    "container_huge_header_box": (L, "moof", patched(b"moof", -8, u32(2**24 + 9))),
     "container_nested_size": (B, "", patched(b"traf", -8, u32(10**6))),
     "container_two_samples": (B, "", patched(b"trun", 4, u32(2))),
     "container_outside_mdat": (B, "mdat", patched(b"trun", 8, u32(4))),
     "container_sample_size": (B, "mdat", patched(b"trun", 16, u32(2**24))),
     "container_no_frames": (B, "", patched(b"trun", 12, u32(0))),
     "config_version": (B, "version", patched(b"gsvC", 0, b"\2")),
-    "config_level_0": (B, "level", patched(b"gsvC", 1, b"\0")),
-    "config_level_5": (B, "level", patched(b"gsvC", 1, b"\5")),
+    "config_level_0": (L, "level", patched(b"gsvC", 1, b"\0")),
+    "config_level_5": (L, "level", patched(b"gsvC", 1, b"\5")),
     "config_frame_duration": (B, "frame_duration", patched(b"gsvC", 2, u32(0))),
     "config_metres_nan": (B, "metres_per_unit", patched(b"gsvC", 6, f32(NAN))),
     "config_metres_0": (B, "metres_per_unit", patched(b"gsvC", 6, f32(0))),
@@ -178,15 +182,15 @@ INVALID = {  # name: (error, part of the package's message, bytes)
     "unit_no_nodes": (B, "", remove_unit(4)),
     "unit_no_node_trajectories": (B, "", remove_unit(5)),
     "unit_no_trajectories": (B, "", remove_unit(6, 1)),
-    "unsupported_step_classes": (B, "unsupported", insert(unit_dict(7, attribute=2, dependencies=[1]))),
-    "unsupported_deaths": (B, "unsupported", insert(unit_dict(8))),
-    "unsupported_layer_correction": (B, "unsupported", insert(unit_dict(9, attribute=2))),
+    "unsupported_step_classes": (B, "not yet supported", insert(unit_dict(7, attribute=2, dependencies=[1]))),
+    "unsupported_deaths": (B, "not yet supported", insert(unit_dict(8))),
+    "unsupported_layer_correction": (B, "not yet supported", insert(unit_dict(9, attribute=2))),
     # Group header
-    "header_predicted": (B, "unsupported", header(flags=1, reference=1)),
-    "header_step_classes": (B, "unsupported", header(flags=2)),
+    "header_predicted": (B, "not yet supported", header(flags=1, reference=1)),
+    "header_step_classes": (B, "not yet supported", header(flags=2)),
     "header_flags": (B, "flags", header(flags=4)),
-    "header_layers": (B, "unsupported", header(layer_count=2, layer_counts=[(40, 2), (40, 2)])),
-    "header_no_layers": (B, "layer_count", header(layer_count=0, layer_counts=[])),
+    "header_layers": (B, "not yet supported", header(layer_count=2, layer_counts=[(40, 2), (40, 2)])),
+    "header_no_layers": (B, "layer", header(layer_count=0, layer_counts=[])),
     "header_frames_0": (B, "frames", header(frames=0)),
     "header_frames_mismatch": (B, "frames", lambda: units_file(lambda u: None, frames=5)),
     "header_origin_nan": (B, "origin", header(origin=(0.0, NAN, 0.0))),
@@ -196,7 +200,7 @@ INVALID = {  # name: (error, part of the package's message, bytes)
     "header_grid_bits_22": (B, "grid_bits", header(grid_bits=22)),
     "header_sh_degree": (B, "sh_degree", header(sh_degree=4)),
     "header_map_width": (B, "map_width_log2", header(layer_counts=[(40, 3)])),
-    "header_attribute_count": (B, "attribute_count", header(channels=HEADER["channels"][:3])),
+    "header_attribute_count": (B, "attributes", header(channels=HEADER["channels"][:3])),
     "header_attribute_order": (B, "attribute", header(channels=[HEADER["channels"][i] for i in (1, 0, 2, 3)])),
     "header_step_nan": (B, "step", header(channels=[(2, [(NAN, 0.0)] * 3), *HEADER["channels"][1:]])),
     "header_step_0": (B, "step", header(channels=[(2, [(0.0, 0.0)] * 3), *HEADER["channels"][1:]])),
@@ -204,7 +208,7 @@ INVALID = {  # name: (error, part of the package's message, bytes)
     "header_trajectory_order": (B, "attribute", traj((5, 2, 0.1), (1, 2, 0.1))),
     "header_trajectory_twice": (B, "attribute", traj((1, 2, 0.1), (1, 2, 0.1))),
     "header_trajectory_none": (B, "attribute", traj((0, 2, 0.1))),
-    "header_trajectory_shn": (B, "shN", traj((1, 2, 0.1), (6, 2, 0.1))),
+    "header_trajectory_shn": (B, "attribute", traj((1, 2, 0.1), (6, 2, 0.1))),
     "header_trajectory_attribute": (B, "attribute", traj((1, 2, 0.1), (7, 2, 0.1))),
     "header_coefficients_0": (B, "coefficients", traj((1, 0, 0.1))),
     "header_coefficients_many": (B, "coefficients", traj((1, 5, 0.1))),
@@ -254,20 +258,20 @@ def describe(data):
 
 
 def main():
-    manifest = {"valid": [], "invalid": []}
-    for folder, cases in (("valid", VALID), ("invalid", INVALID)):
-        (HERE / folder).mkdir(exist_ok=True)
-        for old in (HERE / folder).glob("*.gsv"):
-            old.unlink()
-        for name, case in cases.items():
-            data = case[-1]()
-            entry = {"file": f"{folder}/{name}.gsv"}
-            if folder == "valid":
-                entry |= {"about": case[0]} | describe(data)
-            else:
-                entry |= {"error": case[0]}
-            manifest[folder].append(entry)
-            (HERE / folder / f"{name}.gsv").write_bytes(data)
+    manifest, files = {"valid": [], "invalid": []}, {}
+    for name, (about, build) in VALID.items():
+        file = f"valid/{name}.gsv"
+        files[file] = build()
+        manifest["valid"].append({"file": file, "about": about} | describe(files[file]))
+    for name, (error, _, build) in INVALID.items():
+        file = f"invalid/{name}.gsv"
+        files[file] = build()
+        manifest["invalid"].append({"file": file, "error": error})
+    for old in HERE.glob("*valid/*.gsv"):
+        old.unlink()
+    for file, data in files.items():
+        (HERE / file).parent.mkdir(exist_ok=True)
+        (HERE / file).write_bytes(data)
     (HERE / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n")
     print(f"{len(VALID)} valid, {len(INVALID)} invalid")
 

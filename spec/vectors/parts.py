@@ -131,14 +131,13 @@ def encode(group):
 
 CONFIG = {
     "level": 1,
-    "timescale": 30,
-    "frame_duration": 1,
+    "fps": (30, 1),
     "metres_per_unit": 1.0,
-    "up_axis": 1,
-    "color_space": 0,
+    "up": "y",
+    "color_space": "srgb",
     "background": [0.0, 0.0, 0.0],
     "sh_degree": 0,
-    "sh_frame": 0,
+    "sh_frame": "world",
     "cameras": [],
 }
 
@@ -196,8 +195,19 @@ def other_mdat_sizes():
 
 
 def truncated():
-    data = groups_file(make_group(30, 2), make_group(30, 2, seed=2), finish=False)
-    return data[:-10]
+    return groups_file(make_group(30, 2), make_group(30, 2, seed=2), finish=False)[:-10]
+
+
+def truncated_after_sample():
+    """The file ends in an mdat that goes on after its sample."""
+    parts = split_boxes(groups_file(make_group(30, 2), finish=False))
+    last = parts.pop()[1]
+    return b"".join(whole for _, whole in parts) + struct.pack(">I", len(last) + 100) + last[4:]
+
+
+def major_brand_only():
+    parts = split_boxes(groups_file(make_group(30, 2)))
+    return box(b"ftyp", b"gsv1\0\0\0\0isom") + b"".join(whole for _, whole in parts[1:])
 
 
 CAMERA = {
@@ -362,12 +372,12 @@ def u32(value):
 
 
 def poke_duration(frame_duration, wrong):
-    data = groups_file(base_group(), frame_duration=frame_duration)
+    data = groups_file(base_group(), fps=(30000, frame_duration))
     return poke(data, data.index(b"trun") + 16, u32(wrong))
 
 
 def poke_time(frame_duration, wrong):
-    data = groups_file(base_group(), frame_duration=frame_duration)
+    data = groups_file(base_group(), fps=(30000, frame_duration))
     return poke(data, data.index(b"tfdt") + 8, struct.pack(">Q", wrong))
 
 
