@@ -80,11 +80,7 @@ def clip(x, lo, hi):
 
 # ---- 2. Container ---------------------------------------------------------------------------------------------------
 
-HEADER_BOXES = (
-    "ftyp moov sidx moof mvhd trak tkhd mdia mdhd hdlr minf vvhd dinf dref url_ stbl stsd stts stsc stsz stco mvex "
-    "trex gsv1 gsvC mfhd traf tfhd tfdt trun"
-)
-HEADER_BOXES = {name.replace("_", " ").encode() for name in HEADER_BOXES.split()}
+HEADER_BOXES = (b"ftyp", b"moov", b"sidx", b"moof")  # of the top level
 
 
 def boxes(data, position, end, top_level=False):
@@ -105,7 +101,7 @@ def boxes(data, position, end, top_level=False):
             require(kind == b"mdat" and top_level, f"box {kind!r} at byte {offset}: size 0 is for mdat only")
             size = 2**64  # to the end, which may be still to come
         require(size >= header, f"box {kind!r} at byte {offset}: size {size} is less than its header")
-        if kind in HEADER_BOXES and size - header > 2**24:
+        if top_level and kind in HEADER_BOXES and size - header > 2**24:
             raise LimitError(f"box {kind!r} at byte {offset}: {size} bytes, at most 16 MiB are allowed")
         if offset + size > end and not (top_level and kind == b"mdat"):
             require(top_level, f"box {kind!r} at byte {offset}: {size} bytes, but its container ends at {end}")
@@ -117,7 +113,8 @@ def boxes(data, position, end, top_level=False):
 def find_box(data, box, path):
     """First box at a path of types inside `box`, or None."""
     for wanted in path:
-        box = next((child for child in boxes(data, box[2], box[3]) if child[0] == wanted), None)
+        children = list(boxes(data, box[2], box[3]))  # all of them: each must be well formed
+        box = next((child for child in children if child[0] == wanted), None)
         if box is None:
             return None
     return box
@@ -167,7 +164,8 @@ def read_container(data):
         require(kind == b"ftyp" or not first, f"the first box is {kind!r}, expected ftyp: not a gsv file")
         if first:
             read_ftyp(data, body, end)
-        elif kind == b"moov" and config is None:
+        elif kind == b"moov":
+            require(config is None, f"second moov at byte {offset}")
             config = read_moov(data, box)
         elif kind == b"moof":
             require(config is not None, f"moof at byte {offset} before moov")
@@ -193,7 +191,7 @@ def read_ftyp(data, body, end):
 
 def read_moov(data, moov):
     """Clause 2.2: the first track of handler `volv`."""
-    for trak in boxes(data, moov[2], moov[3]):
+    for trak in list(boxes(data, moov[2], moov[3])):
         hdlr = find_box(data, trak, [b"mdia", b"hdlr"]) if trak[0] == b"trak" else None
         if hdlr is not None and data[hdlr[2] + 8 : min(hdlr[3], hdlr[2] + 12)] == b"volv":
             break
@@ -270,7 +268,7 @@ def read_gsvc(r):
 
 def read_moof(data, moof, config):
     """Clause 2.4: [(offset, size, start_frame, frames, sync)] of the gsv track: none or one."""
-    for traf in boxes(data, moof[2], moof[3]):
+    for traf in list(boxes(data, moof[2], moof[3])):
         if traf[0] != b"traf":
             continue
         tfhd = open_box(data, traf, [b"tfhd"])
@@ -310,6 +308,7 @@ def read_moof(data, moof, config):
 # ---- 3. Group payload -----------------------------------------------------------------------------------------------
 
 GROUP_HEADER, POSITIONS, CHANNELS, LIFETIMES, NODE_POSITIONS, NODE_TRAJECTORIES, TRAJECTORIES = range(7)
+KNOWN = range(10)
 RESERVED = {7: "step_classes", 8: "deaths", 9: "layer_correction"}
 MUST_DEPEND_ON = {CHANNELS: POSITIONS, LIFETIMES: POSITIONS, NODE_TRAJECTORIES: NODE_POSITIONS, TRAJECTORIES: POSITIONS}
 MEANS, LOG_SCALES, QUATS, LOGIT_OPACITIES, SH0, SHN = range(1, 7)
@@ -352,10 +351,8 @@ def read_units(payload):
         require(increasing, f"unit {index}: dependencies {dependencies} are not increasing indices below {index}")
         require(not units or units[-1].layer <= layer, f"unit {index}: layer {layer} after a higher one")
         unit = Unit(unit_type, layer, attribute, dependencies, body)
-        require(
-            all(unit.key() != u.key() for u in units),
-            f"unit {index}: second unit of (type, layer, attribute) {unit.key()}",
-        )
+        second = unit_type in KNOWN and any(unit.key() == u.key() for u in units)
+        require(not second, f"unit {index}: second unit of (type, layer, attribute) {unit.key()}")
         units.append(unit)
     require(units and units[0].key() == (GROUP_HEADER, 0, 0), "unit 0 is not the group header")
     return units

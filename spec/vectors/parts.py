@@ -194,6 +194,53 @@ def other_mdat_sizes():
     return parts[0][1] + parts[1][1] + shift_data(first_moof, 8) + first_mdat + last_moof + bytes(4) + last_mdat[4:]
 
 
+def full_box(kind, flags, *fields, version=0):
+    """Fields are u32 or bytes."""
+    body = b"".join(f if isinstance(f, bytes) else struct.pack(">I", f) for f in fields)
+    return box(kind, struct.pack(">I", version << 24 | flags) + body)
+
+
+def other_track():
+    """An audio track before ours in moov and moof, and every other way to say where a sample is and how long."""
+    payload = encode(make_group(30, 2))
+    first, second = encode(make_group(20, 3, seed=2)), encode(make_group(25, 3, seed=3))
+    (_, ftyp), (_, moov), *_ = split_boxes(make_file([(payload, 2)], finish=False))
+    at = moov.index(b"trak") - 4
+    audio = box(b"trak", box(b"mdia", full_box(b"hdlr", 0, 0, b"soun", bytes(13))))
+    moov = box(b"moov", moov[8:at] + audio + moov[at:])
+    start = moov.index(b"trex") - 4  # defaults: a duration of 3 frames, no sync sample
+    moov = moov[:start] + full_box(b"trex", 0, 1, 1, 3, 0, 1 << 16)
+    mvex = moov.index(b"mvex") - 4
+    moov = box(b"moov", moov[8:mvex] + box(b"mvex", moov[mvex + 8 :]))
+    head = ftyp + moov
+    theirs = box(b"traf", full_box(b"tfhd", 0, 2) + full_box(b"trun", 0, 7))
+
+    def moof(*traf):
+        return box(b"moof", full_box(b"mfhd", 0, 1) + theirs + box(b"traf", b"".join(traf)))
+
+    def by_base(offset):  # base_data_offset, size and flags in tfhd; 32-bit time, no data_offset in trun
+        tfhd = full_box(b"tfhd", 0x31, 1, struct.pack(">Q", offset), len(first), 0)
+        return moof(tfhd, full_box(b"tfdt", 0, 0), full_box(b"trun", 0, 1))
+
+    def by_tfhd(offset):  # sample_description_index, duration, size in tfhd; first_sample_flags in trun
+        tfhd = full_box(b"tfhd", 0x1A, 1, 1, 3, len(second))
+        return moof(tfhd, full_box(b"tfdt", 0, 3), full_box(b"trun", 0x005, 1, offset, 1 << 25))
+
+    def by_trex(offset):
+        return moof(full_box(b"tfhd", 0, 1), full_box(b"tfdt", 0, 6), full_box(b"trun", 0x201, 1, offset, len(second)))
+
+    data = head + by_base(len(head) + len(by_base(0)) + 13) + box(b"mdat", b"audio" + first + b"more audio")
+    for fragment in (by_tfhd, by_trex):
+        data += fragment(len(fragment(0)) + 8) + box(b"mdat", second)
+    return data
+
+
+def no_mdat():
+    """A moof that an unknown box follows in place of its mdat, then a whole fragment."""
+    parts = split_boxes(groups_file(make_group(30, 2), make_group(30, 2, seed=2), finish=False))
+    return b"".join(whole.replace(b"mdat", b"what") if i == 3 else whole for i, (_, whole) in enumerate(parts))
+
+
 def truncated():
     return groups_file(make_group(30, 2), make_group(30, 2, seed=2), finish=False)[:-10]
 
@@ -262,6 +309,7 @@ def unit_dict(unit_type, layer=0, attribute=0, dependencies=(), payload=b""):
 
 def add_unknown_units(units):
     units.append(unit_dict(200, attribute=17, dependencies=[1], payload=b"from later"))
+    units.append(unit_dict(255, layer=3))
     units.append(unit_dict(255, layer=3))
     units.append(unit_dict(10, layer=3, payload=bytes(100)))
 
