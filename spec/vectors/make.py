@@ -1,0 +1,285 @@
+"""Conformance vectors: the list of cases, and the program that writes valid/, invalid/ and manifest.json from it.
+
+    python spec/vectors/make.py
+
+VALID and INVALID drive both this regenerator and tests/test_conformance.py. The hashes in the manifest (clause 16 of
+gsv.md) are those of the reference decoder.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE))
+from parts import (  # noqa: E402
+    CAMERA,
+    HEADER,
+    add_unknown_units,
+    box,
+    change_payload,
+    change_unit,
+    duplicates,
+    extremes,
+    f32,
+    find_unit,
+    groups_file,
+    header,
+    insert,
+    left_over_empty,
+    major_brand_only,
+    make_group,
+    no_mdat,
+    other_mdat_sizes,
+    other_top,
+    other_track,
+    pack_header,
+    patched,
+    payload_file,
+    poke_duration,
+    poke_time,
+    reference,
+    remove_unit,
+    tied_nodes,
+    traj,
+    truncated,
+    truncated_after_sample,
+    u32,
+    unit_dict,
+    units_file,
+    unknown_boxes,
+)
+
+MOTION = {"nodes": 12, "trajectories": {"means": 4, "quats": 3, "logit_opacities": 2, "sh0": 20}}
+
+VALID = {  # name: (what it is about, bytes)
+    "single_frame": ("one group of one frame", lambda: groups_file(make_group(300, 1))),
+    "motion": ("20 frames, nodes and trajectories", lambda: groups_file(make_group(250, 20, **MOTION))),
+    "one_frame_motion": (
+        "T = 1 with nodes, trajectories and lifetimes",
+        lambda: groups_file(make_group(50, 1, nodes=5, trajectories={"means": 1, "log_scales": 1}, lifetimes=True)),
+    ),
+    "no_gaussians": ("N = 0", lambda: groups_file(make_group(0, 3))),
+    "no_gaussians_all_units": (
+        "N = 0 with nodes, trajectories and lifetimes",
+        lambda: groups_file(make_group(0, 3, nodes=3, trajectories={"means": 2}, lifetimes=True)),
+    ),
+    "one_gaussian": ("N = 1, M = 1, finest grid", lambda: groups_file(make_group(1, 4, bits=21, nodes=1, neighbors=8))),
+    "coarsest_grid": ("grid_bits = 1", lambda: groups_file(make_group(64, 2, bits=1, nodes=8))),
+    "duplicates": ("many Gaussians on one grid point", lambda: groups_file(duplicates())),
+    "tied_nodes": ("nodes at equal distance and on one point", lambda: groups_file(tied_nodes())),
+    "few_nodes": ("fewer nodes than neighbours", lambda: groups_file(make_group(40, 6, nodes=3, neighbors=8))),
+    "sh_degree_1": ("sh_degree 1", lambda: groups_file(make_group(80, 2, sh_degree=1), sh_degree=1)),
+    "sh_degree_2": (
+        "sh_degree 2, SH turn",
+        lambda: groups_file(make_group(80, 2, sh_degree=2, nodes=4), sh_degree=2, sh_frame="body"),
+    ),
+    "sh_degree_3": (
+        "sh_degree 3 with trajectories of shN",
+        lambda: groups_file(make_group(80, 8, sh_degree=3, trajectories={"shN": 2}), sh_degree=3),
+    ),
+    "lifetimes": ("cut lifetimes, T no power of two", lambda: groups_file(make_group(300, 37, lifetimes=True))),
+    "most_frames": (
+        "T = 64, all coefficients of every trajectory",
+        lambda: groups_file(make_group(20, 64, nodes=6, trajectories={"means": 64, "log_scales": 64}, lifetimes=True)),
+    ),
+    "extremes": ("values of +-2^24, corners of the grid, extreme steps", lambda: groups_file(extremes())),
+    "several_groups": (
+        "groups of 5, 1 and 7 frames",
+        lambda: groups_file(make_group(50, 5), make_group(60, 1, seed=2), make_group(70, 7, seed=3, nodes=4)),
+    ),
+    "frame_rate": (
+        "29.97 frames per second",
+        lambda: groups_file(make_group(30, 3), fps=(30000, 1001)),
+    ),
+    "cameras": (
+        "reference cameras, other gsvC fields",
+        lambda: groups_file(
+            make_group(30, 2),
+            cameras=[CAMERA, CAMERA | {"name": ""}],
+            level=4,
+            metres_per_unit=0.01,
+            up="-z",
+            background=[1.0, 0.5, 0.25],
+        ),
+    ),
+    "unfinished": ("no sidx", lambda: groups_file(make_group(30, 2), make_group(30, 2, seed=2), finish=False)),
+    "unknown_boxes": ("unknown boxes between all others", unknown_boxes),
+    "other_mdat_sizes": ("mdat with largesize, and with size 0", other_mdat_sizes),
+    "unknown_units": ("unknown unit types, also in later layers", lambda: units_file(add_unknown_units)),
+    "more_dependencies": (
+        "dependencies beyond the necessary",
+        lambda: units_file(lambda u: u[2].update(dependencies=[0, 1])),
+    ),
+    "truncated": ("the file ends in the second sample", truncated),
+    "truncated_after_sample": ("the file ends in an mdat, after the sample", truncated_after_sample),
+    "other_track": ("an audio track, and all other ways to place and time a sample", other_track),
+    "major_brand_only": ("gsv1 is the major brand, but no compatible one", major_brand_only),
+    "no_groups": ("a stream without groups yet", lambda: groups_file(finish=False)),
+}
+
+NAN, INF = float("nan"), float("inf")
+B, L = "BitstreamError", "LimitError"
+
+INVALID = {  # name: (error, part of the package's message, bytes)
+    # Container
+    "container_empty": (B, "", lambda: b""),
+    "container_text": (B, "", lambda: b"This is not a volumetric video, it only has a friendly name.\n"),
+    "container_magic": (B, "ftyp", other_top(lambda p: [(b"ftyp", box(b"ftyp", b"isom\0\0\0\0isommp42")), *p[1:]])),
+    "container_no_moov": (B, "moov", other_top(lambda p: p[:1])),
+    "container_no_ftyp": (B, "ftyp", other_top(lambda p: p[1:])),
+    "container_handler": (B, "volv", patched(b"hdlr", 8, b"vide")),
+    "container_entry": (B, "gsv1", patched(b"stsd", 12, b"avc1")),
+    "container_no_config": (B, "gsvC", patched(b"gsvC", -4, b"none")),
+    "container_small_box": (B, "size", patched(b"moof", -8, u32(4))),
+    "container_zero_size": (B, "", patched(b"moof", -8, u32(0))),
+    "container_huge_header_box": (L, "moof", patched(b"moof", -8, u32(2**24 + 9))),
+    "container_nested_size": (B, "", patched(b"traf", -8, u32(10**6))),
+    "container_two_samples": (B, "", patched(b"trun", 4, u32(2))),
+    "container_outside_mdat": (B, "mdat", patched(b"trun", 8, u32(4))),
+    "container_no_mdat": (B, "mdat", no_mdat),
+    "container_second_moov": (B, "moov", other_top(lambda p: [*p[:2], *p[1:]])),
+    "container_sample_size": (B, "mdat", patched(b"trun", 16, u32(2**24))),
+    "container_no_frames": (B, "", patched(b"trun", 12, u32(0))),
+    "config_version": (B, "version", patched(b"gsvC", 0, b"\2")),
+    "config_level_0": (L, "level", patched(b"gsvC", 1, b"\0")),
+    "config_level_5": (L, "level", patched(b"gsvC", 1, b"\5")),
+    "config_frame_duration": (B, "frame_duration", patched(b"gsvC", 2, u32(0))),
+    "config_metres_nan": (B, "metres_per_unit", patched(b"gsvC", 6, f32(NAN))),
+    "config_metres_0": (B, "metres_per_unit", patched(b"gsvC", 6, f32(0))),
+    "config_up_axis": (B, "up_axis", patched(b"gsvC", 10, b"\6")),
+    "config_color_space": (B, "color_space", patched(b"gsvC", 11, b"\1")),
+    "config_background": (B, "background", patched(b"gsvC", 12, f32(1.5))),
+    "config_sh_degree": (B, "sh_degree", patched(b"gsvC", 24, b"\4")),
+    "config_sh_frame": (B, "sh_frame", patched(b"gsvC", 25, b"\2")),
+    "config_camera_count": (B, "", patched(b"gsvC", 26, b"\xff\xff")),
+    "config_camera_name": (B, "", patched(b"gsvC", 29, b"\xff\xff")),
+    "config_camera_width": (B, "", patched(b"gsvC", 29 + len(CAMERA["name"].encode()), u32(0))),
+    "config_camera_nan": (B, "", patched(b"gsvC", 37 + len(CAMERA["name"].encode()), f32(NAN))),
+    "duration_no_frames": (B, "", lambda: poke_duration(1001, 1000)),
+    "time_no_frames": (B, "", lambda: poke_time(1001, 500)),
+    # Units
+    "unit_none": (B, "", lambda: payload_file(lambda p: b"")),
+    "unit_crc": (B, "CRC", change_unit(2, 5, damage=1)),
+    "unit_payload_damaged": (B, "CRC", lambda: payload_file(lambda p: p[:-1] + bytes([p[-1] ^ 64]))),
+    "unit_header_crc": (B, "CRC", change_unit(0, damage=1 << 31)),
+    "unit_truncated": (B, "", lambda: payload_file(lambda p: p[:-1])),
+    "unit_truncated_head": (B, "", lambda: payload_file(lambda p: p + b"\x80\0\0")),
+    "unit_length": (B, "", lambda: payload_file(lambda p: p + bytes([128, 0, 0, 0]) + u32(2**32 - 1) + bytes(8))),
+    "unit_header_late": (B, "header", lambda: units_file(lambda u: u.insert(0, unit_dict(200)))),
+    "unit_header_twice": (B, "", lambda: units_file(lambda u: u.append(dict(u[0])))),
+    "unit_twice": (B, "", lambda: units_file(lambda u: u.append(dict(find_unit(u, 2, 5))))),
+    "unit_too_many": (B, "255", insert(*(unit_dict(128 + i // 250, attribute=i % 250) for i in range(250)))),
+    "unit_layer_order": (B, "layer", insert(unit_dict(200, layer=2), unit_dict(201, layer=1))),
+    "unit_layer_unannounced": (B, "", change_unit(6, 5, layer=1)),
+    "dependency_on_itself": (B, "depend", lambda: units_file(lambda u: u[2].update(dependencies=[1, 2]))),
+    "dependency_on_later": (B, "depend", lambda: units_file(lambda u: u[2].update(dependencies=[1, 5]))),
+    "dependency_order": (B, "depend", lambda: units_file(lambda u: u[4].update(dependencies=[3, 1]))),
+    "dependency_repeated": (B, "depend", lambda: units_file(lambda u: u[4].update(dependencies=[1, 1]))),
+    "dependency_missing": (B, "depend", change_unit(2, 5, dependencies=[])),
+    "dependency_missing_nodes": (B, "depend", change_unit(5, dependencies=[])),
+    "unit_attribute": (B, "", change_unit(2, 5, attribute=9)),
+    "unit_attribute_of_positions": (B, "", change_unit(1, attribute=1)),
+    "unit_unannounced": (B, "", insert(unit_dict(6, attribute=4, dependencies=[1]))),
+    "unit_unannounced_nodes": (B, "", header(node_count=0)),
+    "unit_no_positions": (B, "", remove_unit(1)),
+    "unit_no_channels": (B, "", remove_unit(2, 4)),
+    "unit_no_nodes": (B, "", remove_unit(4)),
+    "unit_no_node_trajectories": (B, "", remove_unit(5)),
+    "unit_no_trajectories": (B, "", remove_unit(6, 1)),
+    "unsupported_step_classes": (B, "not yet supported", insert(unit_dict(7, attribute=2, dependencies=[1]))),
+    "unsupported_deaths": (B, "not yet supported", insert(unit_dict(8))),
+    "unsupported_layer_correction": (B, "not yet supported", insert(unit_dict(9, attribute=2))),
+    # Group header
+    "header_predicted": (B, "not yet supported", header(flags=1, reference=1)),
+    "header_step_classes": (B, "not yet supported", header(flags=2)),
+    "header_flags": (B, "flags", header(flags=4)),
+    "header_layers": (B, "not yet supported", header(layer_count=2, layer_counts=[(40, 2), (40, 2)])),
+    "header_no_layers": (B, "layer", header(layer_count=0, layer_counts=[])),
+    "header_frames_0": (B, "frames", header(frames=0)),
+    "header_frames_mismatch": (B, "frames", lambda: units_file(lambda u: None, frames=5)),
+    "header_origin_nan": (B, "origin", header(origin=(0.0, NAN, 0.0))),
+    "header_grid_step_0": (B, "grid_step", header(grid_step=0.0)),
+    "header_grid_step_negative": (B, "grid_step", header(grid_step=-0.1)),
+    "header_grid_bits_0": (B, "grid_bits", header(grid_bits=0)),
+    "header_grid_bits_22": (B, "grid_bits", header(grid_bits=22)),
+    "header_sh_degree": (B, "sh_degree", header(sh_degree=4)),
+    "header_map_width": (B, "map_width_log2", header(layer_counts=[(40, 3)])),
+    "header_attribute_count": (B, "attributes", header(channels=HEADER["channels"][:3])),
+    "header_attribute_order": (B, "attribute", header(channels=[HEADER["channels"][i] for i in (1, 0, 2, 3)])),
+    "header_step_nan": (B, "step", header(channels=[(2, [(NAN, 0.0)] * 3), *HEADER["channels"][1:]])),
+    "header_step_0": (B, "step", header(channels=[(2, [(0.0, 0.0)] * 3), *HEADER["channels"][1:]])),
+    "header_offset_infinite": (B, "offset", header(channels=[(2, [(0.1, INF)] * 3), *HEADER["channels"][1:]])),
+    "header_trajectory_order": (B, "attribute", traj((5, 2, 0.1), (1, 2, 0.1))),
+    "header_trajectory_twice": (B, "attribute", traj((1, 2, 0.1), (1, 2, 0.1))),
+    "header_trajectory_none": (B, "attribute", traj((0, 2, 0.1))),
+    "header_trajectory_shn": (B, "attribute", traj((1, 2, 0.1), (6, 2, 0.1))),
+    "header_trajectory_attribute": (B, "attribute", traj((1, 2, 0.1), (7, 2, 0.1))),
+    "header_coefficients_0": (B, "coefficients", traj((1, 0, 0.1))),
+    "header_coefficients_many": (B, "coefficients", traj((1, 5, 0.1))),
+    "header_trajectory_step": (B, "step", traj((1, 2, -INF))),
+    "header_neighbors_0": (B, "neighbors", header(neighbors=0)),
+    "header_neighbors_9": (B, "neighbors", header(neighbors=9)),
+    "header_node_coefficients": (B, "coefficients", header(coefficients=5)),
+    "header_rotation_step": (B, "rotation_step", header(rotation_step=0.0)),
+    "header_translation_step": (B, "translation_step", header(translation_step=NAN)),
+    "header_truncated": (B, "", change_unit(0, payload=pack_header()[:-1])),
+    "header_left_over": (B, "", change_unit(0, payload=pack_header() + b"\0")),
+    # Limits
+    "limit_gaussians": (L, "Gaussians", header(layer_counts=[(65537, 8)])),
+    "limit_gaussians_huge": (L, "Gaussians", header(layer_counts=[(2**32 - 1, 15)])),
+    "limit_frames": (L, "frames", header(frames=65, duration=65)),
+    "limit_nodes": (L, "nodes", header(node_count=1025)),
+    "limit_nodes_huge": (L, "nodes", header(node_count=2**32 - 1)),
+    # Entropy-coded payloads
+    "payload_left_over": (B, "", change_payload(1, 0, lambda p: p + b"\1" * 8)),
+    "payload_left_over_empty": (B, "", lambda: left_over_empty()),
+    "payload_short": (B, "", change_payload(1, 0, lambda p: p[: len(p) // 2])),
+    "payload_empty": (B, "", change_payload(2, 5, lambda p: b"")),
+    "payload_many_gaussians": (B, "", header(layer_counts=[(65536, 8)])),
+    "payload_escape": (B, "", change_payload(2, 5, lambda p: bytes(64))),
+    "payload_value": (B, "", change_payload(2, 5, lambda p: bytes.fromhex("000000000015d476d50000"))),
+    "payload_lifetime": (B, "", change_payload(3, 0, lambda p: bytes.fromhex("342f5d0a5e4842"))),
+}
+
+
+# ---- Regenerator ----------------------------------------------------------------------------------------------------
+
+
+def describe(data):
+    """What the manifest tells of a valid file, by the reference decoder."""
+    _, groups = reference.decode(data)
+    facts = [
+        {
+            "start_frame": sample.start_frame,
+            "frames": sample.frames,
+            "sync": sample.sync,
+            "gaussians": group.header.count,
+            "sha256": reference.group_hash(group),
+        }
+        for sample, group in groups
+    ]
+    return {"frames": sum(sample.frames for sample, _ in groups), "groups": facts}
+
+
+def main():
+    manifest, files = {"valid": [], "invalid": []}, {}
+    for name, (about, build) in VALID.items():
+        file = f"valid/{name}.gsv"
+        files[file] = build()
+        manifest["valid"].append({"file": file, "about": about} | describe(files[file]))
+    for name, (error, _, build) in INVALID.items():
+        file = f"invalid/{name}.gsv"
+        files[file] = build()
+        manifest["invalid"].append({"file": file, "error": error})
+    for old in HERE.glob("*valid/*.gsv"):
+        old.unlink()
+    for file, data in files.items():
+        (HERE / file).parent.mkdir(exist_ok=True)
+        (HERE / file).write_bytes(data)
+    (HERE / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n")
+    print(f"{len(VALID)} valid, {len(INVALID)} invalid")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,436 @@
+"""What the conformance vectors are made of: groups, files, and groups and files taken apart to change one thing.
+
+Synthetic groups go through the package's encoder and muxer. The edits work on the bytes, with the reference decoder's
+parser, since an encoder would never write what they make.
+"""
+
+import struct
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+from gscodec import _native
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import reference_decoder as reference
+
+CHANNELS = {"log_scales": 3, "quats": 3, "logit_opacities": 1, "sh0": 3}
+
+
+# ---- Groups ---------------------------------------------------------------------------------------------------------
+
+
+def morton(positions, bits):
+    code = [0] * len(positions)
+    for i, point in enumerate(positions.tolist()):
+        for axis, value in enumerate(point):
+            code[i] |= sum((value >> j & 1) << (3 * j + 2 - axis) for j in range(bits))
+    return code
+
+
+def sample_positions(rng, count, bits):
+    """[N, 3] u32 in Morton order: a surface and a few points away from it."""
+    uv = rng.random((count, 2))
+    z = (
+        0.5
+        + 0.3 * np.sin(5 * uv[:, 0]) * np.cos(4 * uv[:, 1])
+        + 0.1 * rng.standard_normal(count) * (rng.random(count) < 0.1)
+    )
+    points = np.column_stack([uv, z.clip(0, 1)]) * (2**bits - 1)
+    positions = points.round().astype(np.uint32).reshape(count, 3)
+    code = morton(positions, bits)
+    return positions[sorted(range(count), key=code.__getitem__)]
+
+
+def make_group(
+    count, frames, *, seed=1, bits=10, sh_degree=0, nodes=0, neighbors=4, trajectories=None, lifetimes=False, spread=12
+):
+    """A group dict for encode_group: smooth in space with noise, small motions. `trajectories`: attribute -> K."""
+    rng = np.random.default_rng(seed)
+    positions = sample_positions(rng, count, bits)
+    names = dict(CHANNELS) | ({"shN": 3 * ((sh_degree + 1) ** 2 - 1)} if sh_degree else {})
+    smooth = np.sin(positions @ rng.random((3, 1)) * 8 / 2**bits).T
+    channels = {}
+    for name, c in names.items():
+        values = (
+            (spread * (smooth * rng.random((c, 1)) + 0.3 * rng.standard_normal((c, count)))).round().astype(np.int32)
+        )
+        channels[name] = {
+            "values": values,
+            "steps": [0.01 + 0.002 * i for i in range(c)],
+            "offsets": [0.1 * i - 0.2 for i in range(c)],
+        }
+    group = {
+        "frames": frames,
+        "origin": [-1.0, 0.5, 2.0],
+        "grid_step": 2.0 ** (1 - bits),
+        "grid_bits": bits,
+        "positions": positions,
+        "channels": channels,
+        "lifetimes": None,
+        "nodes": None,
+        "trajectories": {},
+    }
+    if nodes:
+        k = min(6, frames)
+        decay = 20 / (1 + np.arange(k)).reshape(k, 1, 1)
+        motion = (decay * rng.standard_normal((k, 6, nodes))).round().astype(np.int32)
+        group["nodes"] = {"positions": sample_positions(rng, nodes, bits), "coefficients": motion}
+        group["nodes"] |= {"rotation_step": 0.01, "translation_step": 0.005, "neighbors": neighbors}
+    for name, k in (trajectories or {}).items():
+        c = 3 if name == "means" else names[name]
+        values = (5 * rng.standard_normal((k, c, count))).round().astype(np.int32)
+        length = rng.integers(0, k + 1, count) * (rng.random(count) < 0.3)
+        values[np.broadcast_to(np.arange(k)[:, None, None] >= length, values.shape)] = 0
+        group["trajectories"][name] = {"coefficients": values, "step": 0.003}
+    if lifetimes:
+        cut = rng.random(count) < 0.4
+        start = rng.integers(0, frames, count)
+        end = start + 1 + (rng.random(count) * (frames - start)).astype(int)
+        group["lifetimes"] = np.column_stack([np.where(cut, start, 0), np.where(cut, end, frames)]).astype(np.uint16)
+    return group
+
+
+def extremes():
+    """Values at +-2^24, corners of the finest grid, steps from tiny to large."""
+    group = make_group(40, 3, bits=21, nodes=9, trajectories={"means": 3, "log_scales": 2})
+    top = 2**21 - 1
+    group["positions"][0], group["positions"][-1] = 0, top
+    for i, name in enumerate(group["channels"]):
+        channel = group["channels"][name]
+        channel["values"][:, 1::7], channel["values"][:, 3::5] = 2**24, -(2**24)
+        channel["steps"] = [2.0 ** -(30 + i)] * len(channel["steps"])
+    group["channels"]["logit_opacities"]["steps"] = [1e30]
+    group["trajectories"]["means"]["coefficients"][2, :, 4] = [2**24, -(2**24), 2**24]
+    group["trajectories"]["means"]["step"] = 1e-30
+    group["nodes"]["coefficients"][0, :, 2] = [2**24, -(2**24), 2**24] * 2
+    group["nodes"] |= {"rotation_step": 1e-8, "translation_step": 1e-7}
+    return group
+
+
+def duplicates():
+    """Many Gaussians on few grid points, more than 255 on one."""
+    group = make_group(700, 4, bits=3, nodes=20, neighbors=8)
+    group["positions"][:300] = group["positions"][0]
+    return group
+
+
+def tied_nodes():
+    """Nodes at equal distances and on top of each other: the order of clause 13.2 decides."""
+    group = make_group(60, 5, bits=2, nodes=30, neighbors=3)
+    group["nodes"]["positions"] = np.repeat(group["nodes"]["positions"][::2], 2, axis=0)
+    return group
+
+
+def encode(group):
+    return _native.encode_group(group)[0]
+
+
+# ---- Files ----------------------------------------------------------------------------------------------------------
+
+CONFIG = {
+    "level": 1,
+    "fps": (30, 1),
+    "metres_per_unit": 1.0,
+    "up": "y",
+    "color_space": "srgb",
+    "background": [0.0, 0.0, 0.0],
+    "sh_degree": 0,
+    "sh_frame": "world",
+    "cameras": [],
+}
+
+
+def make_file(payloads, *, finish=True, **config):
+    """payloads: [(bytes, frames)] -> bytes of a .gsv file, groups one after the other, all sync."""
+    config = CONFIG | config
+    init = bytes(_native.init_segment(config))
+    fragments, start = [], 0
+    for number, (payload, frames) in enumerate(payloads, 1):
+        fragments.append(bytes(_native.fragment(payload, number, start, frames, True, config)))
+        start += frames
+    if finish:
+        init = bytes(_native.finish(init, [(len(f), n, True) for f, (_, n) in zip(fragments, payloads, strict=True)]))
+    return init + b"".join(fragments)
+
+
+def groups_file(*groups, **options):
+    return make_file([(encode(group), group["frames"]) for group in groups], **options)
+
+
+def box(kind, body):
+    return struct.pack(">I4s", 8 + len(body), kind) + body
+
+
+def split_boxes(data):
+    """[(type, bytes)] of the top-level boxes."""
+    return [(kind, data[start:end]) for kind, start, _, end in reference.boxes(data, 0, len(data), top_level=True)]
+
+
+def shift_data(moof, by):
+    """The moof when `by` bytes come between it and the sample."""
+    at = moof.index(b"trun") + 12
+    return poke(moof, at, struct.pack(">i", struct.unpack_from(">i", moof, at)[0] + by))
+
+
+def unknown_boxes():
+    """Unknown boxes after every top-level box and at the end of each container box."""
+    extra, result = box(b"what", b"ever"), b""
+    for kind, whole in split_boxes(groups_file(make_group(30, 2), make_group(30, 2, seed=2), finish=False)):
+        if kind == b"moof":
+            whole = shift_data(whole, 2 * len(extra))
+        if kind in (b"moov", b"moof"):
+            whole = box(kind, whole[8:] + extra)
+        result += whole + extra
+    return result
+
+
+def other_mdat_sizes():
+    """The first mdat with a 64-bit size, the last one with size 0."""
+    parts = split_boxes(groups_file(make_group(30, 2), make_group(30, 3, seed=2), finish=False))
+    (_, first_moof), (_, first_mdat), (_, last_moof), (_, last_mdat) = parts[2:]
+    first_mdat = struct.pack(">I4sQ", 1, b"mdat", len(first_mdat) + 8) + first_mdat[8:]
+    return parts[0][1] + parts[1][1] + shift_data(first_moof, 8) + first_mdat + last_moof + bytes(4) + last_mdat[4:]
+
+
+def full_box(kind, flags, *fields, version=0):
+    """Fields are u32 or bytes."""
+    body = b"".join(f if isinstance(f, bytes) else struct.pack(">I", f) for f in fields)
+    return box(kind, struct.pack(">I", version << 24 | flags) + body)
+
+
+def other_track():
+    """An audio track before ours in moov and moof, and every other way to say where a sample is and how long."""
+    payload = encode(make_group(30, 2))
+    first, second = encode(make_group(20, 3, seed=2)), encode(make_group(25, 3, seed=3))
+    (_, ftyp), (_, moov), *_ = split_boxes(make_file([(payload, 2)], finish=False))
+    at = moov.index(b"trak") - 4
+    audio = box(b"trak", box(b"mdia", full_box(b"hdlr", 0, 0, b"soun", bytes(13))))
+    moov = box(b"moov", moov[8:at] + audio + moov[at:])
+    start = moov.index(b"trex") - 4  # defaults: a duration of 3 frames, no sync sample
+    moov = moov[:start] + full_box(b"trex", 0, 1, 1, 3, 0, 1 << 16)
+    mvex = moov.index(b"mvex") - 4
+    moov = box(b"moov", moov[8:mvex] + box(b"mvex", moov[mvex + 8 :]))
+    head = ftyp + moov
+    theirs = box(b"traf", full_box(b"tfhd", 0, 2) + full_box(b"trun", 0, 7))
+
+    def moof(*traf):
+        return box(b"moof", full_box(b"mfhd", 0, 1) + theirs + box(b"traf", b"".join(traf)))
+
+    def by_base(offset):  # base_data_offset, size and flags in tfhd; 32-bit time, no data_offset in trun
+        tfhd = full_box(b"tfhd", 0x31, 1, struct.pack(">Q", offset), len(first), 0)
+        return moof(tfhd, full_box(b"tfdt", 0, 0), full_box(b"trun", 0, 1))
+
+    def by_tfhd(offset):  # sample_description_index, duration, size in tfhd; first_sample_flags in trun
+        tfhd = full_box(b"tfhd", 0x1A, 1, 1, 3, len(second))
+        return moof(tfhd, full_box(b"tfdt", 0, 3), full_box(b"trun", 0x005, 1, offset, 1 << 25))
+
+    def by_trex(offset):
+        return moof(full_box(b"tfhd", 0, 1), full_box(b"tfdt", 0, 6), full_box(b"trun", 0x201, 1, offset, len(second)))
+
+    data = head + by_base(len(head) + len(by_base(0)) + 13) + box(b"mdat", b"audio" + first + b"more audio")
+    for fragment in (by_tfhd, by_trex):
+        data += fragment(len(fragment(0)) + 8) + box(b"mdat", second)
+    return data
+
+
+def no_mdat():
+    """A moof that an unknown box follows in place of its mdat, then a whole fragment."""
+    parts = split_boxes(groups_file(make_group(30, 2), make_group(30, 2, seed=2), finish=False))
+    return b"".join(whole.replace(b"mdat", b"what") if i == 3 else whole for i, (_, whole) in enumerate(parts))
+
+
+def truncated():
+    return groups_file(make_group(30, 2), make_group(30, 2, seed=2), finish=False)[:-10]
+
+
+def truncated_after_sample():
+    """The file ends in an mdat that goes on after its sample."""
+    parts = split_boxes(groups_file(make_group(30, 2), finish=False))
+    last = parts.pop()[1]
+    return b"".join(whole for _, whole in parts) + struct.pack(">I", len(last) + 100) + last[4:]
+
+
+def major_brand_only():
+    parts = split_boxes(groups_file(make_group(30, 2)))
+    return box(b"ftyp", b"gsv1\0\0\0\0isom") + b"".join(whole for _, whole in parts[1:])
+
+
+CAMERA = {
+    "name": "Kamera 1 äöü",
+    "width": 1920,
+    "height": 1080,
+    "K": np.array([[1000.5, 0.25, 960], [0, 1001, 540], [0, 0, 1.0]]),
+}
+CAMERA["viewmat"] = np.array([[0, 0, 1, 0.5], [1, 0, 0, -2], [0, 1, 0, 3], [0, 0, 0, 1.0]])
+
+
+# ---- Groups taken apart ---------------------------------------------------------------------------------------------
+
+
+def poke(data, at, new):
+    return data[:at] + new + data[at + len(new) :]
+
+
+def base_group():
+    return make_group(40, 4, nodes=3, trajectories={"means": 2, "sh0": 2}, lifetimes=True)
+
+
+def split_units(payload):
+    return [vars(unit) for unit in reference.read_units(payload)]
+
+
+def join_units(units):
+    result = b""
+    for u in units:
+        head = bytes([u["unit_type"], u["layer"], u["attribute"], len(u["dependencies"]), *u["dependencies"]])
+        head += struct.pack(">I", len(u["payload"]))
+        result += head + struct.pack(">I", zlib.crc32(head + u["payload"]) ^ u.get("damage", 0)) + u["payload"]
+    return result
+
+
+def units_file(edit, frames=4):
+    """The base group with its units (a list of dicts: unit_type, layer, attribute, dependencies, payload) edited."""
+    units = split_units(encode(base_group()))
+    edit(units)
+    return make_file([(join_units(units), frames)])
+
+
+def payload_file(edit):
+    """The base group with its bytes edited."""
+    return make_file([(edit(encode(base_group())), 4)])
+
+
+def unit_dict(unit_type, layer=0, attribute=0, dependencies=(), payload=b""):
+    names = ("unit_type", "layer", "attribute", "dependencies", "payload")
+    return dict(zip(names, (unit_type, layer, attribute, list(dependencies), payload), strict=True))
+
+
+def add_unknown_units(units):
+    units.append(unit_dict(200, attribute=17, dependencies=[1], payload=b"from later"))
+    units.append(unit_dict(255, layer=3))
+    units.append(unit_dict(255, layer=3))
+    units.append(unit_dict(10, layer=3, payload=bytes(100)))
+
+
+def find_unit(units, unit_type, attribute=0):
+    return next(u for u in units if (u["unit_type"], u["attribute"]) == (unit_type, attribute))
+
+
+def remove_unit(unit_type, attribute=0):
+    """The base group without a unit that nothing depends on, or without any dependency on it."""
+
+    def edit(units):
+        index = units.index(find_unit(units, unit_type, attribute))
+        del units[index]
+        for u in units:
+            u["dependencies"] = [d - (d > index) for d in u["dependencies"] if d != index]
+
+    return lambda: units_file(edit)
+
+
+def change_unit(unit_type, attribute=0, /, **fields):
+    return lambda: units_file(lambda units: find_unit(units, unit_type, attribute).update(fields))
+
+
+def change_payload(unit_type, attribute, edit):
+    def change(units):
+        unit = find_unit(units, unit_type, attribute)
+        unit["payload"] = edit(unit["payload"])
+
+    return lambda: units_file(change)
+
+
+def insert(*units):
+    return lambda: units_file(lambda others: others.extend(units))
+
+
+HEADER = {
+    "frames": 4,
+    "flags": 0,
+    "origin": (0.0, 0.0, 0.0),
+    "grid_step": 0.01,
+    "grid_bits": 10,
+    "sh_degree": 0,
+    "layer_count": 1,
+    "layer_counts": [(40, 2)],
+    "channels": [(a, [(0.1, 0.0)] * c) for a, c in ((2, 3), (3, 3), (4, 1), (5, 3))],
+    "trajectories": [(1, 2, 0.1), (5, 2, 0.1)],
+    "node_count": 3,
+    "neighbors": 4,
+    "coefficients": 4,
+    "rotation_step": 0.1,
+    "translation_step": 0.1,
+}
+
+
+def pack_header(**changes):
+    h = HEADER | changes
+    data = struct.pack(">HB", h["frames"], h["flags"])
+    data += struct.pack(">H", h["reference"]) if "reference" in h else b""
+    data += struct.pack(">3ffBBB", *h["origin"], h["grid_step"], h["grid_bits"], h["sh_degree"], h["layer_count"])
+    data += b"".join(struct.pack(">IB", *layer) for layer in h["layer_counts"]) + bytes([len(h["channels"])])
+    for attribute, pairs in h["channels"]:
+        data += bytes([attribute]) + b"".join(struct.pack(">ff", *pair) for pair in pairs)
+    data += bytes([len(h["trajectories"])]) + b"".join(struct.pack(">BHf", *t) for t in h["trajectories"])
+    data += struct.pack(">I", h["node_count"])
+    if h["node_count"]:
+        data += struct.pack(
+            ">BHff", *(h[k] for k in ("neighbors", "coefficients", "rotation_step", "translation_step"))
+        )
+    return data
+
+
+def header(duration=4, **changes):
+    """The base group under another header; a check of the header comes before its other units are looked at."""
+    return lambda: units_file(lambda units: units[0].update(payload=pack_header(**changes)), frames=duration)
+
+
+def traj(*trajectories):
+    return header(trajectories=list(trajectories))
+
+
+def patched(kind, offset, new):
+    """A file with bytes changed at an offset from the body of the first box of a type."""
+
+    def build():
+        data = groups_file(base_group(), cameras=[CAMERA])
+        return poke(data, data.index(kind) + 4 + offset, new)
+
+    return build
+
+
+def other_top(edit):
+    """A file with its list of top-level boxes edited."""
+
+    def build():
+        parts = split_boxes(groups_file(base_group()))
+        return b"".join(whole for _, whole in edit(parts) or parts)
+
+    return build
+
+
+def f32(value):
+    return struct.pack(">f", value)
+
+
+def u32(value):
+    return struct.pack(">I", value)
+
+
+def poke_duration(frame_duration, wrong):
+    data = groups_file(base_group(), fps=(30000, frame_duration))
+    return poke(data, data.index(b"trun") + 16, u32(wrong))
+
+
+def poke_time(frame_duration, wrong):
+    data = groups_file(base_group(), fps=(30000, frame_duration))
+    return poke(data, data.index(b"tfdt") + 8, struct.pack(">Q", wrong))
+
+
+def left_over_empty():
+    """N = 0: nothing is decoded, so a payload of five bytes has one left over."""
+    units = split_units(encode(make_group(0, 4)))
+    find_unit(units, 1)["payload"] = bytes(5)
+    return make_file([(join_units(units), 4)])
