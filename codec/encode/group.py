@@ -21,8 +21,8 @@ from gscodec.gaussians import Group
 
 GRID_BITS_MAX = 21
 ALPHA_MIN = 1 / 255  # what the renderer does not draw (spec: "The picture")
-PRUNE_SHARE = 2e-3  # share of opacity x area that may go; 10 % of the statue's Gaussians hold less
-DEAD_ZONE = 0.7  # in steps; jitter of a trainer stays below it
+PRUNE_SHARE = 5e-4  # share of opacity x area that may go; 8 % of the statue's Gaussians hold less
+DEAD_ZONE = 0.6  # in steps; jitter of a trainer stays below it
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from gscodec.bitstream.transform import dct_basis
 
 NEIGHBORS = 4  # nodes that a Gaussian blends
 NODE_COUNTS = (1, 16, 64, 256, 1024)
-NODE_BITS = 150.0  # what one more node costs in a group of 20 frames, measured on statue
+NODE_BITS = 50.0  # what one more node costs in a group of 20 frames, measured on statue
 RIDGE = 1e-3  # pull of a node's translation towards its own Kabsch solution
 
 
