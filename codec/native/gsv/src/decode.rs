@@ -83,17 +83,17 @@ fn place(group: &mut Group, header: &Header, attribute: Option<Attribute>, part:
     match part {
         Part::Lifetimes(l) => group.lifetimes = Some(l),
         Part::Channels(v) => {
-            let slots = header.attributes().iter().zip(&mut group.channels);
-            slots
-                .filter(|(a, _)| Some(**a) == attribute)
-                .for_each(|(_, slot)| slot.clone_from(&v));
+            let mut slots = header.attributes().iter().zip(&mut group.channels);
+            if let Some((_, slot)) = slots.find(|(a, _)| Some(**a) == attribute) {
+                *slot = v;
+            }
         }
         Part::Trajectories(t) if attribute.is_none() => group.node_trajectories = t,
         Part::Trajectories(t) => {
-            let slots = header.trajectories.iter().zip(&mut group.trajectories);
-            slots
-                .filter(|(h, _)| Some(h.attribute) == attribute)
-                .for_each(|(_, slot)| slot.clone_from(&t));
+            let mut slots = header.trajectories.iter().zip(&mut group.trajectories);
+            if let Some((_, slot)) = slots.find(|(h, _)| Some(h.attribute) == attribute) {
+                *slot = t;
+            }
         }
     }
 }

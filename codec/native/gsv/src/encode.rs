@@ -41,9 +41,9 @@ pub fn encode_group(group: &Group) -> Result<Vec<u8>> {
     let mut header = Writer::default();
     group.header.clone().fields(&mut header)?;
     let mut out = Vec::new();
-    unit::write(&mut out, UnitType::GroupHeader as u8, 0, &[], &header.0)?;
+    unit::write(&mut out, [UnitType::GroupHeader as u8, 0, 0], &[], &header.0)?;
     for (u, payload) in units.iter().zip(&payloads) {
-        unit::write(&mut out, u.kind as u8, u.attribute, u.needs.as_slice(), payload)?;
+        unit::write(&mut out, [u.kind as u8, 0, u.attribute], u.needs.as_slice(), payload)?;
     }
     Ok(out)
 }

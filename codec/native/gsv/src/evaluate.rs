@@ -10,6 +10,7 @@ use crate::trajectories::Trajectories;
 use rayon::prelude::*;
 
 type Quat = [f32; 4]; // wxyz
+const CHANNELS_MAX: usize = 45; // of shN at degree 3
 
 /// Attributes of all N Gaussians in one frame, in the layout of `codec.gaussians.Gaussians`.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -124,8 +125,7 @@ impl Evaluator {
     fn move_with_nodes(&self, basis: &[f32], frame: &mut Frame) {
         let h = &self.group.header.nodes;
         let pose = |(j, n): (usize, &[f32; 3])| {
-            let d = transform(self.group.node_trajectories.get(j), 6, basis);
-            let [rx, ry, rz, tx, ty, tz] = [0, 1, 2, 3, 4, 5].map(|c| d.get(c).copied().unwrap_or(0.0));
+            let [rx, ry, rz, tx, ty, tz] = transform(self.group.node_trajectories.get(j), 6, basis);
             let q = from_rotation_vector([rx, ry, rz].map(|v| v * h.rotation_step));
             Pose {
                 q,
@@ -151,19 +151,24 @@ impl Motion {
     fn add(&self, basis: &[f32], values: &mut [f32], channels: usize) {
         let colour = matches!(self.attribute, Attribute::Sh0 | Attribute::ShN);
         for &i in &self.moving {
-            let mut d = transform(self.coefficients.get(i as usize), channels, basis);
+            let mut d: [f32; CHANNELS_MAX] = transform(self.coefficients.get(i as usize), channels, basis);
             if colour {
-                d.as_chunks_mut().0.iter_mut().for_each(|c| *c = rgb(*c));
+                d.as_chunks_mut()
+                    .0
+                    .iter_mut()
+                    .take(channels / 3)
+                    .for_each(|c| *c = rgb(*c));
             }
-            let own = values.iter_mut().skip(i as usize * channels);
-            own.zip(&d).for_each(|(v, d)| *v += self.step * d);
+            let from = i as usize * channels;
+            let own = values.get_mut(from..from + channels).unwrap_or_default();
+            own.iter_mut().zip(&d).for_each(|(v, d)| *v += self.step * d);
         }
     }
 
     fn turn(&self, basis: &[f32], quats: &mut [Quat]) {
         for &i in &self.moving {
-            let d = transform(self.coefficients.get(i as usize), 3, basis);
-            if let (Some(q), Some(d)) = (quats.get_mut(i as usize), d.first_chunk::<3>()) {
+            let d: [f32; 3] = transform(self.coefficients.get(i as usize), 3, basis);
+            if let Some(q) = quats.get_mut(i as usize) {
                 *q = normalize(multiply(unit(d.map(|v| v * self.step)), *q));
             }
         }
@@ -235,9 +240,9 @@ fn basis(frames: u16, t: u16) -> Vec<f32> {
     (0..frames).map(at).collect()
 }
 
-/// Sum over frequencies, per channel.
-fn transform(coefficients: &[i32], channels: usize, basis: &[f32]) -> Vec<f32> {
-    let mut sum = vec![0.0; channels];
+/// Sum over frequencies, per channel; the channels that an attribute lacks are 0.
+fn transform<const C: usize>(coefficients: &[i32], channels: usize, basis: &[f32]) -> [f32; C] {
+    let mut sum = [0.0; C];
     for (row, b) in coefficients.chunks(channels.max(1)).zip(basis) {
         row.iter().zip(&mut sum).for_each(|(v, s)| *s += *v as f32 * b);
     }

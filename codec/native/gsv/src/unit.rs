@@ -192,10 +192,10 @@ fn check(unit: &Unit, before: &[Unit]) -> std::result::Result<(), String> {
     }
 }
 
-/// Appends a unit of layer 0; `dependencies` are indices of earlier units.
-pub fn write(out: &mut Vec<u8>, number: u8, attribute: u8, dependencies: &[u8], payload: &[u8]) -> Result<()> {
+/// Appends a unit; `id` is its type, layer and attribute, `dependencies` are indices of earlier units. Nothing is checked.
+pub fn write(out: &mut Vec<u8>, id: [u8; 3], dependencies: &[u8], payload: &[u8]) -> Result<()> {
     let length = u32::try_from(payload.len()).map_err(|_| Error::Input("a unit of more than 4 GiB".into()))?;
-    let mut w = Writer(vec![number, 0, attribute, dependencies.len() as u8]);
+    let mut w = Writer([&id[..], &[dependencies.len() as u8]].concat());
     w.0.extend_from_slice(dependencies);
     w.0.extend_from_slice(&length.to_be_bytes());
     let crc = crc32(&[&w.0, payload]);

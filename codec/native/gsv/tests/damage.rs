@@ -119,7 +119,7 @@ fn header_only(g: &gsv::group::Group) -> Vec<u8> {
     let mut w = gsv::fields::Writer::default();
     g.header.clone().fields(&mut w).unwrap();
     let mut out = Vec::new();
-    unit::write(&mut out, 0, 0, &[], &w.0).unwrap();
+    unit::write(&mut out, [0; 3], &[], &w.0).unwrap();
     out
 }
 
@@ -146,7 +146,7 @@ fn later_versions() {
         let mut header = unit::split(&payload).unwrap()[0].payload.to_vec();
         header[flags - unit::split(&payload).unwrap()[0].payload_offset] = bit;
         let mut bad = Vec::new();
-        unit::write(&mut bad, 0, 0, &[], &header).unwrap();
+        unit::write(&mut bad, [0; 3], &[], &header).unwrap();
         let message = decode_group(&bad, &level()).unwrap_err().to_string();
         assert!(
             message.contains(tool) && message.contains("not yet supported"),
@@ -155,14 +155,7 @@ fn later_versions() {
     }
     for (number, ok) in [(7, false), (8, false), (9, false), (10, true), (255, true)] {
         let mut more = payload.clone();
-        unit::write(
-            &mut more,
-            number,
-            if number == 7 || number == 9 { 2 } else { 0 },
-            &[],
-            b"later",
-        )
-        .unwrap();
+        unit::write(&mut more, [number, 0, u8::from(number % 2 == 1) * 2], &[], b"later").unwrap();
         let result = decode_group(&more, &level());
         assert_eq!(result.is_ok(), ok, "{number}");
         if !ok {
@@ -178,7 +171,7 @@ fn broken_units() {
     let first = unit::split(&payload).unwrap()[0].size;
     let with = |number, attribute, dependencies: &[u8], part: &str| {
         let mut bad = payload[..first].to_vec();
-        unit::write(&mut bad, number, attribute, dependencies, b"").unwrap();
+        unit::write(&mut bad, [number, 0, attribute], dependencies, b"").unwrap();
         let message = decode_group(&bad, &level()).unwrap_err().to_string();
         assert!(message.contains(part), "{message}");
     };

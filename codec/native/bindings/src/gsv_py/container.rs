@@ -1,0 +1,204 @@
+//! Config dicts <-> the container: init segment, fragments, index, demuxer.
+
+use super::values::{bytes_of, invalid, item, optional, raise, value};
+use gsv::container::config::{COLOR_SPACES, Camera, Config, SH_FRAMES, UP_AXES, rate};
+use gsv::container::demux::Demuxer;
+use gsv::container::write::{self, Reference};
+use gsv::error::Error;
+use gsv::levels::Level;
+use numpy::{IntoPyArray, PyArrayMethods};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::{PyBytes, PyDict, PyList};
+
+fn config_from(py: Python, d: &Bound<PyDict>) -> PyResult<Config> {
+    let fps = item(d, "fps")?;
+    let (timescale, frame_duration) = match fps.extract::<(u32, u32)>() {
+        Ok((n, d)) if n > 0 && d > 0 => (n, d),
+        Ok(_) => return invalid(format!("fps: expected a positive rational, got {fps}")),
+        Err(_) => rate(value(d, "fps")?).map_err(|e| raise(py, e))?,
+    };
+    let choice = |key: &str, names: &[&str]| -> PyResult<u8> {
+        let v: String = value(d, key)?;
+        match names.iter().position(|n| *n == v) {
+            Some(i) => Ok(i as u8),
+            None => invalid(format!("{key}: expected one of {}, got '{v}'", names.join(", "))),
+        }
+    };
+    let mut config = Config {
+        timescale,
+        frame_duration,
+        level: value(d, "level")?,
+        metres_per_unit: value(d, "metres_per_unit")?,
+        up_axis: choice("up", &UP_AXES)?,
+        color_space: choice("color_space", &COLOR_SPACES)?,
+        background: value(d, "background")?,
+        sh_degree: value(d, "sh_degree")?,
+        sh_frame: choice("sh_frame", &SH_FRAMES)?,
+        cameras: Vec::new(),
+    };
+    Level::get(config.level).map_err(|e| PyValueError::new_err(e.to_string()))?;
+    if let Some(cameras) = optional(d, "cameras")? {
+        for c in cameras.try_iter()? {
+            config.cameras.push(camera_from(&c?.extract()?)?);
+        }
+    }
+    Ok(config)
+}
+
+fn camera_from(d: &Bound<PyDict>) -> PyResult<Camera> {
+    let np = d.py().import("numpy")?;
+    let matrix = |key: &str, n: usize| -> PyResult<Vec<f64>> {
+        let a = np.call_method1("asarray", (item(d, key)?, "float64"))?;
+        if a.getattr("shape")?.extract::<Vec<usize>>()? != [n, n] {
+            return invalid(format!("camera {key}: expected shape [{n}, {n}]"));
+        }
+        a.call_method0("ravel")?.call_method0("tolist")?.extract()
+    };
+    let (k, v) = (matrix("K", 3)?, matrix("viewmat", 4)?);
+    if [k[3], k[6], k[7], k[8]] != [0.0, 0.0, 0.0, 1.0] {
+        return invalid("camera K: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]]".into());
+    }
+    if v[12..] != [0.0, 0.0, 0.0, 1.0] {
+        return invalid("camera viewmat: expected a last row of 0, 0, 0, 1".into());
+    }
+    Ok(Camera {
+        name: value(d, "name")?,
+        width: value(d, "width")?,
+        height: value(d, "height")?,
+        k: [k[0], k[1], k[2], k[4], k[5]].map(|v| v as f32),
+        viewmat: std::array::from_fn(|i| v[i] as f32),
+    })
+}
+
+fn config_into<'py>(py: Python<'py>, c: &Config) -> PyResult<Bound<'py, PyDict>> {
+    let name = |names: &[&'static str], i: u8| names.get(usize::from(i)).copied();
+    let d = PyDict::new(py);
+    d.set_item("fps", (c.timescale, c.frame_duration))?;
+    d.set_item("level", c.level)?;
+    d.set_item("metres_per_unit", c.metres_per_unit)?;
+    d.set_item("up", name(&UP_AXES, c.up_axis))?;
+    d.set_item("color_space", name(&COLOR_SPACES, c.color_space))?;
+    d.set_item("background", c.background.to_vec())?;
+    d.set_item("sh_degree", c.sh_degree)?;
+    d.set_item("sh_frame", name(&SH_FRAMES, c.sh_frame))?;
+    let cameras = PyList::empty(py);
+    for c in &c.cameras {
+        let [fx, skew, cx, fy, cy] = c.k.map(f64::from);
+        let mut v: Vec<f64> = c.viewmat.iter().map(|v| f64::from(*v)).collect();
+        v.extend([0.0, 0.0, 0.0, 1.0]);
+        let one = PyDict::new(py);
+        one.set_item("name", &c.name)?;
+        one.set_item(
+            "K",
+            vec![fx, skew, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+                .into_pyarray(py)
+                .reshape([3, 3])?,
+        )?;
+        one.set_item("viewmat", v.into_pyarray(py).reshape([4, 4])?)?;
+        one.set_item("width", c.width)?;
+        one.set_item("height", c.height)?;
+        cameras.append(one)?;
+    }
+    d.set_item("cameras", cameras)?;
+    Ok(d)
+}
+
+/// ftyp and moov: what opens a file.
+#[pyfunction]
+pub fn init_segment<'py>(py: Python<'py>, config: &Bound<'py, PyDict>) -> PyResult<Bound<'py, PyBytes>> {
+    let out = write::init_segment(&config_from(py, config)?).map_err(|e| raise(py, e))?;
+    Ok(PyBytes::new(py, &out))
+}
+
+/// moof and mdat of one group; sequence numbers count from 1, frames from 0.
+#[pyfunction]
+pub fn fragment<'py>(
+    py: Python<'py>,
+    payload: &Bound<'py, PyAny>,
+    sequence_number: u32,
+    start_frame: u64,
+    frames: u32,
+    sync: bool,
+    config: &Bound<'py, PyDict>,
+) -> PyResult<Bound<'py, PyBytes>> {
+    let config = config_from(py, config)?;
+    let out = write::fragment(
+        bytes_of(payload)?.as_slice()?,
+        sequence_number,
+        start_frame,
+        frames,
+        sync,
+        &config,
+    )
+    .map_err(|e| raise(py, e))?;
+    Ok(PyBytes::new(py, &out))
+}
+
+/// What precedes the fragments of a finished file: `init` and an index of (fragment size, frames, sync).
+#[pyfunction]
+pub fn finish<'py>(
+    py: Python<'py>,
+    init: &Bound<'py, PyAny>,
+    index: Vec<(u64, u32, bool)>,
+) -> PyResult<Bound<'py, PyBytes>> {
+    let mut demuxer = Demuxer::default();
+    let init = bytes_of(init)?;
+    let init = init.as_slice()?;
+    demuxer.push(init).map_err(|e| raise(py, e))?;
+    let Some(config) = demuxer.config() else {
+        return invalid("expected an init segment".into());
+    };
+    let groups: Vec<Reference> = index
+        .into_iter()
+        .map(|(size, frames, sync)| Reference { size, frames, sync })
+        .collect();
+    let out = write::finish(init, config, &groups).map_err(|e| raise(py, e))?;
+    Ok(PyBytes::new(py, &out))
+}
+
+/// Bytes that the demuxer is shown at a time between the boxes that it passes over.
+const LOOK: usize = 4096;
+
+/// Config and groups of a file in any object with the buffer protocol; only headers are read.
+#[pyfunction]
+pub fn demux<'py>(py: Python<'py>, buffer: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyDict>> {
+    let data = bytes_of(buffer)?;
+    let data = data.as_slice()?;
+    let mut demuxer = Demuxer::default();
+    let mut at = 0;
+    while at < data.len() {
+        let skip = usize::try_from(demuxer.skippable())
+            .unwrap_or(usize::MAX)
+            .min(data.len() - at);
+        if skip > 0 {
+            demuxer.skip(skip as u64);
+            at += skip;
+            continue;
+        }
+        let to = data.len().min(at + LOOK);
+        demuxer.push(&data[at..to]).map_err(|e| raise(py, e))?;
+        at = to;
+    }
+    let Some(config) = demuxer.config() else {
+        return Err(raise(
+            py,
+            Error::bitstream(at, "file", "a moov box, found the end of the data"),
+        ));
+    };
+    let d = PyDict::new(py);
+    d.set_item("config", config_into(py, config)?)?;
+    let groups = PyList::empty(py);
+    for g in demuxer.groups() {
+        let one = PyDict::new(py);
+        one.set_item("offset", g.offset)?;
+        one.set_item("size", g.size)?;
+        one.set_item("start_frame", g.start_frame)?;
+        one.set_item("frames", g.frames)?;
+        one.set_item("sync", g.sync)?;
+        groups.append(one)?;
+    }
+    d.set_item("groups", groups)?;
+    d.set_item("complete", demuxer.complete())?;
+    Ok(d)
+}

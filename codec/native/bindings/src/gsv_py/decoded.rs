@@ -1,0 +1,201 @@
+//! DecodedGroup: a payload -> integers in the form that encode_group takes, and attributes of frames.
+
+use super::values::{bytes_of, raise};
+use gsv::attributes::sh_coefficients;
+use gsv::evaluate::{Evaluator, Frame};
+use gsv::levels::Level;
+use gsv::map::Map;
+use gsv::trajectories::Trajectories;
+use gsv::unit;
+use numpy::ndarray::{Array2, Array3};
+use numpy::{IntoPyArray, PyArray1, PyArrayMethods};
+use pyo3::exceptions::PyIndexError;
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyList};
+
+/// A decoded group: integers, and f32 attributes of any frame.
+#[pyclass(frozen, module = "gscodec._native")]
+pub struct DecodedGroup {
+    evaluator: Evaluator,
+    units: Vec<(String, Option<&'static str>, u8, usize, usize)>,
+}
+
+#[pymethods]
+impl DecodedGroup {
+    #[new]
+    fn new(py: Python, payload: &Bound<PyAny>, level: u8) -> PyResult<Self> {
+        let bytes = bytes_of(payload)?.as_slice()?.to_vec(); // ours while the GIL is released
+        let decoded = py.detach(|| {
+            let group = gsv::decode::decode_group(&bytes, &Level::get(level)?)?;
+            let units = unit::split(&bytes)?;
+            let label = |u: &unit::Unit| u.kind.map_or("unknown", |k| k.name()).to_string();
+            let units = units
+                .iter()
+                .map(|u| (label(u), u.attribute.map(|a| a.name()), u.layer, u.offset, u.size));
+            Ok(DecodedGroup {
+                units: units.collect(),
+                evaluator: Evaluator::new(group),
+            })
+        });
+        decoded.map_err(|e| raise(py, e))
+    }
+
+    #[getter]
+    fn frames(&self) -> u16 {
+        self.evaluator.group().header.frames
+    }
+
+    #[getter]
+    fn count(&self) -> u32 {
+        self.evaluator.group().header.count
+    }
+
+    #[getter]
+    fn sh_degree(&self) -> u8 {
+        self.evaluator.group().header.sh_degree
+    }
+
+    /// The group as encode_group takes it.
+    fn integers<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        integers(py, &self.evaluator)
+    }
+
+    /// Attributes of frame `t` of all Gaussians, f32.
+    fn frame<'py>(&self, py: Python<'py>, t: u16) -> PyResult<Bound<'py, PyDict>> {
+        self.check(t)?;
+        let mut frame = Frame::default();
+        py.detach(|| self.evaluator.frame(t, &mut frame));
+        let n = self.count() as usize;
+        let k = sh_coefficients(self.sh_degree());
+        let d = PyDict::new(py);
+        let flat = |v: Vec<[f32; 3]>| v.into_flattened().into_pyarray(py).reshape([n, 3]);
+        d.set_item("means", flat(frame.means)?)?;
+        d.set_item("quats", frame.quats.into_flattened().into_pyarray(py).reshape([n, 4])?)?;
+        d.set_item("log_scales", frame.log_scales.into_pyarray(py).reshape([n, 3])?)?;
+        d.set_item("logit_opacities", frame.logit_opacities.into_pyarray(py))?;
+        d.set_item("sh0", frame.sh0.into_pyarray(py).reshape([n, 3])?)?;
+        d.set_item("shN", frame.sh_n.into_pyarray(py).reshape([n, k, 3])?)?;
+        Ok(d)
+    }
+
+    /// [N] bool: which Gaussians frame `t` shows; None: all.
+    fn visible<'py>(&self, py: Python<'py>, t: u16) -> PyResult<Option<Bound<'py, PyArray1<bool>>>> {
+        self.check(t)?;
+        Ok(self.evaluator.visible(t).map(|v| v.into_pyarray(py)))
+    }
+
+    /// What the payload consists of.
+    fn units<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
+        let list = PyList::empty(py);
+        for (kind, attribute, layer, offset, bytes) in &self.units {
+            let d = PyDict::new(py);
+            d.set_item("type", kind)?;
+            d.set_item("attribute", attribute)?;
+            d.set_item("layer", layer)?;
+            d.set_item("offset", offset)?;
+            d.set_item("bytes", bytes)?;
+            list.append(d)?;
+        }
+        Ok(list)
+    }
+
+    /// Attribute maps (spec 7.2): name of the channel -> [H, W] i32; cells without a Gaussian are 0.
+    fn maps<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let group = self.evaluator.group();
+        let map = Map::new(group.positions.len());
+        let d = PyDict::new(py);
+        for a in 0..3 {
+            d.set_item(
+                format!("means_{a}"),
+                map.arrange(|i| group.positions[i][a] as i32)
+                    .into_pyarray(py)
+                    .reshape([map.height, map.width])?,
+            )?;
+        }
+        for (a, values) in group.header.attributes().iter().zip(&group.channels) {
+            let channels = a.channels(group.header.sh_degree);
+            for c in 0..channels {
+                let cells = map.arrange(|i| values[i * channels + c]);
+                d.set_item(
+                    format!("{}_{c}", a.name()),
+                    cells.into_pyarray(py).reshape([map.height, map.width])?,
+                )?;
+            }
+        }
+        Ok(d)
+    }
+}
+
+impl DecodedGroup {
+    fn check(&self, t: u16) -> PyResult<()> {
+        if t < self.frames() {
+            return Ok(());
+        }
+        Err(PyIndexError::new_err(format!(
+            "frame {t} of a group of {}",
+            self.frames()
+        )))
+    }
+}
+
+fn grid<'py>(py: Python<'py>, p: &[[u32; 3]]) -> PyResult<Bound<'py, PyAny>> {
+    Ok(p.as_flattened()
+        .to_vec()
+        .into_pyarray(py)
+        .reshape([p.len(), 3])?
+        .into_any())
+}
+
+fn dense<'py>(py: Python<'py>, t: &Trajectories, k: u16) -> Bound<'py, PyAny> {
+    let c = t.channels;
+    let mut a = Array3::<i32>::zeros((usize::from(k), c, t.len()));
+    for i in 0..t.len() {
+        t.get(i).iter().enumerate().for_each(|(j, v)| a[[j / c, j % c, i]] = *v);
+    }
+    a.into_pyarray(py).into_any()
+}
+
+fn integers<'py>(py: Python<'py>, e: &Evaluator) -> PyResult<Bound<'py, PyDict>> {
+    let (g, h) = (e.group(), &e.group().header);
+    let d = PyDict::new(py);
+    d.set_item("frames", h.frames)?;
+    d.set_item("origin", h.origin.to_vec())?;
+    d.set_item("grid_step", h.grid_step)?;
+    d.set_item("grid_bits", h.grid_bits)?;
+    d.set_item("positions", grid(py, &g.positions)?)?;
+    let channels = PyDict::new(py);
+    for ((a, values), scale) in h.attributes().iter().zip(&g.channels).zip(&h.scales) {
+        let c = scale.steps.len();
+        let planes = Array2::from_shape_fn((c, g.positions.len()), |(k, i)| values[i * c + k]);
+        let one = PyDict::new(py);
+        one.set_item("values", planes.into_pyarray(py))?;
+        one.set_item("steps", scale.steps.clone())?;
+        one.set_item("offsets", scale.offsets.clone())?;
+        channels.set_item(a.name(), one)?;
+    }
+    d.set_item("channels", channels)?;
+    let trajectories = PyDict::new(py);
+    for (head, t) in h.trajectories.iter().zip(e.trajectories()) {
+        let one = PyDict::new(py);
+        one.set_item("coefficients", dense(py, t, head.coefficients))?;
+        one.set_item("step", head.step)?;
+        trajectories.set_item(head.attribute.name(), one)?;
+    }
+    d.set_item("trajectories", trajectories)?;
+    if let Some(l) = &g.lifetimes {
+        d.set_item(
+            "lifetimes",
+            l.as_flattened().to_vec().into_pyarray(py).reshape([l.len(), 2])?,
+        )?;
+    }
+    if h.nodes.count > 0 {
+        let one = PyDict::new(py);
+        one.set_item("positions", grid(py, &g.node_positions)?)?;
+        one.set_item("coefficients", dense(py, &g.node_trajectories, h.nodes.coefficients))?;
+        one.set_item("rotation_step", h.nodes.rotation_step)?;
+        one.set_item("translation_step", h.nodes.translation_step)?;
+        one.set_item("neighbors", h.nodes.neighbors)?;
+        d.set_item("nodes", one)?;
+    }
+    Ok(d)
+}

@@ -1,0 +1,158 @@
+//! A dict of planar integer arrays -> a group.
+
+use super::values::{array, invalid, item, optional, points, value};
+use gsv::attributes::{Attribute, sh_coefficients};
+use gsv::group::Group;
+use gsv::header::{Header, NodeHeader, Scale, TrajectoryHeader};
+use gsv::trajectories::Trajectories;
+use numpy::{PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+pub fn group_from(d: &Bound<PyDict>) -> PyResult<Group> {
+    let positions = points(d, "positions")?;
+    let channels: Bound<PyDict> = value(d, "channels")?;
+    let mut header = Header {
+        frames: value(d, "frames")?,
+        origin: value(d, "origin")?,
+        grid_step: value(d, "grid_step")?,
+        grid_bits: value(d, "grid_bits")?,
+        count: positions.len() as u32,
+        sh_degree: sh_degree(&channels)?,
+        ..Header::default()
+    };
+    let mut group = Group {
+        positions,
+        ..Group::default()
+    };
+    for a in header.attributes() {
+        let c: Bound<PyDict> = value(&channels, a.name())?;
+        let width = a.channels(header.sh_degree);
+        group.channels.push(planar(
+            &array(&c, "values", "int32")?,
+            a.name(),
+            width,
+            group.positions.len(),
+        )?);
+        let (steps, offsets): (Vec<f32>, Vec<f32>) = (value(&c, "steps")?, value(&c, "offsets")?);
+        if steps.len() != width || offsets.len() != width {
+            return invalid(format!("{}: expected {width} steps and offsets", a.name()));
+        }
+        header.scales.push(Scale { steps, offsets });
+    }
+    if let Some(t) = optional(d, "trajectories")? {
+        let t: Bound<PyDict> = t.extract()?;
+        motion_from(&t, &mut header, &mut group)?;
+    }
+    if let Some(n) = optional(d, "nodes")? {
+        let n: Bound<PyDict> = n.extract()?;
+        nodes_from(&n, &mut header, &mut group)?;
+    }
+    if optional(d, "lifetimes")?.is_some() {
+        let a = array(d, "lifetimes", "uint16")?;
+        let Ok(a) = a.extract::<PyReadonlyArray2<u16>>() else {
+            return invalid("lifetimes: expected shape [N, 2]".into());
+        };
+        if a.shape()[1] != 2 {
+            return invalid(format!("lifetimes: expected shape [N, 2], got {:?}", a.shape()));
+        }
+        group.lifetimes = Some(a.as_array().outer_iter().map(|r| [r[0], r[1]]).collect());
+    }
+    group.header = header;
+    Ok(group)
+}
+
+fn sh_degree(channels: &Bound<PyDict>) -> PyResult<u8> {
+    for key in channels.keys().iter() {
+        let name: String = key.extract()?;
+        if !Attribute::canonical(3).iter().any(|a| a.name() == name) {
+            return invalid(format!("channels: unknown attribute '{name}'"));
+        }
+    }
+    let Some(sh) = optional(channels, "shN")? else {
+        return Ok(0);
+    };
+    let sh: Bound<PyDict> = sh.extract()?;
+    let width: usize = item(&sh, "values")?.len()?;
+    match (0..=3u8).find(|d| 3 * sh_coefficients(*d) == width) {
+        Some(d) => Ok(d),
+        None => invalid(format!("shN: expected 0, 9, 24 or 45 channels, got {width}")),
+    }
+}
+
+/// [C, N] -> C per Gaussian.
+fn planar(a: &Bound<PyAny>, name: &str, channels: usize, count: usize) -> PyResult<Vec<i32>> {
+    let Ok(a) = a.extract::<PyReadonlyArray2<i32>>() else {
+        return invalid(format!("{name}: expected shape [C, N]"));
+    };
+    if a.shape() != [channels, count] {
+        return invalid(format!(
+            "{name}: expected shape [{channels}, {count}], got {:?}",
+            a.shape()
+        ));
+    }
+    Ok(a.as_array().t().iter().copied().collect())
+}
+
+fn motion_from(t: &Bound<PyDict>, header: &mut Header, group: &mut Group) -> PyResult<()> {
+    for key in t.keys().iter() {
+        let name: String = key.extract()?;
+        if !Attribute::ALL.iter().any(|a| a.name() == name) {
+            return invalid(format!("trajectories: unknown attribute '{name}'"));
+        }
+    }
+    for attribute in Attribute::ALL {
+        let Some(a) = optional(t, attribute.name())? else {
+            continue;
+        };
+        let a: Bound<PyDict> = a.extract()?;
+        let channels = attribute.channels(header.sh_degree);
+        let (coefficients, out) = coefficients(&a, attribute.name(), channels, group.positions.len())?;
+        header.trajectories.push(TrajectoryHeader {
+            attribute,
+            coefficients,
+            step: value(&a, "step")?,
+        });
+        group.trajectories.push(out);
+    }
+    Ok(())
+}
+
+/// `coefficients` [K, C, N] -> K and sparse trajectories.
+fn coefficients(d: &Bound<PyDict>, name: &str, channels: usize, count: usize) -> PyResult<(u16, Trajectories)> {
+    let a = array(d, "coefficients", "int32")?;
+    let Ok(a) = a.extract::<PyReadonlyArray3<i32>>() else {
+        return invalid(format!("trajectories of {name}: expected shape [K, C, N]"));
+    };
+    let &[k, c, n] = a.shape() else {
+        return invalid(format!("trajectories of {name}: expected shape [K, C, N]"));
+    };
+    if (c, n) != (channels, count) || k == 0 || k > usize::from(u16::MAX) {
+        return invalid(format!(
+            "trajectories of {name}: expected shape [K, {channels}, {count}], got {:?}",
+            a.shape()
+        ));
+    }
+    let view = a.as_array();
+    let flat: Vec<i32> = view.permuted_axes([2, 0, 1]).iter().copied().collect();
+    let mut out = Trajectories::new(channels);
+    (0..n).for_each(|i| out.push(flat.get(i * k * c..(i + 1) * k * c).unwrap_or(&[])));
+    Ok((k as u16, out))
+}
+
+fn nodes_from(d: &Bound<PyDict>, header: &mut Header, group: &mut Group) -> PyResult<()> {
+    group.node_positions = points(d, "positions")?;
+    if group.node_positions.is_empty() {
+        return Ok(());
+    }
+    let (k, t) = coefficients(d, "nodes", 6, group.node_positions.len())?;
+    group.node_trajectories = t;
+    header.nodes = NodeHeader {
+        count: group.node_positions.len() as u32,
+        neighbors: value(d, "neighbors")?,
+        coefficients: k,
+        rotation_step: value(d, "rotation_step")?,
+        translation_step: value(d, "translation_step")?,
+    };
+    Ok(())
+}

@@ -1,0 +1,401 @@
+"""The bitstream core through its Python face: integers survive, damage is named, the container can be cut and split."""
+
+from __future__ import annotations
+
+import mmap
+import threading
+
+import numpy as np
+import pytest
+from gscodec import _native
+from gscodec.bitstream import attributes
+from gscodec.bitstream.levels import LEVELS, smallest_level
+from gscodec.errors import BitstreamError, LimitError
+
+CAMERA = {"name": "cam00", "K": [[500, 0, 320], [0, 510, 240], [0, 0, 1]], "viewmat": np.eye(4)}
+CONFIG = {
+    "fps": 29.97,
+    "level": 2,
+    "metres_per_unit": 1.0,
+    "up": "-y",
+    "color_space": "srgb",
+    "background": [0.0, 0.5, 1.0],
+    "sh_degree": 0,
+    "sh_frame": "world",
+    "cameras": [{**CAMERA, "width": 640, "height": 480}],
+}
+
+
+def surface_group(n=4000, frames=1, sh_coefficients=0, seed=0):
+    """A group like a scan: points on a bumpy sphere, attributes that vary over it and noise."""
+    rng = np.random.default_rng(seed)
+    v = rng.normal(size=(n, 3))
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    r = 400 + 40 * np.sin(4 * v[:, :1]) + rng.normal(size=(n, 1))
+    p = np.clip(np.rint(v * r + 512), 0, 1023).astype(np.uint32)
+    order = _native.morton_order(p)
+    p, v = p[order], v[order]
+    waves = np.stack([np.sin(3 * v @ rng.normal(size=3)) for _ in range(10 + 3 * sh_coefficients)])
+    q = np.rint(4 * waves + rng.normal(size=waves.shape)).astype(np.int32)
+
+    def channel(lo, hi, step):
+        return {"values": q[lo:hi], "steps": [step] * (hi - lo), "offsets": [0.5] * (hi - lo)}
+
+    group = {
+        "frames": frames,
+        "origin": (-1.0, 0.0, 2.0),
+        "grid_step": 0.25,
+        "grid_bits": 10,
+        "positions": p,
+        "channels": {
+            "log_scales": channel(0, 3, 0.5),
+            "quats": channel(3, 6, 0.03125),
+            "logit_opacities": channel(6, 7, 1.0),
+            "sh0": channel(7, 10, 0.125),
+        },
+    }
+    if sh_coefficients:
+        group["channels"]["shN"] = channel(10, 10 + 3 * sh_coefficients, 0.0625)
+    return group
+
+
+def moving_group(n=500, frames=8):
+    """A group with nodes, trajectories of every attribute and lifetimes."""
+    g = surface_group(n, frames, sh_coefficients=3)
+    rng = np.random.default_rng(1)
+    g["trajectories"] = {}
+    for a in attributes.ATTRIBUTES:
+        c = np.zeros((4, attributes.channels(a.name, 1), n), np.int32)
+        some = rng.permutation(n)[: n // 10]
+        c[:3, :, some] = rng.integers(-3, 4, (3, c.shape[1], len(some)))
+        g["trajectories"][a.name] = {"coefficients": c, "step": 0.015625}
+    count = min(30, n)
+    g["nodes"] = {
+        "positions": g["positions"][np.sort(rng.permutation(n)[:count])],
+        "coefficients": rng.integers(-5, 6, (frames, 6, count)).astype(np.int32),
+        "rotation_step": 0.0625,
+        "translation_step": 0.125,
+        "neighbors": 4,
+    }
+    t0 = rng.integers(0, 3, n)
+    g["lifetimes"] = np.stack([t0, t0 + 1 + rng.integers(0, frames - 2, n)], 1).astype(np.uint16)
+    return g
+
+
+def assert_same(a, b, path="group"):
+    if isinstance(a, dict):
+        assert set(a) <= set(b), path
+        for key in a:
+            assert_same(a[key], b[key], f"{path}/{key}")
+    else:
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b), err_msg=path)
+
+
+@pytest.mark.parametrize(
+    "group",
+    [surface_group(), surface_group(0), surface_group(1), surface_group(300, sh_coefficients=15), moving_group()],
+    ids=["keyframe", "empty", "single", "sh3", "moving"],
+)
+def test_integers_survive(group):
+    payload, report = _native.encode_group(group)
+    decoded = _native.DecodedGroup(payload, 1)
+    assert_same(group, decoded.integers())
+    assert _native.encode_group(decoded.integers())[0] == payload
+    assert sum(u["bytes"] for u in report) == len(payload)
+    assert [(u["type"], u["attribute"], u["bytes"]) for u in report] == [
+        (u["type"], u["attribute"], u["bytes"]) for u in decoded.units()
+    ]
+    assert (decoded.frames, decoded.count) == (group["frames"], len(group["positions"]))
+
+
+def test_payload_may_be_any_buffer():
+    payload, _ = _native.encode_group(surface_group(50))
+    for view in (bytearray(payload), memoryview(b"x" + payload)[1:], np.frombuffer(payload, np.uint8)):
+        assert _native.DecodedGroup(view, 1).count == 50
+
+
+def test_contexts_beat_a_memoryless_code():
+    n = 20000
+    group = surface_group(n)
+    _, report = _native.encode_group(group)
+    bits = {u["attribute"] or u["type"]: 8 * u["bytes"] / n for u in report}
+    for name, c in group["channels"].items():
+        memoryless = 0.0
+        for channel in c["values"]:
+            p = np.unique(channel, return_counts=True)[1] / channel.size
+            memoryless -= (p * np.log2(p)).sum()
+        assert bits[name] < 0.92 * memoryless, name
+    assert bits["positions"] < 13.5  # 30 raw; 17.2 if they were anywhere in the cube, in no order
+
+
+def expected_frame(group, t):
+    """Spec 13 in f64, without nodes and quats."""
+    frames = group["frames"]
+    k = np.arange(frames)
+    basis = np.sqrt(np.where(k == 0, 1, 2) / frames) * np.cos(np.pi * (2 * t + 1) * k / (2 * frames))
+
+    def delta(name):
+        m = group["trajectories"][name]
+        return m["step"] * np.einsum("k,kcn->nc", basis[: len(m["coefficients"])], m["coefficients"])
+
+    def values(name):
+        c = group["channels"][name]
+        v = np.asarray(c["offsets"])[:, None] + np.asarray(c["steps"])[:, None] * c["values"]
+        return v.T + delta(name)
+
+    def rgb(v):
+        y, co, cg = np.moveaxis(v.reshape(len(v), -1, 3), 2, 0)
+        return np.stack([y + co - cg, y + cg, y - co - cg], 2)
+
+    return {
+        "means": np.asarray(group["origin"]) + group["grid_step"] * group["positions"] + delta("means"),
+        "log_scales": values("log_scales"),
+        "logit_opacities": values("logit_opacities")[:, 0],
+        "sh0": rgb(values("sh0"))[:, 0],
+        "shN": rgb(values("shN")),
+    }
+
+
+def test_frames_follow_the_spec():
+    group = moving_group()
+    del group["nodes"]
+    decoded = _native.DecodedGroup(_native.encode_group(group)[0], 1)
+    for t in (0, 3, 7):
+        frame = decoded.frame(t)
+        for name, want in expected_frame(group, t).items():
+            np.testing.assert_allclose(frame[name], want, atol=2e-4, err_msg=name)
+        np.testing.assert_allclose(np.linalg.norm(frame["quats"], axis=1), 1, atol=1e-5)
+        visible = (group["lifetimes"][:, 0] <= t) & (t < group["lifetimes"][:, 1])
+        np.testing.assert_array_equal(decoded.visible(t), visible)
+    with pytest.raises(IndexError, match="frame 8 of a group of 8"):
+        decoded.frame(8)
+
+
+def test_quaternion_trajectories_turn_from_the_left():
+    group = surface_group(3)
+    group["channels"]["quats"]["values"] = np.array([[8, 0, 0]] * 3, np.int32).T
+    group["channels"]["quats"]["offsets"] = [0.0] * 3
+    c = np.zeros((1, 3, 3), np.int32)
+    c[0, 2] = 16
+    group["trajectories"] = {"quats": {"coefficients": c, "step": 0.03125}}
+    q = _native.DecodedGroup(_native.encode_group(group)[0], 1).frame(0)["quats"][0]
+    w, x = np.sqrt(1 - 0.25**2), 0.25  # canonical
+    dw, dz = np.sqrt(1 - 0.5**2), 0.5
+    np.testing.assert_allclose(q, [dw * w, dw * x, dz * x, dz * w], atol=1e-6)
+
+
+def node_group(group, nodes, coefficients, rotation_step, translation_step):
+    nodes = {"positions": nodes, "coefficients": coefficients, "neighbors": 3}
+    return {**group, "nodes": {**nodes, "rotation_step": rotation_step, "translation_step": translation_step}}
+
+
+def test_nodes_carry_their_gaussians():
+    group = surface_group(800, frames=2)
+    nodes = group["positions"][::40]
+    c = np.zeros((1, 6, len(nodes)), np.int32)
+    c[0, 3] = 8  # every node moves by the same
+    decoded = _native.DecodedGroup(_native.encode_group(node_group(group, nodes, c, 0.01, 0.25))[0], 1)
+    rest = np.asarray(group["origin"]) + group["grid_step"] * group["positions"]
+    np.testing.assert_allclose(decoded.frame(1)["means"] - rest, [[8 * 0.25 / np.sqrt(2), 0, 0]] * 800, atol=1e-3)
+
+
+def test_a_rotation_that_all_nodes_share_is_rigid():
+    group = surface_group(200)
+    nodes = group["positions"][::20]
+    angle = 0.5
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    at = np.asarray(group["origin"]) + group["grid_step"] * nodes
+    c = np.zeros((1, 6, len(nodes)), np.int32)
+    c[0, 2] = round(angle / 2**-20)
+    c[0, 3:] = np.rint((at @ turn.T - at).T / 2**-10)
+    still = _native.DecodedGroup(_native.encode_group(group)[0], 1).frame(0)
+    moved = _native.DecodedGroup(_native.encode_group(node_group(group, nodes, c, 2**-20, 2**-10))[0], 1).frame(0)
+    np.testing.assert_allclose(moved["means"], still["means"] @ turn.T, atol=5e-3)
+    w, z = np.cos(angle / 2), np.sin(angle / 2)
+    a, b, c, d = still["quats"].T
+    want = np.stack([w * a - z * d, w * b - z * c, w * c + z * b, w * d + z * a], 1)
+    np.testing.assert_allclose(moved["quats"], want, atol=1e-4)
+
+
+def test_node_weights_are_exact_and_sum_to_one():
+    rng = np.random.default_rng(5)
+    p = rng.integers(0, 1 << 21, (300, 3)).astype(np.uint32)
+    for m in (1, 3, 4, 60):
+        nodes = rng.integers(0, 1 << 21, (m, 3)).astype(np.uint32)
+        nodes = nodes[_native.morton_order(nodes)]
+        index, weight = _native.node_weights(p, nodes, 4)
+        assert index.shape == weight.shape == (300, min(4, m))
+        for i in range(0, 300, 7):
+            d = [sum((int(a) - int(b)) ** 2 for a, b in zip(p[i], q, strict=True)) for q in nodes]
+            order = sorted(range(m), key=lambda j: (d[j], j))
+            k = min(4, m)
+            scale = d[order[4]] if m > 4 else 2 * d[order[k - 1]]
+            w = [(((scale - d[j]) << 16) // scale) ** 2 if scale else 0 for j in order[:k]]
+            w = w if any(w) else [1] * k
+            assert list(index[i]) == order[:k]
+            np.testing.assert_allclose(weight[i], np.array(w, float) / sum(w), rtol=1e-6)
+
+
+def test_node_weights_where_distances_vanish():
+    p = np.full((2, 3), 5, np.uint32)
+    index, weight = _native.node_weights(p, np.full((6, 3), 5, np.uint32), 4)
+    assert index.tolist() == [[0, 1, 2, 3]] * 2
+    np.testing.assert_array_equal(weight, 0.25)
+
+
+def test_damage_is_an_error():
+    payload, _ = _native.encode_group(moving_group(40))
+    rng = np.random.default_rng(2)
+    for at in rng.integers(0, len(payload), 200):
+        bad = bytearray(payload)
+        bad[at] ^= 1 << rng.integers(8)
+        with pytest.raises(BitstreamError, match=r"byte \d+, unit"):
+            _native.DecodedGroup(bad, 1)
+    for size in rng.integers(0, len(payload) - 200, 50):
+        with pytest.raises(BitstreamError):
+            _native.DecodedGroup(payload[:size], 1)
+
+
+def test_levels_are_caps():
+    payload, _ = _native.encode_group(surface_group(1, frames=65))
+    with pytest.raises(LimitError, match="65 frames, level 1 allows 64"):
+        _native.DecodedGroup(payload, 1)
+    assert _native.DecodedGroup(payload, 2).frames == 65
+    with pytest.raises(LimitError):
+        _native.DecodedGroup(payload, 9)
+    assert smallest_level(gaussians=65536) == 1
+    assert smallest_level(gaussians=65537, frames=20) == 2
+    with pytest.raises(LimitError, match="frames exceeds level 4"):
+        smallest_level(frames=LEVELS[-1].frames + 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"positions": np.array([[1, 0, 0], [0, 0, 0]] + [[1, 1, 1]] * 8, np.uint32)}, "Morton order"),
+        ({"positions": np.full((10, 3), 1024, np.uint32)}, r"below 2\^10"),
+        ({"positions": np.full((10, 3), 0.5)}, "integers that fit uint32"),
+        ({"positions": np.zeros((10, 2), np.uint32)}, "shape"),
+        ({"positions": np.zeros((9, 3), np.uint32)}, "shape"),
+        ({"frames": 0}, "frames"),
+        ({"frames": "many"}, "'frames'"),
+        ({"grid_bits": 22}, "grid_bits"),
+        ({"grid_step": 0.0}, "grid_step"),
+        ({"origin": (0, float("nan"), 0)}, "origin"),
+        ({"channels": None}, "channels"),
+        ({"lifetimes": np.zeros((10, 2), np.uint16)}, "lifetime of Gaussian 0"),
+        ({"trajectories": {"colour": {}}}, "unknown attribute 'colour'"),
+        ({"trajectories": {"sh0": {"coefficients": np.zeros((2, 3, 10), np.int32), "step": 1.0}}}, "coefficients"),
+        ({"trajectories": {"sh0": {"coefficients": np.zeros((1, 3, 9), np.int32), "step": 1.0}}}, "expected shape"),
+    ],
+)
+def test_bad_input_is_named(change, message):
+    with pytest.raises(ValueError, match=message):
+        _native.encode_group({**surface_group(10), **change})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"steps": [1.0, 0.0, 1.0]}, "step > 0"),
+        ({"steps": [1.0]}, "3 steps"),
+        ({"values": np.full((3, 10), 1 << 25)}, "sh0: expected integers within"),
+        ({"values": np.zeros((2, 10), np.int32)}, r"expected shape \[3, 10\]"),
+    ],
+)
+def test_channel_errors_are_named(change, message):
+    group = surface_group(10)
+    group["channels"]["sh0"].update(change)
+    with pytest.raises(ValueError, match=message):
+        _native.encode_group(group)
+
+
+def test_maps_hold_every_value():
+    group = surface_group(700)
+    maps = _native.DecodedGroup(_native.encode_group(group)[0], 1).maps()
+    assert len(maps) == 13
+    assert maps["sh0_1"].shape == (48, 16)
+    x = np.sort(maps["means_0"].ravel())
+    np.testing.assert_array_equal(x[-700:], np.sort(group["positions"][:, 0]))
+
+
+def make_file(frames=(20, 1, 7)):
+    init = _native.init_segment(CONFIG)
+    payload, _ = _native.encode_group(surface_group(30))
+    parts, index, start = [], [], 0
+    for number, n in enumerate(frames, 1):
+        parts.append(_native.fragment(payload, number, start, n, number != 2, CONFIG))
+        index.append((len(parts[-1]), n, number != 2))
+        start += n
+    return _native.finish(init, index) + b"".join(parts), payload
+
+
+def test_file_round_trip():
+    data, payload = make_file()
+    found = _native.demux(data)
+    assert found["complete"]
+    config = found["config"]
+    assert config["fps"] == (30000, 1001)
+    for key in ("level", "up", "color_space", "background", "sh_degree", "sh_frame"):
+        assert config[key] == CONFIG[key]
+    np.testing.assert_array_equal(config["cameras"][0]["K"], CONFIG["cameras"][0]["K"])
+    np.testing.assert_array_equal(config["cameras"][0]["viewmat"], np.eye(4))
+    timing = [(g["start_frame"], g["frames"], g["sync"]) for g in found["groups"]]
+    assert timing == [(0, 20, True), (20, 1, False), (21, 7, True)]
+    for g in found["groups"]:
+        assert data[g["offset"] : g["offset"] + g["size"]] == payload
+    assert _native.init_segment(config) == _native.init_segment(CONFIG)
+
+
+def test_cut_files_keep_whole_groups():
+    data, payload = make_file()
+    whole = [g["offset"] + g["size"] for g in _native.demux(data)["groups"]]
+    first = whole[0] - len(payload)
+    for n in [*range(first, len(data), 97), len(data) - 1]:
+        found = _native.demux(data[:n])
+        assert len(found["groups"]) == sum(end <= n for end in whole)
+        assert not found["complete"]
+    with pytest.raises(BitstreamError, match="moov"):
+        _native.demux(data[:40])
+    with pytest.raises(BitstreamError, match="ftyp"):
+        _native.demux(b"ply\nformat ascii 1.0\n")
+
+
+def test_mapped_files(tmp_path):
+    path = tmp_path / "a.gsv"
+    path.write_bytes(make_file()[0])
+    with path.open("rb") as f, mmap.mmap(f.fileno(), 0, access=mmap.ACCESS_READ) as m:
+        assert len(_native.demux(m)["groups"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fps": 0}, "fps"),
+        ({"up": "w"}, "up: expected one of"),
+        ({"background": [0, 0, 2]}, "background"),
+        ({"level": 7}, "level 7"),
+        ({"metres_per_unit": -1.0}, "metres_per_unit"),
+        ({"cameras": [{**CONFIG["cameras"][0], "K": np.ones((3, 3))}]}, "camera K"),
+    ],
+)
+def test_config_errors_are_named(change, message):
+    with pytest.raises(ValueError, match=message):
+        _native.init_segment({**CONFIG, **change})
+
+
+def test_decoding_releases_the_gil():
+    payload, _ = _native.encode_group(surface_group(60000))
+    ticks, done = [], threading.Event()
+
+    def tick():
+        while not done.wait(0.001):
+            ticks.append(1)
+
+    thread = threading.Thread(target=tick)
+    thread.start()
+    for _ in range(3):
+        _native.DecodedGroup(payload, 1)
+    done.set()
+    thread.join()
+    assert len(ticks) >= 6  # one or two per call if it were held
