@@ -36,7 +36,6 @@ Frames = Annotated[str | None, typer.Option(metavar="A:B", help="Only frames A t
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Gop = Annotated[int, typer.Option(help="Frames in a group.")]
 Preset = Annotated[str, typer.Option(help="Training budget: fast, medium or slow.")]
-Device = Annotated[str, typer.Option(help="auto, cpu or cuda (needs gsplat).")]
 Quality = Annotated[float, typer.Option(help="0 (small) to 100 (fine).")]
 
 
@@ -63,8 +62,7 @@ def encode(
     preset: Preset = "medium",
     frames: Frames = None,
     gop: Gop = 20,
-    device: Device = "auto",
-    keep_all: Annotated[bool, typer.Option("--keep-all", help="Keep Gaussians that nobody can see.")] = False,
+    device:     keep_all: Annotated[bool, typer.Option("--keep-all", help="Keep Gaussians that nobody can see.")] = False,
     report: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the report there.")] = None,
 ) -> None:
     """Capture or Gaussian sequence to a stream. A second run resumes; Ctrl-C leaves a playable file."""
@@ -73,7 +71,7 @@ def encode(
 
     with Bar() as bar:
         result = encode_input(
-            seq, out, quality=quality, preset=preset, frames=frames, gop=gop, device=device, keep_all=keep_all, bar=bar
+            seq, out, quality=quality, preset=preset, frames=frames, gop=gop, keep_all=keep_all, bar=bar
         )
     if report:
         report.write_text(json.dumps(result.to_json(), indent=1))
@@ -96,8 +94,7 @@ def train(
     preset: Preset = "medium",
     frames: Frames = None,
     gop: Gop = 20,
-    device: Device = "auto",
-    quality: Quality = 50.0,
+    device:     quality: Quality = 50.0,
 ) -> None:
     """Capture to one .ply per frame, the first half of encode."""
     from gscodec.commands import train_to_folder
@@ -105,7 +102,7 @@ def train(
 
     with Bar() as bar:
         count = train_to_folder(
-            capture, folder, preset=preset, frames=frames, gop=gop, device=device, quality=quality, bar=bar
+            capture, folder, preset=preset, frames=frames, gop=gop, quality=quality, bar=bar
         )
     _out.print(f"{folder}: {count} frames")
 

@@ -29,7 +29,6 @@ def encode_input(
     preset: str,
     frames: str | None,
     gop: int,
-    device: str,
     keep_all: bool,
     bar: Bar,
 ) -> EncodeReport:
@@ -47,7 +46,7 @@ def encode_input(
     out.parent.mkdir(parents=True, exist_ok=True)
     if detect_input(source) == "splats":
         return _encode_splats(source, out, settings, frames, gop, bar)
-    return _encode_capture(source, out, settings, preset, frames, gop, device, bar)
+    return _encode_capture(source, out, settings, preset, frames, gop, bar)
 
 
 def _encode_splats(source, out, settings, frames, gop, bar) -> EncodeReport:
@@ -105,14 +104,13 @@ def _restrict(sequence: GaussianSequence, frames: str | None) -> GaussianSequenc
     return sequence.with_groups(groups)
 
 
-def _encode_capture(source, out, settings, preset, frames, gop, device, bar) -> EncodeReport:
+def _encode_capture(source, out, settings, preset, frames, gop, bar) -> EncodeReport:
     from gscodec.train.settings import train_settings
     from gscodec.train.train import train_groups
 
     capture = _open_capture(source, frames)
     recipe = train_settings(preset, gop=gop, quality=settings.quality)
     work = out.with_name(out.name + ".work")
-    _check_device(device)
     config = stream_config(
         fps=capture.fps,
         sh_degree=0,
@@ -152,15 +150,6 @@ def _open_capture(source: Path, frames: str | None):
     return capture.frames(chosen.start, chosen.stop)
 
 
-def _check_device(device: str) -> None:
-    from gscodec.render.rasterize import cuda_available
-
-    if device not in ("auto", "cpu", "cuda"):
-        raise UsageError(f"--device {device} does not exist, expected auto, cpu or cuda")
-    if device == "cuda" and not cuda_available():
-        raise UsageError("--device cuda: no CUDA device with gsplat was found; install gsplat or use --device cpu")
-
-
 def up_axis(cameras: list[Camera]) -> str:
     """The world axis that the cameras hold upwards, e.g. "z" or "-y"."""
     up = -np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
@@ -169,7 +158,7 @@ def up_axis(cameras: list[Camera]) -> str:
 
 
 def train_to_folder(
-    source: Path, folder: Path, *, preset: str, frames: str | None, gop: int, device: str, quality: float, bar: Bar
+    source: Path, folder: Path, *, preset: str, frames: str | None, gop: int, quality: float, bar: Bar
 ) -> int:
     """Trains a capture and writes one .ply per frame and sequence.json; returns the number of frames."""
     from gscodec.splats import write_sequence
@@ -178,7 +167,6 @@ def train_to_folder(
 
     capture = _open_capture(source, frames)
     recipe = train_settings(preset, gop=gop, quality=quality)
-    _check_device(device)
     groups = train_groups(capture, recipe, on_progress=lambda p: bar.update(p.stage, p.done, p.total))
     sequence = GaussianSequence(capture.fps, list(groups), capture.cameras)
     write_sequence(sequence, folder)
@@ -196,12 +184,16 @@ def evaluate_stream(stream_path: Path, source: Path, *, split: str, frames: str 
     if detect_input(source) == "splats":
         sequence = open_sequence(source)
         chosen = frame_range(frames, min(stream.frame_count, sequence.frame_count))
-        result = evaluate_splats(stream.frame, sequence, frames=chosen, on_progress=on_progress)
+        result = evaluate_splats(stream.frame, sequence, frames=chosen, size=stream.byte_count, progress=on_progress)
     else:
         capture = _open_capture(source, None)
         count = min(stream.frame_count, capture.frame_count)
         chosen = frame_range(frames, count)
         result = evaluate_capture(
-            stream.frame, capture.frames(chosen.start, chosen.stop), split=split, on_progress=on_progress
+            stream.frame,
+            capture.frames(chosen.start, chosen.stop),
+            split=split,
+            size=stream.byte_count,
+            progress=on_progress,
         )
     return result

@@ -7,6 +7,7 @@ import threading
 
 import numpy as np
 import pytest
+
 from gscodec import _native
 from gscodec.bitstream import attributes
 from gscodec.bitstream.levels import LEVELS, smallest_level

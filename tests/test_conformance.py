@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from gscodec import _native, errors
 
 SPEC = Path(__file__).resolve().parents[1] / "spec"

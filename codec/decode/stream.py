@@ -75,6 +75,9 @@ class Stream:
                 self._held[i] = _native.DecodedGroup(self.payload(i), self.config["level"])
             except BitstreamError as e:
                 raise BitstreamError(f"{self.name}: group {i} (frames {self._span(i)}): {e}") from None
+            if self._held[i].frames != self.groups[i]["frames"]:
+                told, got = self.groups[i]["frames"], self._held.pop(i).frames
+                raise BitstreamError(f"{self.name}: group {i}: its header says {got} frames, its sample {told}")
             while len(self._held) > GROUPS_HELD:
                 self._held.popitem(last=False)
         self._held.move_to_end(i)

@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from gscodec import _native
+from gscodec.bitstream.levels import smallest_level
 from gscodec.camera import Camera
 from gscodec.encode.group import group_integers
 from gscodec.encode.writer import StreamWriter
-from gscodec.errors import LimitError, UsageError
+from gscodec.errors import UsageError
 from gscodec.gaussians import Group
 
 
@@ -60,24 +61,6 @@ class EncodeReport:
         }
 
 
-def smallest_level(gaussians: int, frames: int) -> int:
-    """The lowest level (spec 5) whose caps hold groups of that size.
-
-    Raises:
-        LimitError: none does.
-    """
-    levels = _native.levels()
-    for level in levels:
-        if gaussians <= level["gaussians"] and frames <= level["frames"]:
-            return level["level"]
-    top = levels[-1]
-    if frames > top["frames"]:
-        raise LimitError(
-            f"groups of {frames} frames are too long, the highest level allows {top['frames']}: lower --gop"
-        )
-    return top["level"]
-
-
 def stream_config(
     *,
     fps: float,
@@ -95,7 +78,7 @@ def stream_config(
     """
     return {
         "fps": fps,
-        "level": smallest_level(2 * gaussians, frames),
+        "level": smallest_level(gaussians=2 * gaussians, frames=frames),
         "metres_per_unit": 1.0,
         "up": up,
         "color_space": "srgb",

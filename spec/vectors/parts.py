@@ -10,6 +10,7 @@ import zlib
 from pathlib import Path
 
 import numpy as np
+
 from gscodec import _native
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
