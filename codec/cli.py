@@ -62,7 +62,7 @@ def encode(
     preset: Preset = "medium",
     frames: Frames = None,
     gop: Gop = 20,
-    device:     keep_all: Annotated[bool, typer.Option("--keep-all", help="Keep Gaussians that nobody can see.")] = False,
+    keep_all: Annotated[bool, typer.Option("--keep-all", help="Keep Gaussians that nobody can see.")] = False,
     report: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the report there.")] = None,
 ) -> None:
     """Capture or Gaussian sequence to a stream. A second run resumes; Ctrl-C leaves a playable file."""
@@ -94,16 +94,14 @@ def train(
     preset: Preset = "medium",
     frames: Frames = None,
     gop: Gop = 20,
-    device:     quality: Quality = 50.0,
+    quality: Quality = 50.0,
 ) -> None:
     """Capture to one .ply per frame, the first half of encode."""
     from gscodec.commands import train_to_folder
     from gscodec.progress import Bar
 
     with Bar() as bar:
-        count = train_to_folder(
-            capture, folder, preset=preset, frames=frames, gop=gop, quality=quality, bar=bar
-        )
+        count = train_to_folder(capture, folder, preset=preset, frames=frames, gop=gop, quality=quality, bar=bar)
     _out.print(f"{folder}: {count} frames")
 
 
