@@ -15,7 +15,6 @@ import torch
 
 from gscodec.render.step import Workspace, render_loss
 from gscodec.train.hashgrid import HashGrid
-from gscodec.train.keyframe import rotate
 from gscodec.train.model import Model
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views
@@ -57,6 +56,17 @@ def rotvec_to_quat(v: torch.Tensor) -> torch.Tensor:
     return torch.cat([torch.cos(half), v * 0.5 * torch.sinc(half / torch.pi)], 1)
 
 
+def quat_to_matrix(q: torch.Tensor) -> torch.Tensor:
+    """[N, 4] unit wxyz -> [N, 3, 3]."""
+    w, x, y, z = q.unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, 1).view(-1, 3, 3)
+
+
 class RigidGraph:
     """As-rigid-as-possible over the k-NN graph of the keyframe (Sorkine and Alexa 2007)."""
 
@@ -64,22 +74,23 @@ class RigidGraph:
         from scipy.spatial import cKDTree
 
         x = means.numpy()
-        k = min(GRAPH_NEIGHBORS, len(x) - 1)
-        distance, index = cKDTree(x).query(x, k + 1) if k > 0 else (np.ones((len(x), 1)), np.zeros((len(x), 1)))
-        self.i = torch.arange(len(x)).repeat_interleave(k)
+        n, k = len(x), min(GRAPH_NEIGHBORS, len(x) - 1)
+        distance, index = cKDTree(x).query(x, k + 1) if k > 0 else (np.ones((n, 1)), np.zeros((n, 1)))
+        self.count = k
         self.j = torch.from_numpy(index[:, 1:].astype(np.int64).ravel())
-        self.edge = means[self.j] - means[self.i]
+        self.edge = (means[self.j].view(n, k, 3) - means[:, None]).contiguous()
         # Far pairs (bridges across a gap) hold less: half at twice the median distance.
-        d = torch.from_numpy(distance[:, 1:].astype(np.float32).ravel())
-        self.weight = torch.exp2(-((d / (2 * d.median().clamp(min=1e-12))) ** 2))[:, None] / radius
-        self.median = float(d.median()) if len(d) else 1.0
+        d = torch.from_numpy(distance[:, 1:].astype(np.float32))
+        middle = d.median().clamp(min=1e-12) if k > 0 else torch.ones(())
+        self.weight = torch.exp2(-((d / (2 * middle)) ** 2))[..., None] / radius
 
     def loss(self, means: torch.Tensor, turned: torch.Tensor) -> torch.Tensor:
-        """Mean weighted length by which edges miss their rotated selves; `turned` [N, 4] from the keyframe."""
-        if len(self.j) == 0:
+        """Mean weighted length by which edges miss their rotated selves; `turned` [N, 4] unit, from the keyframe."""
+        if self.count == 0:
             return means.sum() * 0
-        miss = means[self.j] - means[self.i] - rotate(turned[self.i], self.edge)
-        return (self.weight * miss).square().sum(1).add(1e-12).sqrt().mean()
+        rotated = torch.bmm(self.edge, quat_to_matrix(turned).transpose(1, 2))
+        moved = means.index_select(0, self.j).view_as(rotated) - means[:, None]
+        return (self.weight * (moved - rotated)).square().sum(2).add(1e-12).sqrt().mean()
 
 
 def track(

@@ -126,6 +126,8 @@ def train_groups(
     Raises:
         CaptureError: a frame cannot be read, or no view overlaps another.
     """
+    # Torch only handles small tensors here; its threads would spin against those of the native kernels.
+    torch.set_num_threads(1)
     ranges = group_ranges(capture.frame_count, settings.gop)
     store = Checkpoint(checkpoints)
     last = store.load(first_group - 1) if first_group else None
