@@ -7,9 +7,9 @@
 use std::sync::atomic::AtomicU32;
 
 use crate::constants::{ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_STOP};
-use crate::project::{CHUNK, Projected};
+use crate::project::Projected;
 use crate::simd::{Vector, c, dispatch};
-use crate::tile::{BLOCK, Batch, PIXEL_X, PIXEL_Y, Plane};
+use crate::tile::{BATCH, BLOCK, Batch, PIXEL_X, PIXEL_Y, Plane};
 
 /// Sums over the pixels of a pair. With a = dL/dalpha * alpha (the gradient by ln alpha) and w the blending weight:
 /// a, a u, a v, a u^2, a u v, a v^2, w g (3), w, largest w, unused.
@@ -89,12 +89,9 @@ fn backward_kernel<V: Vector>(
     sums: &mut [Sums],
 ) {
     let mut batch = Batch::new();
-    for (i, chunk) in pairs.chunks(CHUNK).enumerate() {
-        batch.fill(projected, chunk, origin);
-        for (lane, splat) in batch.splats[..chunk.len()].iter().enumerate() {
-            let (Some(&mask), Some(out)) = (masks.get(i * CHUNK + lane), sums.get_mut(i * CHUNK + lane)) else {
-                return;
-            };
+    for (i, (masks, sums)) in masks.chunks(BATCH).zip(sums.chunks_mut(BATCH)).enumerate() {
+        batch.fill(projected, &pairs[i * BATCH..], origin);
+        for ((splat, &mask), out) in batch.splats.iter().zip(masks).zip(sums) {
             if mask == 0 {
                 *out = [0.0; 12];
                 continue;
