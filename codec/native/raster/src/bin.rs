@@ -83,12 +83,25 @@ impl Bins {
         self.starts[t] as usize..self.starts[t + 1] as usize
     }
 
+    /// Where the list entry of a visible Gaussian is: chunk and offset.
+    #[inline(always)]
+    fn entry(&self, gaussian: usize) -> (&[u32], usize) {
+        let entry = self.owned[gaussian].load(Relaxed);
+        let list = &self.lists[(entry >> OFFSET_BITS) as usize];
+        (list, (entry & ((1 << OFFSET_BITS) - 1)) as usize)
+    }
+
+    /// Fetches what `places` will read.
+    #[inline(always)]
+    pub fn prefetch_places(&self, gaussian: usize) {
+        let (list, at) = self.entry(gaussian);
+        prefetch(list, at);
+    }
+
     /// Positions in `pairs` of a visible Gaussian.
     #[inline(always)]
     pub fn places(&self, gaussian: usize) -> &[u32] {
-        let entry = self.owned[gaussian].load(Relaxed);
-        let list = &self.lists[(entry >> OFFSET_BITS) as usize];
-        let at = (entry & ((1 << OFFSET_BITS) - 1)) as usize;
+        let (list, at) = self.entry(gaussian);
         &list[at + 1..at + 1 + list[at] as usize]
     }
 
@@ -104,7 +117,12 @@ impl Bins {
         let share = sorted.len().div_ceil(CHUNKS).max(1);
         let owned = &self.owned;
         self.lists.iter_mut().for_each(Vec::clear);
-        let work = self.cursors.par_chunks_mut(tiles).zip(&mut self.lists).zip(sorted.par_chunks(share)).enumerate();
+        let work = self
+            .cursors
+            .par_chunks_mut(tiles)
+            .zip(&mut self.lists)
+            .zip(sorted.par_chunks(share))
+            .enumerate();
         work.for_each(|(chunk, ((count, list), keys))| {
             for (i, &key) in keys.iter().enumerate() {
                 if let Some(&next) = keys.get(i + AHEAD) {
@@ -132,7 +150,10 @@ impl Bins {
     fn prefix(&mut self, tiles: usize) -> Result<(), RasterError> {
         let full = |list: &Vec<u32>| list.len() > MAX_PAIRS / CHUNKS;
         if self.lists.iter().any(full) {
-            return Err(RasterError::TooMany { what: "Gaussian-tile pairs", limit: MAX_PAIRS });
+            return Err(RasterError::TooMany {
+                what: "Gaussian-tile pairs",
+                limit: MAX_PAIRS,
+            });
         }
         self.starts.clear();
         let mut sum = 0;
@@ -150,7 +171,11 @@ impl Bins {
     /// Writes the pairs; the tiles in the lists become places.
     fn fill(&mut self, tiles: usize, sorted: &[u64], share: usize) {
         let pairs = &self.pairs;
-        let work = self.cursors.par_chunks_mut(tiles).zip(&mut self.lists).zip(sorted.par_chunks(share));
+        let work = self
+            .cursors
+            .par_chunks_mut(tiles)
+            .zip(&mut self.lists)
+            .zip(sorted.par_chunks(share));
         work.for_each(|((cursor, list), keys)| {
             let mut rest = &mut list[..];
             for &key in keys {

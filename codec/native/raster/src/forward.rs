@@ -41,7 +41,11 @@ impl Canvas {
 fn blend<V: Vector>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut Canvas) -> (u64, bool) {
     let [red, green, blue] = &mut canvas.rgb;
     let t_row = &mut canvas.transmittance.0[b & 15][at..];
-    let rows = [&mut red.0[b & 15][at..], &mut green.0[b & 15][at..], &mut blue.0[b & 15][at..]];
+    let rows = [
+        &mut red.0[b & 15][at..],
+        &mut green.0[b & 15][at..],
+        &mut blue.0[b & 15][at..],
+    ];
     let (px, py) = (V::load(&PIXEL_X.0[b & 15][at..]), V::load(&PIXEL_Y.0[b & 15][at..]));
     let mut t = V::load(t_row);
     let mut rgb = [V::load(rows[0]), V::load(rows[1]), V::load(rows[2])];
@@ -101,7 +105,9 @@ fn forward_kernel<V: Vector>(
             if !open {
                 canvas.live &= !(1 << b);
             }
-            let Some(masks) = masks.get_mut(first..first + n) else { continue };
+            let Some(masks) = masks.get_mut(first..first + n) else {
+                continue;
+            };
             while seen != 0 {
                 masks[seen.trailing_zeros() as usize & (BATCH - 1)] |= 1 << b;
                 seen &= seen - 1;

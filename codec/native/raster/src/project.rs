@@ -331,7 +331,10 @@ fn project_lanes<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize, out: &m
     for (i, (edge, axis)) in edges.into_iter().enumerate() {
         // the first pixel centre at or after the edge; the last one at or before it
         let pixel = if i % 2 == 0 { edge + c(0.5) } else { edge - c(0.5) };
-        pixel.max(c(0.0)).min(c(lens.size[axis] - 1.0)).store(&mut out.0[12 + i][at..]);
+        pixel
+            .max(c(0.0))
+            .min(c(lens.size[axis] - 1.0))
+            .store(&mut out.0[12 + i][at..]);
     }
 }
 
@@ -357,7 +360,8 @@ fn project_kernel<V: Vector>(splats: &Splats, lens: &Lens, first: usize, out: &m
                 depth: f[9][lane],
                 rx: f[10][lane],
                 ry: f[11][lane],
-                tiles: [f[12][lane], f[13][lane], f[14][lane], f[15][lane]].map(|pixel| (pixel as i32 / TILE as i32) as u16),
+                tiles: [f[12][lane], f[13][lane], f[14][lane], f[15][lane]]
+                    .map(|pixel| (pixel as i32 / TILE as i32) as u16),
             };
         }
     }

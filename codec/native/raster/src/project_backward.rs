@@ -51,7 +51,12 @@ impl GradientRows {
 /// visible become 0.
 pub fn gather(bins: &Bins, sums: &[Sums], projected: &[Projected], first: usize, n: usize) -> [Row; 12] {
     let mut rows = [[0.0; CHUNK]; 12];
-    for (g, p) in projected.iter().enumerate().skip(first + n).take(CHUNK) {
+    for (g, p) in projected.iter().enumerate().skip(first + 3 * CHUNK).take(CHUNK) {
+        if p.visible() {
+            bins.prefetch_places(g);
+        }
+    }
+    for (g, p) in projected.iter().enumerate().skip(first + CHUNK).take(CHUNK) {
         if p.visible() {
             bins.places(g).iter().for_each(|&place| prefetch(sums, place as usize));
         }
@@ -63,7 +68,7 @@ pub fn gather(bins: &Bins, sums: &[Sums], projected: &[Projected], first: usize,
         }
         let mut total = [0.0f32; 12];
         for &place in bins.places(g) {
-            let s = &sums[place as usize];
+            let s = &sums[place as usize].0;
             for k in 0..10 {
                 total[k] += s[k];
             }

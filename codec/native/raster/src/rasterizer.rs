@@ -226,7 +226,7 @@ impl Rasterizer {
         check_length("gradient of the image", grad_image.len(), 3 * region.pixels())?;
         check_length("gradient of alpha", grad_alpha.len(), region.pixels())?;
         let start = Instant::now();
-        self.sums.resize(self.bins.pairs.len(), [0.0; 12]);
+        self.sums.resize(self.bins.pairs.len(), Sums::ZERO);
         self.backward_tiles(region.width, shade, grad_image, grad_alpha);
         self.timings.backward_tiles = ms(start);
         let start = Instant::now();
@@ -305,7 +305,11 @@ fn cut_pairs<'a, T>(pairs: &'a mut [T], bins: &Bins, first: usize, middle: usize
 fn finish(canvas: &Canvas, shade: Shade, x: usize, width: usize, image: &mut [f32], alpha: &mut [f32]) {
     let (gain, back) = (shade.gain.unwrap_or([1.0; 3]), shade.background);
     let whole = width - x >= TILE;
-    for (y, (image, alpha)) in image.chunks_exact_mut(3 * width).zip(alpha.chunks_exact_mut(width)).enumerate() {
+    for (y, (image, alpha)) in image
+        .chunks_exact_mut(3 * width)
+        .zip(alpha.chunks_exact_mut(width))
+        .enumerate()
+    {
         let mut rgb_row = [0.0; 3 * TILE];
         let mut alpha_row = [0.0; TILE];
         let four = y % 4 * 4..y % 4 * 4 + 4;
@@ -336,7 +340,10 @@ fn finish(canvas: &Canvas, shade: Shade, x: usize, width: usize, image: &mut [f3
 fn finish_empty(shade: Shade, x: usize, width: usize, image: &mut [f32], alpha: &mut [f32]) {
     let columns = TILE.min(width - x);
     for (image, alpha) in image.chunks_exact_mut(3 * width).zip(alpha.chunks_exact_mut(width)) {
-        image[3 * x..3 * (x + columns)].as_chunks_mut::<3>().0.fill(shade.background);
+        image[3 * x..3 * (x + columns)]
+            .as_chunks_mut::<3>()
+            .0
+            .fill(shade.background);
         alpha[x..x + columns].fill(0.0);
     }
 }
@@ -354,8 +361,15 @@ impl Pixels<'_> {
     /// The tile at (x, y). With image = gain sum(w rgb) + T background and alpha = 1 - T, the remainder of the whole pixel,
     /// g . sum(w rgb) + T (g . background - g_alpha), is g . image - T g_alpha.
     fn adjoint(&self, x: usize, y: usize, shade: Shade) -> Adjoint {
-        let mut a = Adjoint { transmittance: Plane::ZERO, remainder: Plane::ZERO, rgb: [Plane::ZERO; 3] };
-        let (rows, gain) = ((self.alpha.len() / self.width - y).min(TILE), shade.gain.unwrap_or([1.0; 3]));
+        let mut a = Adjoint {
+            transmittance: Plane::ZERO,
+            remainder: Plane::ZERO,
+            rgb: [Plane::ZERO; 3],
+        };
+        let (rows, gain) = (
+            (self.alpha.len() / self.width - y).min(TILE),
+            shade.gain.unwrap_or([1.0; 3]),
+        );
         let columns = TILE.min(self.width - x);
         for j in 0..rows {
             let at = (y + j) * self.width + x;

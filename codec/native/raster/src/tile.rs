@@ -51,7 +51,10 @@ pub struct Batch {
 
 impl Batch {
     pub fn new() -> Batch {
-        Batch { splats: [Projected::default(); BATCH], rows: [[0.0; BATCH]; 6] }
+        Batch {
+            splats: [Projected::default(); BATCH],
+            rows: [[0.0; BATCH]; 6],
+        }
     }
 
     /// The first 64 of `pairs`; those after them are fetched for the next call. Returns how many.
