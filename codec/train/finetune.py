@@ -37,7 +37,8 @@ def laplace_bits(x: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
     """
     b = torch.exp(log_scale)
     a = x.abs()
-    inner = 1 - 0.5 * (torch.exp((a - 0.5) / b) + torch.exp(-(a + 0.5) / b))  # |x| < 1/2
+    near = a.clamp(max=0.5)  # keeps the branch that is not taken, and its gradient, finite
+    inner = 1 - 0.5 * (torch.exp((near - 0.5) / b) + torch.exp(-(near + 0.5) / b))
     tail = torch.exp(-(a - 0.5).clamp(min=0) / b) * 0.5 * (-torch.expm1(-1 / b))
     p = torch.where(a < 0.5, inner, tail)
     far = (a - 0.5).clamp(min=0) / b / np.log(2) + 1 - torch.log2(-torch.expm1(-1 / b))  # where p underflows

@@ -2,7 +2,7 @@
 
 V3's motion model (Wang et al. 2024): a multi-resolution hash grid and a shallow MLP, here one field a frame on top of
 the extrapolated pose of the two frames before, so that it only has to learn the change. The field sees nothing but the
-keyframe position, hence neighbours move alike; an as-rigid-as-possible term over the k-NN graph does the rest.
+keyframe position (plain and through the grid), hence neighbours move alike; an as-rigid-as-possible term over the k-NN graph does the rest.
 In: keyframe model, views. Out: means [T, N, 3] and quats [T, N, 4] of all frames.
 """
 
@@ -20,9 +20,9 @@ from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views
 
 GRAPH_NEIGHBORS = 6
-FIELD_RATE = 4e-3
-TRANSLATION_UNIT = 0.02  # of the subject's radius: what an output of 1 means
-ROTATION_UNIT = 0.1  # radians
+MLP_RATE, TABLE_RATE = 4e-3, 2e-2
+TRANSLATION_UNIT = 0.1  # of the subject's radius: what an output of 1 means
+ROTATION_UNIT = 0.3  # radians
 
 
 class MotionField(torch.nn.Module):
@@ -32,14 +32,14 @@ class MotionField(torch.nn.Module):
         super().__init__()
         self.grid = HashGrid(levels=8, features=2, log2_table=14, base_resolution=4, max_resolution=resolution)
         self.mlp = torch.nn.Sequential(
-            torch.nn.Linear(16, 32), torch.nn.ReLU(), torch.nn.Linear(32, 32), torch.nn.ReLU(), torch.nn.Linear(32, 6)
+            torch.nn.Linear(19, 32), torch.nn.ReLU(), torch.nn.Linear(32, 32), torch.nn.ReLU(), torch.nn.Linear(32, 6)
         )
         torch.nn.init.zeros_(self.mlp[-1].weight)
         torch.nn.init.zeros_(self.mlp[-1].bias)
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Shapes as the class says; zero for a fresh field."""
-        out = self.mlp(self.grid(x))
+        out = self.mlp(torch.cat([self.grid(x), 2 * x - 1], 1))
         return out[:, :3] * TRANSLATION_UNIT, out[:, 3:] * ROTATION_UNIT
 
 
@@ -133,11 +133,14 @@ def _fit_frame(key, views, frame, settings, radius, start, graph, on_step):
     torch.manual_seed(settings.seed * 1000003 + frame)
     rng = np.random.default_rng([settings.seed, frame, 1])
     field, workspace = MotionField(), Workspace()
-    optimizer = torch.optim.Adam(field.parameters(), lr=FIELD_RATE, betas=(0.9, 0.99), fused=True)
+    groups = [(field.mlp.parameters(), MLP_RATE), (field.grid.parameters(), TABLE_RATE)]
+    optimizer = torch.optim.Adam(
+        [{"params": list(p), "lr": r, "base": r} for p, r in groups], betas=(0.9, 0.99), fused=True
+    )
     steps = settings.motion_steps
     for step in range(steps):
         for g in optimizer.param_groups:
-            g["lr"] = FIELD_RATE * 0.1 ** (step / steps)
+            g["lr"] = g["base"] * 0.1 ** (step / steps)
         move, turn = field(unit)
         means = base + radius * move
         turned = torch.nn.functional.normalize(quat_multiply(rotvec_to_quat(turn), base_turned), dim=1)

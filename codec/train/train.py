@@ -69,13 +69,13 @@ def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
         views.append((capture.cameras[i], v.rgb, v.alpha))
     known = [c for c, _, _ in views]
     if all(alpha is not None for _, _, alpha in views):
-        points, colors, spacing = carve(known, views, settings.initial_points)
+        points, colors = carve(known, views, settings.initial_points)
         if len(points):
-            return from_points(points, colors, spacing)
-    points, colors, spacing = random_box(known, views, settings.initial_points, settings.seed)
+            return from_points(points, colors, opacity=0.5)
+    points, colors = random_box(known, views, settings.initial_points, settings.seed)
     if len(points) == 0:
         raise CaptureError(f"{capture.name}: no point is seen by two cameras, expected cameras that overlap")
-    return from_points(points, colors, spacing)
+    return from_points(points, colors, opacity=0.1)
 
 
 class Checkpoint:

@@ -38,10 +38,11 @@ class Views:
     def __init__(self, capture, seed: int):
         self.capture = capture
         self.train_cameras = [i for i, c in enumerate(capture.cameras) if c.split == "train"]
-        self._random = np.random.default_rng(seed)
+        self._seed = seed
         self._held: OrderedDict[tuple[int, int], Target] = OrderedDict()
         self._bytes = 0
         self._order: dict[int, list[int]] = {}
+        self._rounds: dict[int, int] = {}
 
     def target(self, camera: int, frame: int) -> Target:
         """View of camera index `camera` at `frame`, cropped to the subject."""
@@ -56,10 +57,13 @@ class Views:
         return self._held[key]
 
     def draw(self, frame: int) -> Target:
-        """The next view of `frame`; every camera once before any comes again."""
+        """The next view of `frame`; every camera once before any comes again, in an order that depends on the frame
+        and not on what was drawn before (a resumed run draws the same)."""
         order = self._order.get(frame)
         if not order:
-            order = self._order[frame] = self._random.permutation(self.train_cameras).tolist()
+            turn = self._rounds[frame] = self._rounds.get(frame, 0) + 1
+            rng = np.random.default_rng([self._seed, frame, turn])
+            order = self._order[frame] = rng.permutation(self.train_cameras).tolist()
         return self.target(order.pop(), frame)
 
     @staticmethod
