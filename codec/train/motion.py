@@ -2,8 +2,8 @@
 
 V3's motion model (Wang et al. 2024): a multi-resolution hash grid and a shallow MLP, here one field a frame on top of
 the extrapolated pose of the two frames before, so that it only has to learn the change. The field sees nothing but the
-keyframe position (plain and through the grid), hence neighbours move alike; an as-rigid-as-possible term over the k-NN graph does the rest.
-In: keyframe model, views. Out: means [T, N, 3] and quats [T, N, 4] of all frames.
+keyframe position (plain and through the grid), hence neighbours move alike; an as-rigid-as-possible term over the
+k-NN graph does the rest. In: keyframe model, views. Out: means [T, N, 3] and turns [T, N, 4] of all frames.
 """
 
 from __future__ import annotations
