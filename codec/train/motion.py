@@ -13,11 +13,11 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from gscodec.render.step import Workspace, render_loss
+from gscodec.render.workspace import Workspace
 from gscodec.train.hashgrid import HashGrid
 from gscodec.train.model import Model
 from gscodec.train.settings import TrainSettings
-from gscodec.train.views import Views
+from gscodec.train.views import Views, compare
 
 GRAPH_NEIGHBORS = 6
 MLP_RATE, TABLE_RATE = 4e-3, 2e-2
@@ -145,18 +145,7 @@ def _fit_frame(key, views, frame, settings, radius, start, graph, on_step):
         means = base + radius * move
         turned = torch.nn.functional.normalize(quat_multiply(rotvec_to_quat(turn), base_turned), dim=1)
         quats = quat_multiply(turned, key.params["quats"])
-        target = views.draw(frame)
-        background = rng.uniform(0, 1, 3) if target.alpha is not None else np.zeros(3)
-        result = render_loss(
-            {**key.params, "means": means.detach(), "quats": quats.detach()},
-            target.camera,
-            target.rgb,
-            target.alpha,
-            background=tuple(background),
-            ssim_lambda=settings.ssim_lambda,
-            mask_lambda=settings.mask_lambda,
-            workspace=workspace,
-        )
+        result = compare({**key.params, "means": means, "quats": quats}, views.draw(frame), settings, rng, workspace)
         rigid = settings.rigidity * graph.loss(means, turned)
         optimizer.zero_grad()
         torch.autograd.backward([means, quats, rigid], [result.grads["means"], result.grads["quats"], torch.ones(())])
