@@ -113,7 +113,7 @@ pub(crate) fn exp2_poly<V: Vector>(f: V) -> V {
     let p = f.mul_add(c(9.570_097e-3), c(5.591_786e-2));
     let p = f.mul_add(p, c(2.402_474_5e-1));
     let p = f.mul_add(p, c(6.931_218e-1));
-    f.mul_add(p, c(9.999_992_6e-1))
+    f.mul_add(p, c(9.999_992e-1))
 }
 
 /// An instruction set that this machine has been found to have. There is no other way to make one, so kernels may rely on it.
