@@ -210,6 +210,14 @@ def test_region_is_a_crop():
     np.testing.assert_allclose(part, whole[21:91, 37:127], atol=2e-5)
 
 
+def test_8_bit_image_is_the_float_image_rounded():
+    cam, g = camera(203, 150), dense()
+    params = tuple(getattr(g, k) for k in PARAMETERS)
+    image, _ = Workspace().forward(params, cam, BACKGROUND)
+    want = np.floor(np.clip(image, 0, 1) * 255 + 0.5)
+    np.testing.assert_array_equal(render_image(g, cam, BACKGROUND), want)
+
+
 def test_statistics():
     cam, params = camera(), [p.detach().float().requires_grad_() for p in scene()]
     image, alpha, info = rasterize(*params, cam)

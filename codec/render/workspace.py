@@ -61,6 +61,13 @@ class Workspace:
         image, alpha = call(self.native.forward, params, view(camera, region), rgb(background), training)
         return image.reshape(region[3], region[2], 3), alpha.reshape(region[3], region[2])
 
+    def draw(self, params, camera: Camera, background) -> np.ndarray:
+        """Draws `params` and returns [H, W, 3] uint8, rounded."""
+        self.calls += 1
+        whole = (0, 0, camera.width, camera.height)
+        flat = call(self.native.draw, params, view(camera, whole), rgb(background))
+        return flat.reshape(camera.height, camera.width, 3)
+
     def gradients(self, params) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
         """Arrays in the shapes of `params`, and three statistics [N]; the same ones as long as the shapes stay."""
         n = len(params[0])

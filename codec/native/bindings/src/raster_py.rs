@@ -193,6 +193,25 @@ impl Rasterizer {
         Ok((v.loss, v.image.l1, v.image.mse, v.image.ssim, v.mask, v.gain))
     }
 
+    /// Draws and returns the picture as 8 bits, flat.
+    fn draw<'py>(
+        &mut self,
+        py: Python<'py>,
+        params: Params<'py>,
+        view: ViewArgs,
+        background: [f32; 3],
+    ) -> PyResult<Bound<'py, PyArray1<u8>>> {
+        let (splats, view) = (splats(&params)?, view.view());
+        view.check().map_err(usage)?; // before its size is allocated
+        let mut out = vec![0; 3 * view.region.pixels()];
+        py.detach(|| {
+            self.inner.forward(&splats, &view, Shade::over(background), false)?;
+            self.inner.bytes(&mut out)
+        })
+        .map_err(usage)?;
+        Ok(PyArray1::from_vec(py, out))
+    }
+
     /// The picture of the last pass.
     fn picture<'py>(&self, py: Python<'py>) -> Picture<'py> {
         (
@@ -251,7 +270,7 @@ fn image_loss<'py>(
 }
 
 /// Instant-NGP grid: `cells` on a side of each level, `table` entries at most a level.
-#[pyclass(frozen)]
+#[pyclass]
 struct HashGrid {
     inner: raster::HashGrid,
 }
@@ -271,7 +290,7 @@ impl HashGrid {
     }
 
     /// points [N, 3], table [entries, F] -> out [N, L * F], written in place.
-    fn forward(&self, py: Python, points: In, table: In, mut out: InOut) -> PyResult<()> {
+    fn forward(&mut self, py: Python, points: In, table: In, mut out: InOut) -> PyResult<()> {
         let (points, table) = (contiguous(points.as_slice())?, contiguous(table.as_slice())?);
         let out = contiguous(out.as_slice_mut())?;
         py.detach(|| self.inner.forward(points, table, out)).map_err(usage)
@@ -279,7 +298,7 @@ impl HashGrid {
 
     /// Adds to grad_table and overwrites grad_points.
     fn backward(
-        &self,
+        &mut self,
         py: Python,
         points: In,
         table: In,

@@ -101,6 +101,20 @@ impl Rasterizer {
         &self.alpha
     }
 
+    /// The last image as 8 bits, rounded and clamped.
+    ///
+    /// # Errors
+    /// A length other than that of the image.
+    pub fn bytes(&self, out: &mut [u8]) -> Result<(), RasterError> {
+        check_length("8-bit image", out.len(), self.image.len())?;
+        out.par_chunks_mut(1 << 14).zip(self.image.par_chunks(1 << 14)).for_each(|(out, image)| {
+            for (o, v) in out.iter_mut().zip(image) {
+                *o = (v.clamp(0.0, 1.0) * 255.0 + 0.5) as i32 as u8;
+            }
+        });
+        Ok(())
+    }
+
     pub fn projected(&self) -> &[Projected] {
         &self.projected
     }
