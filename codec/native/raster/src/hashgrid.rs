@@ -274,7 +274,11 @@ impl HashGrid {
         let (n, stride) = (points.len() / 3, self.outputs().max(1));
         self.scratch.resize(3 * n * self.levels.len(), 0.0);
         let (table, _) = table.as_chunks::<F>();
-        let levels = self.levels.par_iter().zip(self.scratch.par_chunks_mut((3 * n).max(1))).enumerate();
+        let levels = self
+            .levels
+            .par_iter()
+            .zip(self.scratch.par_chunks_mut((3 * n).max(1)))
+            .enumerate();
         levels.for_each(|(l, (level, out))| {
             let rows = &table[level.first..level.first + level.entries];
             let items = out.as_chunks_mut::<3>().0.iter_mut().zip(points.as_chunks::<3>().0);

@@ -8,6 +8,7 @@
 
 mod backward;
 mod bin;
+mod clock;
 pub mod constants;
 mod divide;
 mod forward;

@@ -4,12 +4,12 @@
 //! Gaussians), every piece owns what it writes, and sums over pairs have a fixed order: results do not depend on the threads.
 
 use std::ops::Range;
-use std::time::Instant;
 
 use rayon::prelude::*;
 
 use crate::backward::{Adjoint, Sums, backward};
 use crate::bin::Bins;
+use crate::clock::Clock;
 use crate::divide::divide;
 use crate::forward::{Canvas, forward};
 use crate::project::{CHUNK, Lens, Projected, TILE, project};
@@ -31,10 +31,6 @@ pub struct Timings {
     pub backward_tiles: f64,
     pub backward_project: f64,
     pub loss: f64,
-}
-
-pub(crate) fn ms(since: Instant) -> f64 {
-    since.elapsed().as_secs_f64() * 1e3
 }
 
 /// Colours around and on the Gaussians.
@@ -107,11 +103,13 @@ impl Rasterizer {
     /// A length other than that of the image.
     pub fn bytes(&self, out: &mut [u8]) -> Result<(), RasterError> {
         check_length("8-bit image", out.len(), self.image.len())?;
-        out.par_chunks_mut(1 << 14).zip(self.image.par_chunks(1 << 14)).for_each(|(out, image)| {
-            for (o, v) in out.iter_mut().zip(image) {
-                *o = (v.clamp(0.0, 1.0) * 255.0 + 0.5) as i32 as u8;
-            }
-        });
+        out.par_chunks_mut(1 << 14)
+            .zip(self.image.par_chunks(1 << 14))
+            .for_each(|(out, image)| {
+                for (o, v) in out.iter_mut().zip(image) {
+                    *o = (v.clamp(0.0, 1.0) * 255.0 + 0.5) as i32 as u8;
+                }
+            });
         Ok(())
     }
 
@@ -148,23 +146,23 @@ impl Rasterizer {
         shade: Shade,
         training: bool,
     ) -> Result<(), RasterError> {
-        let (level, lens, start) = (self.level, Lens::new(view), Instant::now());
+        let (level, lens, start) = (self.level, Lens::new(view), Clock::start());
         self.drawn = None;
         self.projected.resize(splats.len(), Projected::default());
         self.projected.par_chunks_mut(SHARE).enumerate().for_each(|(i, out)| {
             project(level, splats, &lens, i * SHARE, out);
         });
-        self.timings.project = ms(start);
-        let start = Instant::now();
+        self.timings.project = start.ms();
+        let start = Clock::start();
         let sorted = self.sort.sort(&self.projected);
         self.bins.build(&self.projected, sorted, view.region)?;
-        self.timings.bin = ms(start);
-        let start = Instant::now();
+        self.timings.bin = start.ms();
+        let start = Clock::start();
         self.masks.resize(if training { self.bins.pairs.len() } else { 0 }, 0);
         self.image.resize(3 * view.region.pixels(), 0.0);
         self.alpha.resize(view.region.pixels(), 0.0);
         self.blend(view.region, shade);
-        self.timings.blend = ms(start);
+        self.timings.blend = start.ms();
         if training {
             self.drawn = Some((lens, view.region, shade));
         }
@@ -241,13 +239,13 @@ impl Rasterizer {
         )?;
         check_length("gradient of the image", grad_image.len(), 3 * region.pixels())?;
         check_length("gradient of alpha", grad_alpha.len(), region.pixels())?;
-        let start = Instant::now();
+        let start = Clock::start();
         self.sums.resize(self.bins.pairs.len(), Sums::ZERO);
         self.backward_tiles(region.width, shade, grad_image, grad_alpha);
-        self.timings.backward_tiles = ms(start);
-        let start = Instant::now();
+        self.timings.backward_tiles = start.ms();
+        let start = Clock::start();
         self.backward_gaussians(splats, &lens, out);
-        self.timings.backward_project = ms(start);
+        self.timings.backward_project = start.ms();
         self.drawn = Some((lens, region, shade));
         Ok(())
     }
