@@ -70,6 +70,21 @@ def test_picture_and_gradients_match_the_torch_reference(simd, k):
         assert (g - w).norm() <= 1e-4 * w.norm(), name
 
 
+def test_gaussians_beyond_the_field_of_view_match_the_reference():
+    # Wide ones whose centres are past the clamp of the Jacobian, and some nearer than the near plane.
+    cam, exact = camera(), scene(n=60, k=3, log_scale=-0.8)
+    with torch.no_grad():
+        exact[0][:, :2].mul_(6)
+        exact[0][::9, 2] = -2.6
+        exact[3].sub_(1.0)
+    params = [p.detach().float().requires_grad_() for p in exact]
+    want_image, _, want = gradients(rasterize_reference, exact, cam)
+    image, _, got = gradients(rasterize, params, cam)
+    assert (image - want_image).abs().max() < 1e-4
+    for name, g, w in zip(PARAMETERS, got, want, strict=True):
+        assert (g - w).norm() <= 1e-3 * w.norm(), name
+
+
 def test_reference_gradients_match_finite_differences():
     # Few large, faint Gaussians: no pixel crosses a threshold within the step.
     cam, params = camera(17, 13), scene(n=4, k=3, log_scale=-0.3)

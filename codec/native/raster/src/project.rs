@@ -80,12 +80,13 @@ impl Soa {
         columns(&mut self.log_scales, &s.log_scales[3 * first..3 * (first + n)]);
         columns(&mut self.sh0, &s.sh0[3 * first..3 * (first + n)]);
         self.logits[..n].copy_from_slice(&s.logit_opacities[first..first + n]);
-        let stride = 3 * s.sh_k;
-        for k in 0..s.sh_k {
-            for lane in 0..n {
-                let at = (first + lane) * stride + 3 * k;
-                for ch in 0..3 {
-                    self.sh_n[k][ch][lane] = s.sh_n[at + ch];
+        if s.sh_k > 0 {
+            let own = s.sh_n[3 * s.sh_k * first..].chunks_exact(3 * s.sh_k);
+            for (lane, item) in own.take(n).enumerate() {
+                for (rows, rgb) in self.sh_n.iter_mut().zip(item.as_chunks::<3>().0) {
+                    for ch in 0..3 {
+                        rows[ch][lane] = rgb[ch];
+                    }
                 }
             }
         }

@@ -37,12 +37,17 @@ impl GradientRows {
                 out.quats[4 * g + d] = keep(self.rows[3 + d][lane]);
             }
             out.logit_opacities[g] = keep(self.rows[10][lane]);
-            for i in 0..3 * k {
-                out.sh_n[3 * k * g + i] = keep(self.sh_n[i / 3][i % 3][lane]);
-            }
             out.grad2d[g] = keep(self.rows[14][lane]);
             out.sum_weight[g] = sums[9][lane];
             out.max_weight[g] = sums[10][lane];
+            let sh_n = &mut out.sh_n[3 * k * g..3 * k * (g + 1)];
+            if seen >> lane & 1 == 0 {
+                sh_n.fill(0.0);
+                continue;
+            }
+            for (out, rows) in sh_n.as_chunks_mut::<3>().0.iter_mut().zip(&self.sh_n) {
+                *out = [rows[0][lane], rows[1][lane], rows[2][lane]];
+            }
         }
     }
 }
