@@ -2,12 +2,11 @@
 
 use crate::backward::Sums;
 use crate::bin::Bins;
-use crate::project::{CHUNK, Ewa, Lens, Soa, WHITEN, colour, direction, dot3, ewa};
+use crate::project::{Ewa, Lens, WHITEN, colour, direction, dot3, ewa};
 use crate::scene::{Gradients, Splats};
 use crate::sh;
 use crate::simd::{Vector, c, dispatch, prefetch};
-
-type Row = [f32; CHUNK];
+use crate::soa::{CHUNK, Row, Soa};
 
 /// Rows of the chunk: means 0-2, quats 3-6, log_scales 7-9, logit 10, sh0 11-13, grad2d 14; and shN.
 pub struct GradientRows {
