@@ -6,7 +6,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from gscodec.camera import Camera, look_at  # noqa: E402
-from gscodec.errors import UsageError  # noqa: E402
+from gscodec.errors import LimitError, UsageError  # noqa: E402
 from gscodec.gaussians import Gaussians  # noqa: E402
 from gscodec.render.image import render_image, render_rgba  # noqa: E402
 from gscodec.render.rasterize import rasterize  # noqa: E402
@@ -263,6 +263,8 @@ def test_wrong_arguments_are_named():
         Workspace().forward(tuple(params), cam, BACKGROUND, (0, 0, 0, 3))
     with pytest.raises(UsageError, match='simd "neon9" is not available'):
         Workspace(simd="neon9")
+    with pytest.raises(LimitError, match="more than 16384 pixels on a side"):
+        render_image(g, Camera("c", cam.K, cam.viewmat, 20000, 10))
     with pytest.raises(UsageError, match="distortion"):
         render_image(g, Camera("c", cam.K, cam.viewmat, 61, 45, np.array([0.1])))
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from gscodec import _native
 from gscodec.camera import Camera
-from gscodec.errors import UsageError
+from gscodec.errors import LimitError, UsageError
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 STATISTICS = ("grad2d", "max_weight", "sum_weight")
@@ -107,8 +107,15 @@ def rgb(colour) -> list[float]:
 
 
 def call(function, *args):
-    """Calls into the native side; what it refuses is a mistake in the arguments."""
+    """Calls into the native side.
+
+    Raises:
+        UsageError: wrong arguments.
+        LimitError: too many Gaussians, pixels, or Gaussian-tile pairs.
+    """
     try:
         return function(*args)
+    except OverflowError as e:
+        raise LimitError(f"rasterizer: {e}") from None
     except ValueError as e:
         raise UsageError(f"rasterizer: {e}") from None

@@ -4,7 +4,7 @@
 mod kernels;
 
 use numpy::{PyArray1, PyReadonlyArrayDyn, PyReadwriteArrayDyn, prelude::*};
-use pyo3::exceptions::PyValueError;
+use pyo3::exceptions::{PyOverflowError, PyValueError};
 use pyo3::prelude::*;
 use raster::{Gradients, Lambdas, Level, RasterError, Region, Shade, Splats, Step, Target, View};
 
@@ -19,8 +19,12 @@ type Grads<'py> = (
 /// (image, alpha), flat
 type Picture<'py> = (Bound<'py, PyArray1<f32>>, Bound<'py, PyArray1<f32>>);
 
+/// ValueError for wrong arguments, OverflowError for what is too large.
 fn usage(e: RasterError) -> PyErr {
-    PyValueError::new_err(e.to_string())
+    match e {
+        RasterError::TooMany { .. } => PyOverflowError::new_err(e.to_string()),
+        _ => PyValueError::new_err(e.to_string()),
+    }
 }
 
 fn contiguous<T>(r: Result<T, impl std::fmt::Display>) -> PyResult<T> {
