@@ -1,5 +1,5 @@
 //! One vector interface for all kernels. A kernel is written once, generic over `Vector`; the instances are `f32` (the plain
-//! reference), AVX2 + FMA and AVX-512, chosen at run time by `Level`. `dispatch!` makes the entry point of a kernel: it
+//! reference), AVX2 + FMA and AVX-512, chosen at run time by `Level`, and WebAssembly simd128, chosen by the build. `dispatch!` makes the entry point of a kernel: it
 //! compiles the instance inside a function that has the target features, which is what lets the intrinsics inline.
 
 #[cfg(target_arch = "x86_64")]
@@ -7,6 +7,8 @@ pub mod avx2;
 #[cfg(target_arch = "x86_64")]
 pub mod avx512;
 mod scalar;
+#[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+pub mod wasm128;
 
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
 
@@ -113,7 +115,7 @@ pub(crate) fn exp2_poly<V: Vector>(f: V) -> V {
     let p = f.mul_add(c(9.570_097e-3), c(5.591_786e-2));
     let p = f.mul_add(p, c(2.402_474_5e-1));
     let p = f.mul_add(p, c(6.931_218e-1));
-    f.mul_add(p, c(9.999_992_6e-1))
+    f.mul_add(p, c(9.999_992e-1))
 }
 
 /// An instruction set that this machine has been found to have. There is no other way to make one, so kernels may rely on it.
@@ -127,6 +129,8 @@ pub(crate) enum Isa {
     Avx2,
     #[cfg(target_arch = "x86_64")]
     Avx512,
+    #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+    Wasm128,
 }
 
 impl Level {
@@ -146,6 +150,8 @@ impl Level {
                 found.push(Level(Isa::Avx2));
             }
         }
+        #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+        found.push(Level(Isa::Wasm128));
         found.push(Level::SCALAR);
         found
     }
@@ -161,6 +167,8 @@ impl Level {
             Isa::Avx2 => "avx2",
             #[cfg(target_arch = "x86_64")]
             Isa::Avx512 => "avx512",
+            #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+            Isa::Wasm128 => "wasm128",
         }
     }
 
@@ -193,6 +201,10 @@ macro_rules! dispatch {
                     $crate::simd::Isa::Avx2 => return unsafe { avx2($($arg),*) },
                     $crate::simd::Isa::Scalar => {}
                 }
+            }
+            #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+            if level.isa() == $crate::simd::Isa::Wasm128 {
+                return $kernel::<$crate::simd::wasm128::F32x4>($($arg),*);
             }
             let _ = level;
             $kernel::<f32>($($arg),*)
