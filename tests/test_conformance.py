@@ -23,8 +23,6 @@ import reference_decoder as reference  # noqa: E402
 
 MANIFEST = json.loads((VECTORS / "manifest.json").read_text())
 VALID = {Path(entry["file"]).stem: entry for entry in MANIFEST["valid"]}
-# Rules that the native decoder does not keep yet; strict, so that whoever mends it deletes the entry.
-NOT_YET_NATIVE = {"container_no_mdat": "takes a sample of which no mdat has come"}
 INVALID = {Path(entry["file"]).stem: entry for entry in MANIFEST["invalid"]}
 
 
@@ -96,7 +94,7 @@ def test_encoder_still_makes_these_integers(name):
 
 
 @pytest.mark.parametrize("name", INVALID)
-def test_invalid(name, request):
+def test_invalid(name):
     error, message, _ = make.INVALID[name]
     data = (VECTORS / INVALID[name]["file"]).read_bytes()
     with pytest.raises(getattr(reference, error)):
@@ -104,8 +102,6 @@ def test_invalid(name, request):
     if name == "header_frames_mismatch":  # the group alone is valid: who has both the fragment and the group compares
         assert [group.frames != fragment["frames"] for fragment, group in native_groups(data)] == [True]
         return
-    if name in NOT_YET_NATIVE:
-        request.applymarker(pytest.mark.xfail(strict=True, reason=NOT_YET_NATIVE[name]))
     with pytest.raises(getattr(errors, error)) as caught:
         native_groups(data)
     assert message.lower() in str(caught.value).lower()
