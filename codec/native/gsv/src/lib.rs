@@ -21,6 +21,7 @@ pub mod map;
 mod model;
 pub mod morton;
 pub mod neighbors;
+mod node_tree;
 pub mod positions;
 pub mod range_coder;
 pub mod trajectories;
