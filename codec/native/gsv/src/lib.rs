@@ -15,6 +15,7 @@ pub mod evaluate;
 pub mod fields;
 pub mod group;
 pub mod header;
+pub mod inventory;
 pub mod levels;
 pub mod lifetimes;
 pub mod map;

@@ -26,7 +26,8 @@ impl Tile {
 
     /// The box around all lanes.
     fn hull(&self) -> [[f32; 3]; 2] {
-        let fold = |v: &Lanes, f: fn(f32, f32) -> f32, start| v.iter().filter(|v| v.is_finite()).copied().fold(start, f);
+        let fold =
+            |v: &Lanes, f: fn(f32, f32) -> f32, start| v.iter().filter(|v| v.is_finite()).copied().fold(start, f);
         [
             std::array::from_fn(|a| fold(&self.low[a], f32::min, f32::INFINITY)),
             std::array::from_fn(|a| fold(&self.high[a], f32::max, 0.0)),

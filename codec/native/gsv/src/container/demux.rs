@@ -90,12 +90,18 @@ impl Demuxer {
 
     /// Bytes from `position` that need not be pushed.
     pub fn skippable(&self) -> u64 {
-        if let State::Skip { left, .. } = self.state { left } else { 0 }
+        if let State::Skip { left, .. } = self.state {
+            left
+        } else {
+            0
+        }
     }
 
     /// Passes over `n` bytes, at most `skippable`.
     pub fn skip(&mut self, n: u64) {
-        let State::Skip { left, media } = &mut self.state else { return };
+        let State::Skip { left, media } = &mut self.state else {
+            return;
+        };
         let media = *media;
         let n = n.min(*left);
         self.position = self.position.saturating_add(n);
