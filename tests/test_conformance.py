@@ -5,6 +5,7 @@ The case list of spec/vectors/make.py drives these tests and writes the files; t
 
 import hashlib
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -135,6 +136,25 @@ def test_reference_command(tmp_path):
     bad = subprocess.run([*command[:2], VECTORS / "invalid" / "unit_crc.gsv"], capture_output=True, text=True)
     assert bad.returncode == 1
     assert bad.stderr.startswith("BitstreamError: ")
+
+
+def test_picture_is_as_written():
+    """Clause 14 has the constants of the rasterizer and its spherical harmonics."""
+    text = (SPEC / "gsv.md").read_text().split("## 14. Picture")[1].split("## 15.")[0]
+    code = (SPEC.parent / "codec/native/raster/src/constants.rs").read_text()
+    constants = dict(re.findall(r"pub const (\w+): f32 = ([^;]+);", code))
+    constants.pop("LOG2_ALPHA_MIN")
+    for name, value in constants.items():
+        assert float(eval(re.search(rf"\b{name} = (\d[\d. /e-]*)", text)[1])) == float(eval(value)), name
+
+    torch = pytest.importorskip("torch")
+    from gscodec.render.reference import sh_basis
+
+    x, y, z = direction = np.array([0.48, -0.6, 0.64])
+    written = {int(k): term.strip() for k, term in re.findall(r"Y_(\d+) +=(.*?)(?=  +Y_|\n)", text)}
+    for k, value in enumerate(sh_basis(torch.tensor(direction)[None], 15)[0].tolist(), 1):
+        term = re.sub(r"(?<=[\dxyz]) (?=[xyz(])", " * ", written[k].replace("^", "**"))
+        assert eval(term, {"x": x, "y": y, "z": z}) == pytest.approx(value, rel=1e-8), f"Y_{k}"
 
 
 def test_reference_hash_is_as_written():

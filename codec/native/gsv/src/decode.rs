@@ -111,7 +111,7 @@ fn fill(group: &mut Group) {
         values.resize(n * scale.steps.len(), 0);
     }
     for (t, head) in group.trajectories.iter_mut().zip(&h.trajectories) {
-        if t.len() != n {
+        if t.channels == 0 {
             *t = Trajectories::still(head.attribute.channels(h.sh_degree), n);
         }
     }

@@ -123,6 +123,33 @@ fn what_is_cut_off_is_missing() {
     assert!(decode_damaged(&payload[..units[5].offset], LEVEL).is_err());
 }
 
+#[test]
+fn damage_where_there_are_no_gaussians() {
+    let shape = common::Shape {
+        count: 0,
+        frames: 3,
+        bits: 5,
+        sh_degree: 0,
+        nodes: 2,
+        magnitude: 3,
+        lifetimes: false,
+        moving: 0b10,
+        seed: 1,
+    };
+    let mut payload = encode_group(&common::group(&shape)).unwrap();
+    let units = unit::split(&payload).unwrap();
+    let at = units
+        .iter()
+        .find(|u| u.kind == Some(UnitType::Trajectories))
+        .unwrap()
+        .offset
+        + 4;
+    payload[at] ^= 1;
+    let (group, damage) = decode_damaged(&payload, LEVEL).unwrap();
+    assert_eq!(damage.len(), 1);
+    group.validate().unwrap();
+}
+
 /// A sound unit that breaks a rule is not damage.
 #[test]
 fn broken_rules_stay_errors() {
