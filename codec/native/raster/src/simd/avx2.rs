@@ -103,6 +103,14 @@ impl Vector for F32x8 {
         unsafe { F32x8(_mm256_andnot_ps(_mm256_set1_ps(-0.0), self.0)) }
     }
     #[inline(always)]
+    fn or(self, b: Self) -> Self {
+        unsafe { F32x8(_mm256_or_ps(self.0, b.0)) }
+    }
+    #[inline(always)]
+    fn negative(self) -> Self {
+        unsafe { F32x8(_mm256_or_ps(self.0, _mm256_set1_ps(-0.0))) }
+    }
+    #[inline(always)]
     fn sqrt(self) -> Self {
         unsafe { F32x8(_mm256_sqrt_ps(self.0)) }
     }
@@ -150,6 +158,10 @@ impl Vector for F32x8 {
     #[inline(always)]
     fn any(m: Mask8) -> bool {
         unsafe { _mm256_movemask_ps(m.0) != 0 }
+    }
+    #[inline(always)]
+    fn bits(m: Mask8) -> u32 {
+        unsafe { _mm256_movemask_ps(m.0) as u32 }
     }
     #[inline(always)]
     fn max_lane(self) -> f32 {
