@@ -35,7 +35,7 @@ class TrainSettings:
     initial_points: int = 8000
     ssim_lambda: float = 0.2
     mask_lambda: float = 0.1
-    cut_ratio: float = 1.9
+    cut_ratio: float = 2.8
     rigidity: float = 0.3
     rate_lambda: float = 0.1
     temporal_lambda: float = 0.01
