@@ -7,13 +7,21 @@
 use std::sync::atomic::AtomicU32;
 
 use crate::constants::{ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_STOP};
-use crate::project::{CHUNK, Projected};
+use crate::project::Projected;
 use crate::simd::{Vector, c, dispatch};
-use crate::tile::{BLOCK, Batch, PIXEL_X, PIXEL_Y, Plane};
+use crate::tile::{BATCH, BLOCK, Batch, PIXEL_X, PIXEL_Y, Plane};
 
 /// Sums over the pixels of a pair. With a = dL/dalpha * alpha (the gradient by ln alpha) and w the blending weight:
 /// a, a u, a v, a u^2, a u v, a v^2, w g (3), w, largest w, unused.
-pub type Sums = [f32; 12];
+///
+/// One cache line, since they are gathered in random order.
+#[derive(Clone, Copy)]
+#[repr(align(64))]
+pub struct Sums(pub [f32; 12]);
+
+impl Sums {
+    pub const ZERO: Sums = Sums([0.0; 12]);
+}
 
 /// State of the pixels of a tile.
 pub struct Adjoint {
@@ -89,14 +97,11 @@ fn backward_kernel<V: Vector>(
     sums: &mut [Sums],
 ) {
     let mut batch = Batch::new();
-    for (i, chunk) in pairs.chunks(CHUNK).enumerate() {
-        batch.fill(projected, chunk, origin);
-        for (lane, splat) in batch.splats[..chunk.len()].iter().enumerate() {
-            let (Some(&mask), Some(out)) = (masks.get(i * CHUNK + lane), sums.get_mut(i * CHUNK + lane)) else {
-                return;
-            };
+    for (i, (masks, sums)) in masks.chunks(BATCH).zip(sums.chunks_mut(BATCH)).enumerate() {
+        batch.fill(projected, &pairs[i * BATCH..], origin);
+        for ((splat, &mask), out) in batch.splats.iter().zip(masks).zip(sums) {
             if mask == 0 {
-                *out = [0.0; 12];
+                *out = Sums::ZERO;
                 continue;
             }
             let mut acc = Accumulator([c::<V>(0.0); 12], c::<V>(0.0));
@@ -105,8 +110,8 @@ fn backward_kernel<V: Vector>(
                 block_backward::<V>(splat, rest.trailing_zeros() as usize, adjoint, &mut acc);
                 rest &= rest - 1;
             }
-            V::sum12(&acc.0, out);
-            out[10] = acc.1.max_lane();
+            V::sum12(&acc.0, &mut out.0);
+            out.0[10] = acc.1.max_lane();
         }
     }
 }

@@ -1,22 +1,24 @@
 //! Depth-sorted Gaussians -> for each 16 x 16 tile the list of those whose ellipse (alpha >= ALPHA_MIN) meets it, in depth order.
 //!
-//! A counting sort: fixed chunks of the sorted order count their tiles in parallel, a prefix sum gives each (tile, chunk) its
-//! place, and the chunks fill in parallel. The places do not depend on the threads. For the backward pass each Gaussian
-//! also learns the places of its pairs, so that gradients are gathered in a fixed order instead of added atomically.
+//! A counting sort. Fixed chunks of the sorted order list and count their tiles in parallel, a prefix sum gives each
+//! (tile, chunk) its place, and the chunks fill in parallel; the places do not depend on the threads. In the chunk's list the
+//! places then replace the tiles: from them the backward pass gathers the gradients of a Gaussian in a fixed order.
 
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
 use crate::constants::LOG2_ALPHA_MIN;
-use crate::project::Projected;
+use crate::project::{Projected, SLACK, TILE};
 use crate::scene::{MAX_PAIRS, RasterError, Region};
+use crate::simd::prefetch;
 
-pub const TILE: usize = 16;
 /// Chunks of the sorted order; bounds the parallelism of binning.
 const CHUNKS: usize = 16;
-/// Widens the ellipse a little, so that rounding never loses a pixel that the blending would have drawn.
-const SLACK: f32 = 1e-3;
+/// An entry of `owned` is chunk << OFFSET_BITS | offset in the chunk's list.
+const OFFSET_BITS: u32 = 28;
+/// Items between a prefetch and its use.
+const AHEAD: usize = 12;
 
 #[derive(Default)]
 pub struct Bins {
@@ -26,10 +28,10 @@ pub struct Bins {
     pub starts: Vec<u32>,
     /// Gaussian of each pair
     pub pairs: Vec<AtomicU32>,
-    /// [N + 1] first of a Gaussian's entries in `places`
-    pub owned: Vec<u32>,
-    /// pairs of each Gaussian, as positions in `pairs`
-    pub places: Vec<AtomicU32>,
+    /// [N] where a Gaussian's entry in the lists begins; only those of visible ones mean anything
+    owned: Vec<AtomicU32>,
+    /// of each chunk: for each Gaussian the number of its pairs, then their positions in `pairs`
+    lists: Vec<Vec<u32>>,
     cursors: Vec<u32>, // [CHUNKS, tiles]
 }
 
@@ -41,11 +43,8 @@ pub fn reach(log2_opacity: f32) -> f32 {
 
 /// Calls `visit(tile)` for the tiles that the ellipse of `p` meets at pixel centres.
 #[inline(always)]
-fn for_tiles(p: &Projected, columns: usize, rows: usize, mut visit: impl FnMut(usize)) {
-    let tile = |v: f32, n: usize| ((v.max(0.0) as usize) / TILE).min(n - 1);
-    let (rx, ry) = (p.rx + SLACK, p.ry + SLACK);
-    let (x0, x1) = (tile(p.x - rx + 0.5, columns), tile(p.x + rx - 0.5, columns));
-    let (y0, y1) = (tile(p.y - ry + 0.5, rows), tile(p.y + ry - 0.5, rows));
+fn for_tiles(p: &Projected, columns: usize, mut visit: impl FnMut(usize)) {
+    let [x0, x1, y0, y1] = p.tiles.map(usize::from);
     if x0 >= x1 || y0 >= y1 {
         for row in y0..=y1.max(y0) {
             for column in x0..=x1.max(x0) {
@@ -55,33 +54,23 @@ fn for_tiles(p: &Projected, columns: usize, rows: usize, mut visit: impl FnMut(u
         return;
     }
     let q = reach(p.log2_opacity);
+    let inv = 1.0 / p.l11;
     // y where the ellipse is widest to the right
-    let peak = -p.l21 * p.l11 * rx / (p.l21 * p.l21 + p.l22 * p.l22);
+    let peak = -p.l21 * p.l11 * p.rx / (p.l21 * p.l21 + p.l22 * p.l22);
+    let tile = |v: f32| v.max(0.0) as usize / TILE;
     for row in y0..=y1 {
         let top = (row * TILE) as f32 + 0.5 - p.y;
         let bottom = top + (TILE - 1) as f32;
-        let (right, left) = (
-            end(p, q, peak.max(top).min(bottom), 1.0),
-            end(p, q, (-peak).max(top).min(bottom), -1.0),
-        );
-        if left <= right {
-            let (first, last) = (tile(p.x + left + 0.5, columns), tile(p.x + right - 0.5, columns));
+        let (yr, yl) = (peak.max(top).min(bottom), (-peak).max(top).min(bottom));
+        let (hr, hl) = (q - p.l22 * yr * p.l22 * yr, q - p.l22 * yl * p.l22 * yl);
+        if hr >= 0.0 && hl >= 0.0 {
+            let right = (hr.sqrt() - p.l21 * yr) * inv + SLACK;
+            let left = (-hl.sqrt() - p.l21 * yl) * inv - SLACK;
+            let (first, last) = (tile(p.x + left + 0.5), tile(p.x + right - 0.5));
             for column in first.max(x0)..=last.min(x1) {
                 visit(row * columns + column);
             }
         }
-    }
-}
-
-/// Right (sign 1) or left end of the ellipse u^2 + v^2 <= q on the line y, relative to the centre; empty: the other side.
-#[inline(always)]
-fn end(p: &Projected, q: f32, y: f32, sign: f32) -> f32 {
-    let v = p.l22 * y;
-    let h = q - v * v;
-    if h < 0.0 {
-        -sign * f32::INFINITY
-    } else {
-        (sign * h.sqrt() - p.l21 * y) / p.l11 + sign * SLACK
     }
 }
 
@@ -94,94 +83,112 @@ impl Bins {
         self.starts[t] as usize..self.starts[t + 1] as usize
     }
 
+    /// Where the list entry of a visible Gaussian is: chunk and offset.
+    #[inline(always)]
+    fn entry(&self, gaussian: usize) -> (&[u32], usize) {
+        let entry = self.owned[gaussian].load(Relaxed);
+        let list = &self.lists[(entry >> OFFSET_BITS) as usize];
+        (list, (entry & ((1 << OFFSET_BITS) - 1)) as usize)
+    }
+
+    /// Fetches what `places` will read.
+    #[inline(always)]
+    pub fn prefetch_places(&self, gaussian: usize) {
+        let (list, at) = self.entry(gaussian);
+        prefetch(list, at);
+    }
+
+    /// Positions in `pairs` of a visible Gaussian.
+    #[inline(always)]
+    pub fn places(&self, gaussian: usize) -> &[u32] {
+        let (list, at) = self.entry(gaussian);
+        &list[at + 1..at + 1 + list[at] as usize]
+    }
+
     /// # Errors
     /// More than MAX_PAIRS pairs.
-    pub fn build(
-        &mut self,
-        projected: &[Projected],
-        sorted: &[u64],
-        region: Region,
-        training: bool,
-    ) -> Result<(), RasterError> {
+    pub fn build(&mut self, projected: &[Projected], sorted: &[u64], region: Region) -> Result<(), RasterError> {
         (self.columns, self.rows) = (region.width.div_ceil(TILE), region.height.div_ceil(TILE));
-        let (columns, rows, tiles) = (self.columns, self.rows, self.tiles());
+        let (columns, tiles) = (self.columns, self.tiles());
         self.cursors.clear();
         self.cursors.resize(CHUNKS * tiles, 0);
+        self.lists.resize_with(CHUNKS, Vec::new);
+        self.owned.resize_with(projected.len(), AtomicU32::default);
         let share = sorted.len().div_ceil(CHUNKS).max(1);
-        self.cursors
+        let owned = &self.owned;
+        self.lists.iter_mut().for_each(Vec::clear);
+        let work = self
+            .cursors
             .par_chunks_mut(tiles)
+            .zip(&mut self.lists)
             .zip(sorted.par_chunks(share))
-            .for_each(|(count, chunk)| {
-                for key in chunk {
-                    for_tiles(&projected[*key as u32 as usize], columns, rows, |t| count[t] += 1);
+            .enumerate();
+        work.for_each(|(chunk, ((count, list), keys))| {
+            for (i, &key) in keys.iter().enumerate() {
+                if let Some(&next) = keys.get(i + AHEAD) {
+                    prefetch(projected, next as u32 as usize);
                 }
-            });
-        let total = self.prefix(tiles)?;
-        self.pairs.resize_with(total, AtomicU32::default);
-        if training {
-            self.count_owned(projected, total);
-        }
-        let (pairs, owned, places) = (&self.pairs, &self.owned, &self.places);
-        self.cursors
-            .par_chunks_mut(tiles)
-            .zip(sorted.par_chunks(share))
-            .for_each(|(cursor, chunk)| {
-                for key in chunk {
-                    let g = *key as u32;
-                    let mut own = if training { owned[g as usize] as usize } else { 0 };
-                    for_tiles(&projected[g as usize], columns, rows, |t| {
-                        pairs[cursor[t] as usize].store(g, Relaxed);
-                        if training {
-                            places[own].store(cursor[t], Relaxed);
-                            own += 1;
-                        }
-                        cursor[t] += 1;
-                    });
+                let (g, head) = (key as u32 as usize, list.len());
+                owned[g].store((chunk as u32) << OFFSET_BITS | head as u32, Relaxed);
+                list.push(0);
+                for_tiles(&projected[g], columns, |t| {
+                    count[t] += 1;
+                    list.push(t as u32);
+                });
+                list[head] = (list.len() - head - 1) as u32;
+                if list.len() > MAX_PAIRS / CHUNKS {
+                    return; // the prefix sum reports it
                 }
-            });
+            }
+        });
+        self.prefix(tiles)?;
+        self.fill(tiles, sorted, share);
         Ok(())
     }
 
-    /// Turns the counts into first places and sets `starts`.
-    fn prefix(&mut self, tiles: usize) -> Result<usize, RasterError> {
+    /// Turns the counts into first places and sets `starts` and the size of `pairs`.
+    fn prefix(&mut self, tiles: usize) -> Result<(), RasterError> {
+        let full = |list: &Vec<u32>| list.len() > MAX_PAIRS / CHUNKS;
+        if self.lists.iter().any(full) {
+            return Err(RasterError::TooMany {
+                what: "Gaussian-tile pairs",
+                limit: MAX_PAIRS,
+            });
+        }
         self.starts.clear();
-        let mut sum = 0usize;
+        let mut sum = 0;
         for t in 0..tiles {
-            self.starts.push(sum as u32);
+            self.starts.push(sum);
             for chunk in 0..CHUNKS {
-                let n = std::mem::replace(&mut self.cursors[chunk * tiles + t], sum as u32);
-                sum += n as usize;
-            }
-            if sum > MAX_PAIRS {
-                return Err(RasterError::TooMany {
-                    what: "Gaussian-tile pairs",
-                    limit: MAX_PAIRS,
-                });
+                sum += std::mem::replace(&mut self.cursors[chunk * tiles + t], sum);
             }
         }
-        self.starts.push(sum as u32);
-        Ok(sum)
+        self.starts.push(sum);
+        self.pairs.resize_with(sum as usize, AtomicU32::default);
+        Ok(())
     }
 
-    fn count_owned(&mut self, projected: &[Projected], total: usize) {
-        let (columns, rows) = (self.columns, self.rows);
-        self.owned.resize(projected.len() + 1, 0);
-        self.owned[1..]
-            .par_chunks_mut(1024)
-            .zip(projected.par_chunks(1024))
-            .for_each(|(n, p)| {
-                for (n, p) in n.iter_mut().zip(p) {
-                    *n = 0;
-                    if p.visible() {
-                        for_tiles(p, columns, rows, |_| *n += 1);
-                    }
+    /// Writes the pairs; the tiles in the lists become places.
+    fn fill(&mut self, tiles: usize, sorted: &[u64], share: usize) {
+        let pairs = &self.pairs;
+        let work = self
+            .cursors
+            .par_chunks_mut(tiles)
+            .zip(&mut self.lists)
+            .zip(sorted.par_chunks(share));
+        work.for_each(|((cursor, list), keys)| {
+            let mut rest = &mut list[..];
+            for &key in keys {
+                let Some((n, own)) = rest.split_first_mut() else { return };
+                let (own, after) = own.split_at_mut(*n as usize);
+                for tile in own {
+                    let place = &mut cursor[*tile as usize];
+                    pairs[*place as usize].store(key as u32, Relaxed);
+                    *tile = *place;
+                    *place += 1;
                 }
-            });
-        let mut sum = 0;
-        for n in &mut self.owned {
-            sum += *n;
-            *n = sum;
-        }
-        self.places.resize_with(total, AtomicU32::default);
+                rest = after;
+            }
+        });
     }
 }

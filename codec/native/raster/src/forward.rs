@@ -3,11 +3,10 @@
 
 use std::sync::atomic::AtomicU32;
 
-use crate::bin::TILE;
 use crate::constants::{ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_STOP};
-use crate::project::{CHUNK, Projected};
+use crate::project::{Projected, TILE};
 use crate::simd::{Vector, c, dispatch};
-use crate::tile::{BLOCK, Batch, PIXEL_X, PIXEL_Y, Plane, swizzle};
+use crate::tile::{BATCH, BLOCK, Batch, PIXEL_X, PIXEL_Y, Plane, swizzle};
 
 /// A tile while it is drawn.
 pub struct Canvas {
@@ -36,42 +35,50 @@ impl Canvas {
     }
 }
 
-/// Adds one Gaussian to one block; false: all pixels of the block are finished.
+/// Adds the Gaussians of the batch that `hits` names to one vector of pixels; returns those that it got to see before all
+/// pixels were finished, and whether any is unfinished.
 #[inline(always)]
-fn blend_block<V: Vector>(s: &Projected, b: usize, canvas: &mut Canvas) -> bool {
+fn blend<V: Vector>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut Canvas) -> (u64, bool) {
     let [red, green, blue] = &mut canvas.rgb;
-    let (t_row, px, py) = (
-        &mut canvas.transmittance.0[b & 15],
-        &PIXEL_X.0[b & 15],
-        &PIXEL_Y.0[b & 15],
-    );
-    let rows = [&mut red.0[b & 15], &mut green.0[b & 15], &mut blue.0[b & 15]];
-    let mut open = false;
-    for at in (0..BLOCK).step_by(V::LANES) {
-        let dx = V::load(&px[at..]) - c(s.x);
-        let dy = V::load(&py[at..]) - c(s.y);
+    let t_row = &mut canvas.transmittance.0[b & 15][at..];
+    let rows = [
+        &mut red.0[b & 15][at..],
+        &mut green.0[b & 15][at..],
+        &mut blue.0[b & 15][at..],
+    ];
+    let (px, py) = (V::load(&PIXEL_X.0[b & 15][at..]), V::load(&PIXEL_Y.0[b & 15][at..]));
+    let mut t = V::load(t_row);
+    let mut rgb = [V::load(rows[0]), V::load(rows[1]), V::load(rows[2])];
+    let mut rest = hits;
+    while rest != 0 {
+        let s = &batch.splats[rest.trailing_zeros() as usize & (BATCH - 1)];
+        rest &= rest - 1;
+        let (dx, dy) = (px - c(s.x), py - c(s.y));
         let u = dx.mul_add(c(s.l11), dy * c(s.l21));
         let v = dy * c(s.l22);
         let e = v.neg_mul_add(v, u.neg_mul_add(u, c(s.log2_opacity)));
         let alpha = e.exp2().min(c(ALPHA_MAX));
-        let t = V::load(&t_row[at..]);
         let next = alpha.neg_mul_add(t, t);
         let hit = e.ge(c(LOG2_ALPHA_MIN));
         let draw = hit & next.ge(c(TRANSMITTANCE_STOP));
         let weight = (alpha * t).select(draw, c(0.0));
         for ch in 0..3 {
-            weight
-                .mul_add(c(s.rgb[ch]), V::load(&rows[ch][at..]))
-                .store(&mut rows[ch][at..]);
+            rgb[ch] = weight.mul_add(c(s.rgb[ch]), rgb[ch]);
         }
-        let t = next.select(draw, t.min(-t).select(hit, t));
-        t.store(&mut t_row[at..]);
-        open |= V::any(c::<V>(0.0).lt(t));
+        t = next.select(draw, t.min(-t).select(hit, t));
+        if !V::any(c::<V>(0.0).lt(t)) {
+            break;
+        }
     }
-    open
+    t.store(t_row);
+    for ch in 0..3 {
+        rgb[ch].store(rows[ch]);
+    }
+    (hits & !rest, V::any(c::<V>(0.0).lt(t)))
 }
 
-/// Draws the pairs onto the canvas and leaves in `masks` the blocks that each Gaussian was drawn on, for the backward pass.
+/// Draws the pairs onto the canvas and leaves in `masks` the blocks that each Gaussian was drawn on, for the backward pass;
+/// an empty `masks` means that there is none.
 #[inline(always)]
 fn forward_kernel<V: Vector>(
     projected: &[Projected],
@@ -81,23 +88,29 @@ fn forward_kernel<V: Vector>(
     masks: &mut [u16],
 ) {
     let mut batch = Batch::new();
-    let mut hits = [0u16; CHUNK];
     masks.fill(0);
-    for (i, chunk) in pairs.chunks(CHUNK).enumerate() {
-        batch.fill(projected, chunk, origin);
-        batch.masks::<V>(&mut hits);
-        for (lane, splat) in batch.splats[..chunk.len()].iter().enumerate() {
-            let drawn = hits[lane] & canvas.live;
-            let mut rest = drawn;
-            while rest != 0 {
-                let b = rest.trailing_zeros();
-                rest &= rest - 1;
-                if !blend_block::<V>(splat, b as usize, canvas) {
-                    canvas.live &= !(1 << b);
-                }
+    for first in (0..pairs.len()).step_by(BATCH) {
+        let n = batch.fill(projected, &pairs[first..], origin);
+        let hits = batch.hits::<V>(n);
+        let mut live = canvas.live;
+        while live != 0 {
+            let b = live.trailing_zeros() as usize;
+            live &= live - 1;
+            let (mut seen, mut open) = (0, false);
+            for at in (0..BLOCK).step_by(V::LANES) {
+                let (s, o) = blend::<V>(&batch, hits[b], b, at, canvas);
+                seen |= s;
+                open |= o;
             }
-            if let Some(mask) = masks.get_mut(i * CHUNK + lane) {
-                *mask = drawn;
+            if !open {
+                canvas.live &= !(1 << b);
+            }
+            let Some(masks) = masks.get_mut(first..first + n) else {
+                continue;
+            };
+            while seen != 0 {
+                masks[seen.trailing_zeros() as usize & (BATCH - 1)] |= 1 << b;
+                seen &= seen - 1;
             }
         }
         if canvas.live == 0 {

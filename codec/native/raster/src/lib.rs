@@ -20,6 +20,7 @@ mod scene;
 mod sh;
 mod simd;
 mod sort;
+mod ssim;
 mod step;
 mod tile;
 

@@ -1,41 +1,18 @@
 //! Image loss (1 - lambda) L1 + lambda (1 - SSIM) and its gradient by the image.
 //!
 //! SSIM as in 3D Gaussian Splatting: 11 x 11 Gaussian window of sigma 1.5, zeros outside of the image, mean over pixels and
-//! channels. Images stay interleaved: a row is 3 W values and horizontal taps are 3 apart. Only E[x], E[y], E[x^2 + y^2] and
-//! E[xy] are needed, since the variances occur as their sum. Pass 1 leaves the three derivative maps of the SSIM, pass 2
-//! blurs them back. Both work on strips that fit the stack: vertical taps first, then horizontal ones.
+//! channels. Images stay interleaved: a row is 3 W values and horizontal taps are 3 apart. Pass 1 (`ssim.rs`) leaves three
+//! derivative maps of the SSIM, pass 2 blurs them back. Where both images are equal for 15 pixels around (the background),
+//! SSIM is 1 and its gradient 0, so both passes visit only the columns that matter to a band of rows.
+
+use std::ops::Range;
+
+use rayon::prelude::*;
 
 use crate::divide::divide;
 use crate::scene::{RasterError, check_length};
 use crate::simd::{Level, Vector, c, dispatch};
-
-const RADIUS: usize = 5;
-const TAPS: usize = 2 * RADIUS + 1;
-/// exp(-d^2 / (2 1.5^2)), normalised.
-const WINDOW: [f32; TAPS] = [
-    0.001_028_38,
-    0.007_598_758,
-    0.036_000_773,
-    0.109_360_69,
-    0.213_005_54,
-    0.266_011_72,
-    0.213_005_54,
-    0.109_360_69,
-    0.036_000_773,
-    0.007_598_758,
-    0.001_028_38,
-];
-const C1: f32 = 0.01 * 0.01;
-const C2: f32 = 0.03 * 0.03;
-
-/// Values of a strip, and with room for the taps on both sides (16, so that 3 * RADIUS fits and vectors align).
-const STRIP: usize = 384;
-const MARGIN: usize = 16;
-const WIDE: usize = STRIP + 2 * MARGIN;
-/// Rows of one task.
-const ROWS: usize = 8;
-
-type Wide = [f32; WIDE];
+use crate::ssim::{ROWS, derivative_rows, gradient_rows};
 
 /// Means over the (weighted) pixels and channels.
 #[derive(Clone, Copy, Default, Debug, PartialEq)]
@@ -51,6 +28,8 @@ pub struct LossValue {
 pub struct ImageLoss {
     maps: [Vec<f32>; 3],
     partial: Vec<[f64; 3]>,
+    /// Values of each row from the first to the last that differ.
+    spans: Vec<Range<usize>>,
 }
 
 /// Two images [H, W, 3] and their weights.
@@ -64,10 +43,10 @@ pub struct Pair<'a> {
 }
 
 impl Pair<'_> {
-    fn row_values(&self) -> usize {
+    pub fn row_values(&self) -> usize {
         3 * self.width
     }
-    fn rows(&self) -> usize {
+    pub fn rows(&self) -> usize {
         self.image.len() / self.row_values().max(1)
     }
 }
@@ -109,15 +88,23 @@ impl ImageLoss {
         let (values, rows) = (pair.row_values(), pair.rows());
         self.partial.clear();
         self.partial.resize(rows, [0.0; 3]);
+        self.spans.resize(rows, 0..0);
+        let rows_of = |image| <[f32]>::par_chunks_exact(image, values);
+        let spans = self
+            .spans
+            .par_iter_mut()
+            .zip(rows_of(pair.image))
+            .zip(rows_of(pair.target));
+        spans.for_each(|((span, x), y)| *span = differing(level, x, y));
         for m in &mut self.maps {
             m.resize(pair.image.len(), 0.0);
         }
+        let spans = &self.spans;
         let [a, b, d] = &mut self.maps;
-        let work = ([&mut a[..], &mut b[..], &mut d[..]], &mut self.partial[..]);
         divide(
             0..rows,
             ROWS,
-            work,
+            ([&mut a[..], &mut b[..], &mut d[..]], &mut self.partial[..]),
             &|([a, b, d], partial), r, middle| {
                 let n = middle - r.start;
                 let (a, a2) = a.split_at_mut(n * values);
@@ -126,7 +113,10 @@ impl ImageLoss {
                 let (partial, partial2) = partial.split_at_mut(n);
                 (([a, b, d], partial), ([a2, b2, d2], partial2))
             },
-            &|r, (mut maps, partial)| derivative_rows(level, pair, scale as f32, r.start, &mut maps, partial),
+            &|r, (mut maps, partial)| {
+                let columns = columns(spans, &r, 15 + ROWS + 1, 64, values);
+                derivative_rows(level, pair, scale as f32, r.start, &columns, &mut maps, partial);
+            },
         );
         self.partial
             .iter()
@@ -142,243 +132,46 @@ impl ImageLoss {
             ROWS,
             grad,
             &|g, r, middle| g.split_at_mut((middle - r.start) * values),
-            &|r, g| gradient_rows(level, pair, &maps, l1, r.start, g),
+            &|r, g| {
+                let columns = columns(&self.spans, &r, 10, 30, values);
+                gradient_rows(level, pair, &maps, l1, r.start, &columns, g);
+            },
         );
     }
 }
 
-/// Taps of `row` that are inside of the image.
-#[inline(always)]
-fn taps(row: usize, rows: usize) -> std::ops::Range<usize> {
-    RADIUS.saturating_sub(row)..TAPS.min(rows + RADIUS - row)
-}
-
-/// Values of the strip at `start` with their margin that exist in the row: first, and how many.
-#[inline(always)]
-fn extent(start: usize, values: usize) -> (usize, usize) {
-    let first = start.saturating_sub(MARGIN);
-    (first, (start + STRIP + MARGIN).min(values) - first)
-}
-
-/// sum_k w_k of [x, y, x^2 + y^2, xy] over the rows, for values at .. at + LANES.
-#[inline(always)]
-fn vertical_moments<V: Vector>(x: &[&[f32]; TAPS], y: &[&[f32]; TAPS], k: std::ops::Range<usize>, at: usize) -> [V; 4] {
-    let mut m = [c::<V>(0.0); 4];
-    for k in k {
-        let (w, x, y) = (c::<V>(WINDOW[k]), V::load(&x[k][at..]), V::load(&y[k][at..]));
-        let (wx, wy) = (w * x, w * y);
-        m[0] = m[0] + wx;
-        m[1] = m[1] + wy;
-        m[2] = wy.mul_add(y, wx.mul_add(x, m[2]));
-        m[3] = wx.mul_add(y, m[3]);
+/// The columns that matter to a band: those of all rows nearer than `reach`, widened by `margin` values and to whole vectors.
+///
+/// A gradient is nonzero within 10 pixels of a difference and uses maps 5 pixels further. Pass 2 takes 10 rows and, rounded up
+/// to vectors, at most 45 values; what it reads, 60 values and 5 rows away, is inside of what pass 1 takes for any band of
+/// such a row.
+fn columns(spans: &[Range<usize>], band: &Range<usize>, reach: usize, margin: usize, values: usize) -> Range<usize> {
+    let rows = band.start.saturating_sub(reach)..(band.end + reach).min(spans.len());
+    let used = spans[rows].iter().filter(|s| !s.is_empty());
+    let (first, last) = used.fold((usize::MAX, 0), |(a, b), s| (a.min(s.start), b.max(s.end)));
+    if first >= last {
+        return 0..0;
     }
-    m
+    first.saturating_sub(margin) / 16 * 16..(last + margin).next_multiple_of(16).min(values)
 }
 
 #[inline(always)]
-fn vertical_maps<V: Vector>(maps: &[[&[f32]; TAPS]; 3], k: std::ops::Range<usize>, at: usize) -> [V; 3] {
-    let mut m = [c::<V>(0.0); 3];
-    for k in k {
-        let w = c::<V>(WINDOW[k]);
-        for i in 0..3 {
-            m[i] = w.mul_add(V::load(&maps[i][k][at..]), m[i]);
-        }
-    }
-    m
+fn differ<V: Vector>(x: &[f32], y: &[f32], at: usize) -> bool {
+    V::any(c::<V>(0.0).lt((V::load(&x[at..]) - V::load(&y[at..])).abs()))
 }
 
+/// From the first to the last value that differs, give or take a vector.
 #[inline(always)]
-fn horizontal<V: Vector, const N: usize>(temp: &[Wide; N], at: usize) -> [V; N] {
-    let mut m = [c::<V>(0.0); N];
-    for i in 0..N {
-        for k in 0..TAPS {
-            m[i] = V::load(&temp[i][at + MARGIN + 3 * k - 3 * RADIUS..]).mul_add(c(WINDOW[k]), m[i]);
-        }
+fn differing_kernel<V: Vector>(x: &[f32], y: &[f32]) -> Range<usize> {
+    let n = x.len().min(y.len());
+    let mut first = 0;
+    while first + V::LANES <= n && !differ::<V>(x, y, first) {
+        first += V::LANES;
     }
-    m
+    let mut last = n;
+    while last >= first + V::LANES && !differ::<V>(x, y, last - V::LANES) {
+        last -= V::LANES;
+    }
+    first..last
 }
-
-/// The rows that the taps touch, `n` values from `first` on.
-#[inline(always)]
-fn tap_rows(
-    image: &[f32],
-    values: usize,
-    row: usize,
-    k: std::ops::Range<usize>,
-    first: usize,
-    n: usize,
-) -> [&[f32]; TAPS] {
-    let mut out: [&[f32]; TAPS] = [&[]; TAPS];
-    for k in k {
-        let at = (row + k - RADIUS) * values + first;
-        out[k] = &image[at..at + n];
-    }
-    out
-}
-
-/// SSIM of the local means, and its derivatives by E[x], E[x^2] and E[xy].
-#[inline(always)]
-fn ssim<V: Vector>([x, y, squares, xy]: [V; 4]) -> (V, [V; 3]) {
-    let two = c::<V>(2.0);
-    let (mxy, mm) = (x * y, x * x + y * y);
-    let (a1, a2) = (two * mxy + c(C1), two * (xy - mxy) + c(C2));
-    let (b1, b2) = (mm + c(C1), squares - mm + c(C2));
-    let inv = c::<V>(1.0) / (b1 * b2);
-    let s = a1 * a2 * inv;
-    let d_xy = two * a1 * inv;
-    let d_xx = -(s * b1 * inv);
-    let d_x = two * y * a2 * inv - two * x * s * b2 * inv - d_xy * y - two * d_xx * x;
-    (s, [d_x, d_xx, d_xy])
-}
-
-#[inline(always)]
-fn derivative_kernel<V: Vector>(
-    pair: Pair,
-    scale: f32,
-    first_row: usize,
-    maps: &mut [&mut [f32]; 3],
-    partial: &mut [[f64; 3]],
-) {
-    let (values, rows) = (pair.row_values(), pair.rows());
-    for start in (0..values).step_by(STRIP) {
-        let (first, n) = extent(start, values);
-        let offset = first + MARGIN - start;
-        let mut temp = [[0.0; WIDE]; 4];
-        for (i, sums) in partial.iter_mut().enumerate() {
-            let row = first_row + i;
-            let k = taps(row, rows);
-            let x = tap_rows(pair.image, values, row, k.clone(), first, n);
-            let y = tap_rows(pair.target, values, row, k.clone(), first, n);
-            let whole = n - n % V::LANES;
-            for at in (0..whole).step_by(V::LANES) {
-                let m = vertical_moments::<V>(&x, &y, k.clone(), at);
-                for j in 0..4 {
-                    m[j].store(&mut temp[j][offset + at..]);
-                }
-            }
-            for at in whole..n {
-                let m = vertical_moments::<f32>(&x, &y, k.clone(), at);
-                for j in 0..4 {
-                    temp[j][offset + at] = m[j];
-                }
-            }
-            derivative_strip::<V>(pair, scale, row, start, &temp, i * values, maps, sums);
-        }
-    }
-}
-
-/// Horizontal taps and SSIM of one row of a strip.
-#[inline(always)]
-#[allow(clippy::too_many_arguments)]
-fn derivative_strip<V: Vector>(
-    pair: Pair,
-    scale: f32,
-    row: usize,
-    start: usize,
-    temp: &[Wide; 4],
-    out_at: usize,
-    maps: &mut [&mut [f32]; 3],
-    sums: &mut [f64; 3],
-) {
-    let values = pair.row_values();
-    let n = STRIP.min(values - start);
-    let mut out = [[0.0; STRIP]; 4];
-    for at in (0..n).step_by(V::LANES) {
-        let (s, d) = ssim(horizontal::<V, 4>(temp, at));
-        for j in 0..3 {
-            (d[j] * c(scale)).store(&mut out[j][at..]);
-        }
-        s.store(&mut out[3][at..]);
-    }
-    let at = row * values + start;
-    let (x, y) = (&pair.image[at..at + n], &pair.target[at..at + n]);
-    let mut sum = [0.0f32; 3];
-    let mut weighted = [0.0f64; 3];
-    for i in 0..n {
-        let d = x[i] - y[i];
-        let terms = [d.abs(), d * d, out[3][i]];
-        match pair.weight {
-            None => (0..3).for_each(|j| sum[j] += terms[j]),
-            Some(w) => {
-                let w = w[(at + i) / 3];
-                (0..3).for_each(|j| out[j][i] *= w);
-                (0..3).for_each(|j| weighted[j] += f64::from(w * terms[j]));
-            }
-        }
-    }
-    for j in 0..3 {
-        sums[j] += f64::from(sum[j]) + weighted[j];
-        maps[j][out_at + start..out_at + start + n].copy_from_slice(&out[j][..n]);
-    }
-}
-dispatch!(
-    fn derivative_rows = derivative_kernel(
-        pair: Pair,
-        scale: f32,
-        first_row: usize,
-        maps: &mut [&mut [f32]; 3],
-        partial: &mut [[f64; 3]],
-    )
-);
-
-#[inline(always)]
-fn gradient_kernel<V: Vector>(pair: Pair, maps: &[&[f32]; 3], l1: f32, first_row: usize, grad: &mut [f32]) {
-    let (values, rows) = (pair.row_values(), pair.rows());
-    for start in (0..values).step_by(STRIP) {
-        let (first, n) = extent(start, values);
-        let offset = first + MARGIN - start;
-        let mut temp = [[0.0; WIDE]; 3];
-        for (i, grad) in grad.chunks_exact_mut(values).enumerate() {
-            let row = first_row + i;
-            let k = taps(row, rows);
-            let mut m: [[&[f32]; TAPS]; 3] = [[&[]; TAPS]; 3];
-            for j in 0..3 {
-                m[j] = tap_rows(maps[j], values, row, k.clone(), first, n);
-            }
-            let whole = n - n % V::LANES;
-            for at in (0..whole).step_by(V::LANES) {
-                let v = vertical_maps::<V>(&m, k.clone(), at);
-                for j in 0..3 {
-                    v[j].store(&mut temp[j][offset + at..]);
-                }
-            }
-            for at in whole..n {
-                let v = vertical_maps::<f32>(&m, k.clone(), at);
-                for j in 0..3 {
-                    temp[j][offset + at] = v[j];
-                }
-            }
-            gradient_strip::<V>(pair, l1, row, start, &temp, grad);
-        }
-    }
-}
-
-#[inline(always)]
-fn gradient_strip<V: Vector>(pair: Pair, l1: f32, row: usize, start: usize, temp: &[Wide; 3], grad: &mut [f32]) {
-    let values = pair.row_values();
-    let n = STRIP.min(values - start);
-    let at = row * values + start;
-    let mut out = [[0.0; STRIP]; 3];
-    for i in (0..n).step_by(V::LANES) {
-        let m = horizontal::<V, 3>(temp, i);
-        for j in 0..3 {
-            m[j].store(&mut out[j][i..]);
-        }
-    }
-    let (x, y) = (&pair.image[at..at + n], &pair.target[at..at + n]);
-    for (i, g) in grad[start..start + n].iter_mut().enumerate() {
-        let d = x[i] - y[i];
-        let sign = if d > 0.0 {
-            l1
-        } else if d < 0.0 {
-            -l1
-        } else {
-            0.0
-        };
-        let w = pair.weight.map_or(1.0, |w| w[(at + i) / 3]);
-        *g = out[0][i] + 2.0 * x[i] * out[1][i] + y[i] * out[2][i] + sign * w;
-    }
-}
-dispatch!(
-    fn gradient_rows = gradient_kernel(pair: Pair, maps: &[&[f32]; 3], l1: f32, first_row: usize, grad: &mut [f32])
-);
+dispatch!(fn differing = differing_kernel(x: &[f32], y: &[f32]) -> Range<usize>);

@@ -10,13 +10,19 @@ use crate::scene::{Splats, View};
 use crate::sh;
 use crate::simd::{Vector, c, dispatch};
 
+/// Side of a tile in pixels.
+pub const TILE: usize = 16;
+/// Widens the box and the ellipse a little, so that rounding never loses a pixel that the blending would have drawn.
+pub const SLACK: f32 = 1e-3;
 /// Gaussians in one SoA chunk.
 pub const CHUNK: usize = 16;
 type Row = [f32; CHUNK];
 
 /// A Gaussian on the image; x and y in pixels of the region.
+///
+/// One cache line: tiles fetch them in depth order, which is random in memory.
 #[derive(Clone, Copy, Default, Debug)]
-#[repr(C)]
+#[repr(C, align(64))]
 pub struct Projected {
     pub x: f32,
     pub y: f32,
@@ -29,6 +35,8 @@ pub struct Projected {
     /// Half width and height of the box around the pixels where alpha >= ALPHA_MIN; rx < 0: not visible.
     pub rx: f32,
     pub ry: f32,
+    /// Tiles that the box meets: first and last column, first and last row.
+    pub tiles: [u16; 4],
 }
 
 impl Projected {
@@ -274,8 +282,8 @@ pub fn colour<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize) -> [V; 3] 
     rgb
 }
 
-/// The fields of `Projected` of 16 Gaussians, as rows.
-struct Out([Row; 12]);
+/// The fields of `Projected` of 16 Gaussians, as rows; the last four are pixels, rounded down and clamped to the region.
+struct Out([Row; 16]);
 
 #[inline(always)]
 fn project_lanes<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize, out: &mut Out) {
@@ -318,12 +326,22 @@ fn project_lanes<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize, out: &m
     }
     rx.select(seen, c(-1.0)).store(&mut out.0[10][at..]);
     ry.store(&mut out.0[11][at..]);
+    let (wide, high) = (rx + c(SLACK), ry + c(SLACK));
+    let edges = [(x - wide, 0), (x + wide, 0), (y - high, 1), (y + high, 1)];
+    for (i, (edge, axis)) in edges.into_iter().enumerate() {
+        // the first pixel centre at or after the edge; the last one at or before it
+        let pixel = if i % 2 == 0 { edge + c(0.5) } else { edge - c(0.5) };
+        pixel
+            .max(c(0.0))
+            .min(c(lens.size[axis] - 1.0))
+            .store(&mut out.0[12 + i][at..]);
+    }
 }
 
 #[inline(always)]
 fn project_kernel<V: Vector>(splats: &Splats, lens: &Lens, first: usize, out: &mut [Projected]) {
     let mut soa = Soa::new();
-    let mut rows = Out([[0.0; CHUNK]; 12]);
+    let mut rows = Out([[0.0; CHUNK]; 16]);
     for (i, block) in out.chunks_mut(CHUNK).enumerate() {
         soa.fill(splats, first + i * CHUNK);
         for at in (0..CHUNK).step_by(V::LANES) {
@@ -342,6 +360,8 @@ fn project_kernel<V: Vector>(splats: &Splats, lens: &Lens, first: usize, out: &m
                 depth: f[9][lane],
                 rx: f[10][lane],
                 ry: f[11][lane],
+                tiles: [f[12][lane], f[13][lane], f[14][lane], f[15][lane]]
+                    .map(|pixel| (pixel as i32 / TILE as i32) as u16),
             };
         }
     }

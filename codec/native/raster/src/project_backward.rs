@@ -1,13 +1,11 @@
 //! Sums over the pixels of a Gaussian -> gradients of its parameters; the mirror of project.rs, 16 Gaussians at a time.
 
-use std::sync::atomic::Ordering::Relaxed;
-
 use crate::backward::Sums;
 use crate::bin::Bins;
 use crate::project::{CHUNK, Ewa, Lens, Projected, Soa, WHITEN, colour, direction, dot3, ewa};
 use crate::scene::{Gradients, Splats};
 use crate::sh;
-use crate::simd::{Vector, c, dispatch};
+use crate::simd::{Vector, c, dispatch, prefetch};
 
 type Row = [f32; CHUNK];
 
@@ -49,17 +47,28 @@ impl GradientRows {
     }
 }
 
-/// Adds up the pairs of 16 Gaussians, in the order of their tiles. Lanes that are not visible become 0.
+/// Adds up the pairs of 16 Gaussians, in the order of their tiles, and fetches those of the next 16. Lanes that are not
+/// visible become 0.
 pub fn gather(bins: &Bins, sums: &[Sums], projected: &[Projected], first: usize, n: usize) -> [Row; 12] {
     let mut rows = [[0.0; CHUNK]; 12];
+    for (g, p) in projected.iter().enumerate().skip(first + 3 * CHUNK).take(CHUNK) {
+        if p.visible() {
+            bins.prefetch_places(g);
+        }
+    }
+    for (g, p) in projected.iter().enumerate().skip(first + CHUNK).take(CHUNK) {
+        if p.visible() {
+            bins.places(g).iter().for_each(|&place| prefetch(sums, place as usize));
+        }
+    }
     for lane in 0..n {
         let g = first + lane;
         if !projected[g].visible() {
             continue;
         }
         let mut total = [0.0f32; 12];
-        for place in &bins.places[bins.owned[g] as usize..bins.owned[g + 1] as usize] {
-            let s = &sums[place.load(Relaxed) as usize];
+        for &place in bins.places(g) {
+            let s = &sums[place as usize].0;
             for k in 0..10 {
                 total[k] += s[k];
             }

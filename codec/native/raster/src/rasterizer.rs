@@ -9,10 +9,10 @@ use std::time::Instant;
 use rayon::prelude::*;
 
 use crate::backward::{Adjoint, Sums, backward};
-use crate::bin::{Bins, TILE};
+use crate::bin::Bins;
 use crate::divide::divide;
 use crate::forward::{Canvas, forward};
-use crate::project::{CHUNK, Lens, Projected, project};
+use crate::project::{CHUNK, Lens, Projected, TILE, project};
 use crate::project_backward::{GradientRows, gather, project_backward};
 use crate::scene::{Gradients, RasterError, Region, Splats, View, check_length};
 use crate::simd::Level;
@@ -143,7 +143,7 @@ impl Rasterizer {
         self.timings.project = ms(start);
         let start = Instant::now();
         let sorted = self.sort.sort(&self.projected);
-        self.bins.build(&self.projected, sorted, view.region, training)?;
+        self.bins.build(&self.projected, sorted, view.region)?;
         self.timings.bin = ms(start);
         let start = Instant::now();
         self.masks.resize(if training { self.bins.pairs.len() } else { 0 }, 0);
@@ -174,6 +174,10 @@ impl Rasterizer {
                 let (own, rest) = masks.split_at_mut(pairs.len().min(masks.len()));
                 masks = rest;
                 let x = column * TILE;
+                if pairs.is_empty() {
+                    finish_empty(shade, x, width, image, alpha);
+                    continue;
+                }
                 let mut canvas = Canvas::new(width - x, alpha.len() / width);
                 forward(
                     level,
@@ -222,7 +226,7 @@ impl Rasterizer {
         check_length("gradient of the image", grad_image.len(), 3 * region.pixels())?;
         check_length("gradient of alpha", grad_alpha.len(), region.pixels())?;
         let start = Instant::now();
-        self.sums.resize(self.bins.pairs.len(), [0.0; 12]);
+        self.sums.resize(self.bins.pairs.len(), Sums::ZERO);
         self.backward_tiles(region.width, shade, grad_image, grad_alpha);
         self.timings.backward_tiles = ms(start);
         let start = Instant::now();
@@ -299,23 +303,48 @@ fn cut_pairs<'a, T>(pairs: &'a mut [T], bins: &Bins, first: usize, middle: usize
 
 /// Writes a finished tile to the rows of its band.
 fn finish(canvas: &Canvas, shade: Shade, x: usize, width: usize, image: &mut [f32], alpha: &mut [f32]) {
-    let (columns, gain) = (TILE.min(width - x), shade.gain.unwrap_or([1.0; 3]));
+    let (gain, back) = (shade.gain.unwrap_or([1.0; 3]), shade.background);
+    let whole = width - x >= TILE;
     for (y, (image, alpha)) in image
         .chunks_exact_mut(3 * width)
         .zip(alpha.chunks_exact_mut(width))
         .enumerate()
     {
-        let pixels = image[3 * x..3 * (x + columns)]
-            .chunks_exact_mut(3)
-            .zip(&mut alpha[x..x + columns]);
-        for (i, (rgb, alpha)) in pixels.enumerate() {
-            let (b, k) = swizzle(i, y);
-            let t = canvas.transmittance.0[b][k].abs();
-            for ch in 0..3 {
-                rgb[ch] = gain[ch] * canvas.rgb[ch].0[b][k] + t * shade.background[ch];
+        let mut rgb_row = [0.0; 3 * TILE];
+        let mut alpha_row = [0.0; TILE];
+        let four = y % 4 * 4..y % 4 * 4 + 4;
+        for column in 0..4 {
+            let b = (y / 4 * 4 + column) & 15;
+            let t = &canvas.transmittance.0[b][four.clone()];
+            let [r, g, b] = [0, 1, 2].map(|ch| &canvas.rgb[ch].0[b][four.clone()]);
+            for i in 0..4 {
+                let (at, t) = (4 * column + i, t[i].abs());
+                rgb_row[3 * at] = gain[0] * r[i] + t * back[0];
+                rgb_row[3 * at + 1] = gain[1] * g[i] + t * back[1];
+                rgb_row[3 * at + 2] = gain[2] * b[i] + t * back[2];
+                alpha_row[at] = 1.0 - t;
             }
-            *alpha = 1.0 - t;
         }
+        let (image, alpha) = (&mut image[3 * x..], &mut alpha[x..]);
+        if whole {
+            image[..3 * TILE].copy_from_slice(&rgb_row);
+            alpha[..TILE].copy_from_slice(&alpha_row);
+        } else {
+            image.copy_from_slice(&rgb_row[..image.len()]);
+            alpha.copy_from_slice(&alpha_row[..alpha.len()]);
+        }
+    }
+}
+
+/// A tile without Gaussians.
+fn finish_empty(shade: Shade, x: usize, width: usize, image: &mut [f32], alpha: &mut [f32]) {
+    let columns = TILE.min(width - x);
+    for (image, alpha) in image.chunks_exact_mut(3 * width).zip(alpha.chunks_exact_mut(width)) {
+        image[3 * x..3 * (x + columns)]
+            .as_chunks_mut::<3>()
+            .0
+            .fill(shade.background);
+        alpha[x..x + columns].fill(0.0);
     }
 }
 
@@ -341,18 +370,19 @@ impl Pixels<'_> {
             (self.alpha.len() / self.width - y).min(TILE),
             shade.gain.unwrap_or([1.0; 3]),
         );
+        let columns = TILE.min(self.width - x);
         for j in 0..rows {
-            for i in 0..TILE.min(self.width - x) {
-                let at = (y + j) * self.width + x + i;
+            let at = (y + j) * self.width + x;
+            let image = &self.image[3 * at..3 * (at + columns)];
+            let grad = &self.grad_image[3 * at..3 * (at + columns)];
+            let (alpha, grad_alpha) = (&self.alpha[at..at + columns], &self.grad_alpha[at..at + columns]);
+            for (i, (g, c)) in grad.as_chunks::<3>().0.iter().zip(image.as_chunks::<3>().0).enumerate() {
                 let (b, k) = swizzle(i, j);
                 a.transmittance.0[b][k] = 1.0;
-                let mut rest = -(1.0 - self.alpha[at]) * self.grad_alpha[at];
                 for ch in 0..3 {
-                    let g = self.grad_image[3 * at + ch];
-                    rest += g * self.image[3 * at + ch];
-                    a.rgb[ch].0[b][k] = g * gain[ch];
+                    a.rgb[ch].0[b][k] = g[ch] * gain[ch];
                 }
-                a.remainder.0[b][k] = rest;
+                a.remainder.0[b][k] = g[0] * c[0] + g[1] * c[1] + g[2] * c[2] - (1.0 - alpha[i]) * grad_alpha[i];
             }
         }
         a

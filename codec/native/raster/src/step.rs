@@ -34,6 +34,17 @@ pub struct StepValue {
     pub gain: [f64; 3],
 }
 
+/// v / 255
+static BYTE: [f32; 256] = {
+    let mut table = [0.0; 256];
+    let mut v = 0;
+    while v < 256 {
+        table[v] = v as f32 / 255.0;
+        v += 1;
+    }
+    table
+};
+
 /// Buffers of a step, [H, W, ...] of the region.
 #[derive(Default)]
 pub struct Step {
@@ -129,29 +140,30 @@ impl Step {
             let at = (region.y + y) * view.width + region.x;
             let rgb = &target.rgb[3 * at..3 * (at + width)];
             let Some(alpha) = target.alpha.map(|a| &a[at..at + width]) else {
-                out.iter_mut()
-                    .zip(rgb)
-                    .for_each(|(o, &v)| *o = f32::from(v) * (1.0 / 255.0));
+                out.iter_mut().zip(rgb).for_each(|(o, &v)| *o = BYTE[usize::from(v)]);
                 grad.fill(0.0);
                 sums[0] = 0.0;
                 return;
             };
             let mut sum = 0.0;
-            for (x, &a) in alpha.iter().enumerate() {
-                let a = f32::from(a) * (1.0 / 255.0);
-                for ch in 0..3 {
-                    let v = f32::from(rgb[3 * x + ch]) * (1.0 / 255.0);
-                    out[3 * x + ch] = v * a + (1.0 - a) * shade.background[ch];
-                }
-                let d = drawn[x] - a;
-                sum += d.abs();
-                grad[x] = if d > 0.0 {
-                    slope
-                } else if d < 0.0 {
-                    -slope
-                } else {
-                    0.0
+            let pixels = out
+                .as_chunks_mut::<3>()
+                .0
+                .iter_mut()
+                .zip(rgb.as_chunks::<3>().0)
+                .zip(alpha);
+            for (((out, rgb), &a), (grad, drawn)) in pixels.zip(grad.iter_mut().zip(drawn)) {
+                *out = match a {
+                    0 => shade.background,
+                    255 => rgb.map(|v| BYTE[usize::from(v)]),
+                    _ => {
+                        let a = BYTE[usize::from(a)];
+                        [0, 1, 2].map(|ch| BYTE[usize::from(rgb[ch])] * a + (1.0 - a) * shade.background[ch])
+                    }
                 };
+                let d = drawn - BYTE[usize::from(a)];
+                sum += d.abs();
+                *grad = slope * (f32::from(d > 0.0) - f32::from(d < 0.0));
             }
             sums[0] = f64::from(sum);
         });

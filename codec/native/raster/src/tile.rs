@@ -1,14 +1,16 @@
 //! What the forward and backward tile kernels share: a tile is 16 blocks of 4 x 4 pixels, block by block in memory, so that
-//! a small ellipse touches few vectors; and for each Gaussian of the tile the 16-bit mask of the blocks its ellipse meets.
+//! a small ellipse touches few vectors; and for a batch of Gaussians, which of them meet each block.
 
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
-use crate::bin::{TILE, reach};
-use crate::project::{CHUNK, Projected};
-use crate::simd::{Vector, c};
+use crate::bin::reach;
+use crate::project::{Projected, TILE};
+use crate::simd::{Vector, c, prefetch};
 
 pub const BLOCKS: usize = 16;
 pub const BLOCK: usize = 16;
+/// Gaussians of one batch, the bits of a mask.
+pub const BATCH: usize = 64;
 
 /// One value a pixel, [block][pixel of the block].
 #[derive(Clone, Copy)]
@@ -41,56 +43,60 @@ pub fn swizzle(x: usize, y: usize) -> (usize, usize) {
     ((y / 4 * 4 + x / 4) & 15, (y % 4 * 4 + x % 4) & 15)
 }
 
-/// Up to 16 Gaussians of the tile, copied together, positions relative to the tile.
+/// Up to 64 Gaussians of the tile, copied together, positions relative to the tile.
 pub struct Batch {
-    pub splats: [Projected; CHUNK],
-    rows: [[f32; CHUNK]; 6], // x y l11 l21 l22 reach
+    pub splats: [Projected; BATCH],
+    rows: [[f32; BATCH]; 6], // x y l11 l21 l22 reach
 }
 
 impl Batch {
     pub fn new() -> Batch {
         Batch {
-            splats: [Projected::default(); CHUNK],
-            rows: [[0.0; CHUNK]; 6],
+            splats: [Projected::default(); BATCH],
+            rows: [[0.0; BATCH]; 6],
         }
     }
 
+    /// The first 64 of `pairs`; those after them are fetched for the next call. Returns how many.
     #[inline(always)]
-    pub fn fill(&mut self, projected: &[Projected], pairs: &[AtomicU32], origin: [f32; 2]) {
-        for (lane, (s, pair)) in self.splats.iter_mut().zip(pairs).enumerate() {
+    pub fn fill(&mut self, projected: &[Projected], pairs: &[AtomicU32], origin: [f32; 2]) -> usize {
+        for pair in pairs.iter().skip(BATCH).take(BATCH) {
+            prefetch(projected, pair.load(Relaxed) as usize);
+        }
+        for (s, pair) in self.splats.iter_mut().zip(pairs) {
             *s = projected[pair.load(Relaxed) as usize];
             s.x -= origin[0];
             s.y -= origin[1];
+        }
+        pairs.len().min(BATCH)
+    }
+
+    /// Exact test of each ellipse against the pixel centres of each block: bit i of hits[b] is Gaussian i on block b.
+    #[inline(always)]
+    pub fn hits<V: Vector>(&mut self, n: usize) -> [u64; BLOCKS] {
+        for (lane, s) in self.splats[..n].iter().enumerate() {
             let fields = [s.x, s.y, s.l11, s.l21, s.l22, reach(s.log2_opacity)];
             for (row, v) in self.rows.iter_mut().zip(fields) {
                 row[lane] = v;
             }
         }
-    }
-
-    /// Exact test of each ellipse against the pixel centres of each block.
-    #[inline(always)]
-    pub fn masks<V: Vector>(&self, masks: &mut [u16; CHUNK]) {
-        for at in (0..CHUNK).step_by(V::LANES) {
-            let mut bits = [0.0; CHUNK];
-            self.mask_lanes::<V>(at).store(&mut bits);
-            for lane in 0..V::LANES {
-                masks[at + lane] = bits[lane] as u16;
-            }
+        let mut hits = [0; BLOCKS];
+        for at in (0..n).step_by(V::LANES) {
+            self.hit_lanes::<V>(at, &mut hits);
         }
+        let valid = if n == BATCH { u64::MAX } else { (1 << n) - 1 };
+        hits.map(|h| h & valid)
     }
 
-    /// The masks as exact small floats, which spares the vector interface integers.
     #[inline(always)]
-    fn mask_lanes<V: Vector>(&self, at: usize) -> V {
+    fn hit_lanes<V: Vector>(&self, at: usize, hits: &mut [u64; BLOCKS]) {
         let r = &self.rows;
         let (x, y) = (V::load(&r[0][at..]), V::load(&r[1][at..]));
         let (l11, l21, l22) = (V::load(&r[2][at..]), V::load(&r[3][at..]), V::load(&r[4][at..]));
         let q = V::load(&r[5][at..]);
-        // y where the ellipse is widest to the right: l21 sqrt(q) / (l22 sqrt(l21^2 + l22^2)), downwards negative
+        // y where the ellipse is widest to the right: -l21 sqrt(q) / (l22 sqrt(l21^2 + l22^2))
         let norm = l21.mul_add(l21, l22 * l22);
         let peak = -(l21 * (q / norm).sqrt() / l22);
-        let mut bits = c::<V>(0.0);
         for row in 0..4 {
             let top = c::<V>(4.0 * row as f32 + 0.5) - y;
             let bottom = top + c(3.0);
@@ -105,9 +111,8 @@ impl Batch {
                 let first = (c::<V>(4.0 * column as f32 + 0.5) - x) * l11;
                 let last = (c::<V>(4.0 * column as f32 + 3.5) - x) * l11;
                 let hit = met & right.ge(first) & last.ge(left);
-                bits = (bits + c((1u32 << (4 * row + column)) as f32)).select(hit, bits);
+                hits[4 * row + column] |= u64::from(V::bits(hit)) << at;
             }
         }
-        bits
     }
 }

@@ -152,6 +152,10 @@ impl Vector for F32x8 {
         unsafe { _mm256_movemask_ps(m.0) != 0 }
     }
     #[inline(always)]
+    fn bits(m: Mask8) -> u32 {
+        unsafe { _mm256_movemask_ps(m.0) as u32 }
+    }
+    #[inline(always)]
     fn max_lane(self) -> f32 {
         let mut a = [0.0; 8];
         self.store(&mut a);

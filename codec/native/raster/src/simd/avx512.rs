@@ -134,6 +134,10 @@ impl Vector for F32x16 {
         m != 0
     }
     #[inline(always)]
+    fn bits(m: __mmask16) -> u32 {
+        m.into()
+    }
+    #[inline(always)]
     fn max_lane(self) -> f32 {
         unsafe { _mm512_reduce_max_ps(self.0) }
     }

@@ -50,6 +50,8 @@ pub trait Vector:
     /// `self` where the mask is set, `b` elsewhere.
     fn select(self, m: Self::Mask, b: Self) -> Self;
     fn any(m: Self::Mask) -> bool;
+    /// Bit i is lane i.
+    fn bits(m: Self::Mask) -> u32;
     fn max_lane(self) -> f32;
     /// The sum over the lanes of each of 12 vectors.
     fn sum12(v: &[Self; 12], out: &mut [f32; 12]);
@@ -81,6 +83,19 @@ pub trait Vector:
 #[inline(always)]
 pub(crate) fn c<V: Vector>(x: f32) -> V {
     V::splat(x)
+}
+
+/// Asks for `items[index]` to be in the cache soon.
+#[inline(always)]
+pub(crate) fn prefetch<T>(items: &[T], index: usize) {
+    #[cfg(target_arch = "x86_64")]
+    if let Some(item) = items.get(index) {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        // SAFETY: SSE is part of x86_64, and the address is that of an item.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(item).cast()) }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (items, index);
 }
 
 /// Minimax polynomial of 2^f on [-0.5, 0.5], degree 5, relative error 8e-8 before rounding.

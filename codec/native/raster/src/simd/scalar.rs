@@ -73,6 +73,10 @@ impl Vector for f32 {
         m
     }
     #[inline(always)]
+    fn bits(m: bool) -> u32 {
+        m.into()
+    }
+    #[inline(always)]
     fn max_lane(self) -> f32 {
         self
     }

@@ -1,0 +1,369 @@
+//! The two passes over rows of an image pair: derivative maps of the SSIM, and their blur back to a gradient.
+//!
+//! Only E[x], E[y], E[x^2 + y^2] and E[xy] are needed, since the variances occur as their sum. Rows are worked on in strips
+//! that live on the stack: vertical taps from the images into a wide strip, then horizontal taps 3 apart.
+
+use std::ops::Range;
+
+use crate::loss::Pair;
+use crate::simd::{Vector, c, dispatch};
+
+const RADIUS: usize = 5;
+const TAPS: usize = 2 * RADIUS + 1;
+/// exp(-d^2 / (2 1.5^2)), normalised.
+#[rustfmt::skip]
+const WINDOW: [f32; TAPS] = [
+    0.001_028_38, 0.007_598_758, 0.036_000_773, 0.109_360_69, 0.213_005_54, 0.266_011_72,
+    0.213_005_54, 0.109_360_69, 0.036_000_773, 0.007_598_758, 0.001_028_38,
+];
+const C1: f32 = 0.01 * 0.01;
+const C2: f32 = 0.03 * 0.03;
+
+/// Values of a strip, and with room for the taps on both sides (16, so that 3 * RADIUS fits and vectors align).
+const STRIP: usize = 384;
+const MARGIN: usize = 16;
+const WIDE: usize = STRIP + 2 * MARGIN;
+/// Rows of one task.
+pub const ROWS: usize = 8;
+
+#[repr(align(64))]
+struct Wide([f32; WIDE]);
+#[repr(align(64))]
+struct Narrow([f32; STRIP]);
+
+impl Wide {
+    const ZERO: Wide = Wide([0.0; WIDE]);
+}
+
+impl Narrow {
+    const ZERO: Narrow = Narrow([0.0; STRIP]);
+
+    /// `source`, then zeros.
+    fn copy(&mut self, source: &[f32]) {
+        self.0[..source.len()].copy_from_slice(source);
+        self.0[source.len()..].fill(0.0);
+    }
+}
+
+/// Where a strip lies: `n` values from `start`, with those of its margin that exist `reach`.
+struct Strip {
+    start: usize,
+    n: usize,
+    reach: Range<usize>,
+}
+
+impl Strip {
+    fn new(start: usize, end: usize, values: usize) -> Strip {
+        let n = STRIP.min(end - start);
+        Strip {
+            start,
+            n,
+            reach: start.saturating_sub(MARGIN)..(start + n + MARGIN).min(values),
+        }
+    }
+
+    /// Index in the wide strip of the first value of `reach`.
+    fn offset(&self) -> usize {
+        self.reach.start + MARGIN - self.start
+    }
+}
+
+/// Rows that the taps of `row` touch, `reach` of each; `k` says which taps are inside of the image.
+fn tap_rows<'a>(
+    image: &'a [f32],
+    values: usize,
+    row: usize,
+    k: Range<usize>,
+    reach: &Range<usize>,
+) -> [&'a [f32]; TAPS] {
+    let mut out: [&[f32]; TAPS] = [&[]; TAPS];
+    for k in k {
+        let at = (row + k - RADIUS) * values;
+        out[k] = &image[at + reach.start..at + reach.end];
+    }
+    out
+}
+
+/// Taps of `row` that are inside of the image.
+fn taps(row: usize, rows: usize) -> Range<usize> {
+    RADIUS.saturating_sub(row)..TAPS.min(rows + RADIUS - row)
+}
+
+/// sum_k w_k of [x, y, x^2 + y^2, xy] over the rows, U vectors from `at` on.
+#[inline(always)]
+fn moments<V: Vector, const U: usize>(
+    x: &[&[f32]; TAPS],
+    y: &[&[f32]; TAPS],
+    k: Range<usize>,
+    at: usize,
+    offset: usize,
+    temp: &mut [Wide; 4],
+) {
+    let mut m = [[c::<V>(0.0); U]; 4];
+    for k in k {
+        let (w, x, y) = (
+            c::<V>(WINDOW[k]),
+            &x[k][at..at + U * V::LANES],
+            &y[k][at..at + U * V::LANES],
+        );
+        for u in 0..U {
+            let (x, y) = (V::load(&x[u * V::LANES..]), V::load(&y[u * V::LANES..]));
+            let (wx, wy) = (w * x, w * y);
+            m[0][u] = m[0][u] + wx;
+            m[1][u] = m[1][u] + wy;
+            m[2][u] = wy.mul_add(y, wx.mul_add(x, m[2][u]));
+            m[3][u] = wx.mul_add(y, m[3][u]);
+        }
+    }
+    for (temp, m) in temp.iter_mut().zip(m) {
+        let temp = &mut temp.0[offset + at..offset + at + U * V::LANES];
+        for u in 0..U {
+            m[u].store(&mut temp[u * V::LANES..]);
+        }
+    }
+}
+
+/// sum_k w_k of one map over the rows.
+#[inline(always)]
+fn vertical<V: Vector, const U: usize>(
+    rows: &[&[f32]; TAPS],
+    k: Range<usize>,
+    at: usize,
+    offset: usize,
+    temp: &mut Wide,
+) {
+    let mut m = [c::<V>(0.0); U];
+    for k in k {
+        let (w, row) = (c::<V>(WINDOW[k]), &rows[k][at..at + U * V::LANES]);
+        for u in 0..U {
+            m[u] = w.mul_add(V::load(&row[u * V::LANES..]), m[u]);
+        }
+    }
+    let temp = &mut temp.0[offset + at..offset + at + U * V::LANES];
+    for u in 0..U {
+        m[u].store(&mut temp[u * V::LANES..]);
+    }
+}
+
+#[inline(always)]
+fn horizontal<V: Vector, const N: usize>(temp: &[Wide; N], at: usize) -> [V; N] {
+    let mut m = [c::<V>(0.0); N];
+    for i in 0..N {
+        let row = &temp[i].0[at + MARGIN - 3 * RADIUS..at + MARGIN + 3 * RADIUS + V::LANES];
+        for k in 0..TAPS {
+            m[i] = V::load(&row[3 * k..]).mul_add(c(WINDOW[k]), m[i]);
+        }
+    }
+    m
+}
+
+/// SSIM of the local means, and its derivatives by E[x], E[x^2] and E[xy].
+#[inline(always)]
+fn ssim<V: Vector>([x, y, squares, xy]: [V; 4]) -> (V, [V; 3]) {
+    let two = c::<V>(2.0);
+    let (mxy, mm) = (x * y, x * x + y * y);
+    let (a1, a2) = (two * mxy + c(C1), two * (xy - mxy) + c(C2));
+    let (b1, b2) = (mm + c(C1), squares - mm + c(C2));
+    let inv = c::<V>(1.0) / (b1 * b2);
+    let s = a1 * a2 * inv;
+    let d_xy = two * a1 * inv;
+    let d_xx = -(s * b1 * inv);
+    let d_x = two * y * a2 * inv - two * x * s * b2 * inv - d_xy * y - two * d_xx * x;
+    (s, [d_x, d_xx, d_xy])
+}
+
+/// The weights of the strip's values; 0 past its end.
+fn weights(pair: Pair, row: usize, strip: &Strip, out: &mut Narrow) {
+    match pair.weight {
+        None => out.0[..strip.n].fill(1.0),
+        Some(w) => {
+            let first = strip.start;
+            let row = &w[row * pair.width..(row + 1) * pair.width];
+            out.0[..strip.n]
+                .iter_mut()
+                .enumerate()
+                .for_each(|(i, o)| *o = row[(first + i) / 3]);
+        }
+    }
+    out.0[strip.n..].fill(0.0);
+}
+
+#[inline(always)]
+fn derivative_kernel<V: Vector>(
+    pair: Pair,
+    scale: f32,
+    first_row: usize,
+    columns: &Range<usize>,
+    maps: &mut [&mut [f32]; 3],
+    partial: &mut [[f64; 3]],
+) {
+    let (values, rows) = (pair.row_values(), pair.rows());
+    for (i, sums) in partial.iter_mut().enumerate() {
+        sums[2] = equal_weight(pair, first_row + i, columns);
+    }
+    for start in columns.clone().step_by(STRIP) {
+        let strip = Strip::new(start, columns.end, values);
+        let (offset, n) = (strip.offset(), strip.reach.len());
+        let mut temp = [Wide::ZERO; 4];
+        for (i, sums) in partial.iter_mut().enumerate() {
+            let row = first_row + i;
+            let k = taps(row, rows);
+            let x = tap_rows(pair.image, values, row, k.clone(), &strip.reach);
+            let y = tap_rows(pair.target, values, row, k.clone(), &strip.reach);
+            let mut at = 0;
+            while at + 4 * V::LANES <= n {
+                moments::<V, 4>(&x, &y, k.clone(), at, offset, &mut temp);
+                at += 4 * V::LANES;
+            }
+            while at + V::LANES <= n {
+                moments::<V, 1>(&x, &y, k.clone(), at, offset, &mut temp);
+                at += V::LANES;
+            }
+            for at in at..n {
+                moments::<f32, 1>(&x, &y, k.clone(), at, offset, &mut temp);
+            }
+            let out = maps
+                .each_mut()
+                .map(|m| &mut m[i * values + start..i * values + start + strip.n]);
+            derivative_strip::<V>(pair, scale, row, &strip, &temp, out, sums);
+        }
+    }
+}
+
+/// Weight of the values of a row outside of `columns`, where the images are equal and SSIM is 1.
+fn equal_weight(pair: Pair, row: usize, columns: &Range<usize>) -> f64 {
+    let Some(weight) = pair.weight else {
+        return (pair.row_values() - columns.len()) as f64;
+    };
+    let row = &weight[row * pair.width..(row + 1) * pair.width];
+    let outside = |i: &usize| !columns.contains(i);
+    (0..pair.row_values())
+        .filter(outside)
+        .map(|i| f64::from(row[i / 3]))
+        .sum()
+}
+
+/// Horizontal taps and SSIM of one row of a strip.
+#[inline(always)]
+fn derivative_strip<V: Vector>(
+    pair: Pair,
+    scale: f32,
+    row: usize,
+    strip: &Strip,
+    temp: &[Wide; 4],
+    maps: [&mut [f32]; 3],
+    sums: &mut [f64; 3],
+) {
+    let at = row * pair.row_values() + strip.start;
+    let mut local = [Narrow::ZERO; 3];
+    local[0].copy(&pair.image[at..at + strip.n]);
+    local[1].copy(&pair.target[at..at + strip.n]);
+    weights(pair, row, strip, &mut local[2]);
+    let mut sum = [c::<V>(0.0); 3];
+    for i in (0..strip.n).step_by(V::LANES) {
+        let (x, y, w) = (
+            V::load(&local[0].0[i..]),
+            V::load(&local[1].0[i..]),
+            V::load(&local[2].0[i..]),
+        );
+        let (s, d) = ssim(horizontal::<V, 4>(temp, i));
+        let difference = (x - y).abs();
+        sum[0] = difference.mul_add(w, sum[0]);
+        sum[1] = (difference * difference).mul_add(w, sum[1]);
+        sum[2] = s.mul_add(w, sum[2]);
+        for j in 0..3 {
+            (d[j] * (w * c(scale))).store(&mut local[j].0[i..]);
+        }
+    }
+    for j in 0..3 {
+        let mut lanes = [0.0f32; 16];
+        sum[j].store(&mut lanes);
+        sums[j] += lanes.iter().map(|&v| f64::from(v)).sum::<f64>();
+        maps[j].copy_from_slice(&local[j].0[..strip.n]);
+    }
+}
+dispatch!(
+    /// Writes the derivative maps of the columns, times `scale` and weight, and the sums of |x - y|, (x - y)^2 and SSIM.
+    pub fn derivative_rows = derivative_kernel(
+        pair: Pair,
+        scale: f32,
+        first_row: usize,
+        columns: &Range<usize>,
+        maps: &mut [&mut [f32]; 3],
+        partial: &mut [[f64; 3]],
+    )
+);
+
+#[inline(always)]
+fn gradient_kernel<V: Vector>(
+    pair: Pair,
+    maps: &[&[f32]; 3],
+    l1: f32,
+    first_row: usize,
+    columns: &Range<usize>,
+    grad: &mut [f32],
+) {
+    let (values, rows) = (pair.row_values(), pair.rows());
+    for row in grad.chunks_exact_mut(values) {
+        row[..columns.start].fill(0.0);
+        row[columns.end..].fill(0.0);
+    }
+    for start in columns.clone().step_by(STRIP) {
+        let strip = Strip::new(start, columns.end, values);
+        let (offset, n) = (strip.offset(), strip.reach.len());
+        let mut temp = [Wide::ZERO; 3];
+        for (i, grad) in grad.chunks_exact_mut(values).enumerate() {
+            let row = first_row + i;
+            let k = taps(row, rows);
+            for (map, temp) in maps.iter().zip(&mut temp) {
+                let map = tap_rows(map, values, row, k.clone(), &strip.reach);
+                let mut at = 0;
+                while at + 8 * V::LANES <= n {
+                    vertical::<V, 8>(&map, k.clone(), at, offset, temp);
+                    at += 8 * V::LANES;
+                }
+                while at + V::LANES <= n {
+                    vertical::<V, 1>(&map, k.clone(), at, offset, temp);
+                    at += V::LANES;
+                }
+                for at in at..n {
+                    vertical::<f32, 1>(&map, k.clone(), at, offset, temp);
+                }
+            }
+            gradient_strip::<V>(pair, l1, row, &strip, &temp, &mut grad[start..start + strip.n]);
+        }
+    }
+}
+
+#[inline(always)]
+fn gradient_strip<V: Vector>(pair: Pair, l1: f32, row: usize, strip: &Strip, temp: &[Wide; 3], grad: &mut [f32]) {
+    let at = row * pair.row_values() + strip.start;
+    let mut local = [Narrow::ZERO; 3];
+    local[0].copy(&pair.image[at..at + strip.n]);
+    local[1].copy(&pair.target[at..at + strip.n]);
+    weights(pair, row, strip, &mut local[2]);
+    let zero = c::<V>(0.0);
+    for i in (0..strip.n).step_by(V::LANES) {
+        let (x, y, w) = (
+            V::load(&local[0].0[i..]),
+            V::load(&local[1].0[i..]),
+            V::load(&local[2].0[i..]),
+        );
+        let [d_x, d_xx, d_xy] = horizontal::<V, 3>(temp, i);
+        let sign = (w * c(l1)).select(y.lt(x), zero) - (w * c(l1)).select(x.lt(y), zero);
+        let g = y.mul_add(d_xy, (x + x).mul_add(d_xx, d_x + sign));
+        g.store(&mut local[0].0[i..]);
+    }
+    grad.copy_from_slice(&local[0].0[..strip.n]);
+}
+dispatch!(
+    /// Writes whole rows of the gradient, 0 outside of the columns.
+    pub fn gradient_rows = gradient_kernel(
+        pair: Pair,
+        maps: &[&[f32]; 3],
+        l1: f32,
+        first_row: usize,
+        columns: &Range<usize>,
+        grad: &mut [f32],
+    )
+);
