@@ -7,7 +7,9 @@
 #![allow(clippy::needless_range_loop)]
 
 mod backward;
+mod bands;
 mod bin;
+mod clock;
 pub mod constants;
 mod divide;
 mod forward;
@@ -24,6 +26,7 @@ mod ssim;
 mod step;
 mod tile;
 
+pub use bands::{Band, Bands};
 pub use hashgrid::HashGrid;
 pub use loss::{ImageLoss, LossValue, Pair};
 pub use project::Projected;

@@ -3,10 +3,9 @@
 //! Target: unassociated 8-bit colour and optional alpha, composited on the same background as the Gaussians. Loss: the image
 //! loss plus mask_lambda * mean |alpha - target alpha|. Nothing a pixel large ever passes through the caller.
 
-use std::time::Instant;
-
 use rayon::prelude::*;
 
+use crate::clock::Instant;
 use crate::loss::{ImageLoss, LossValue, Pair};
 use crate::rasterizer::{Rasterizer, Shade, ms};
 use crate::scene::{Gradients, RasterError, Splats, View, check_length};

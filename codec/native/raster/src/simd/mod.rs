@@ -1,5 +1,5 @@
 //! One vector interface for all kernels. A kernel is written once, generic over `Vector`; the instances are `f32` (the plain
-//! reference), AVX2 + FMA and AVX-512, chosen at run time by `Level`. `dispatch!` makes the entry point of a kernel: it
+//! reference), AVX2 + FMA and AVX-512, chosen at run time by `Level`, and simd128 in a wasm build. `dispatch!` makes the entry point of a kernel: it
 //! compiles the instance inside a function that has the target features, which is what lets the intrinsics inline.
 
 #[cfg(target_arch = "x86_64")]
@@ -7,6 +7,8 @@ pub mod avx2;
 #[cfg(target_arch = "x86_64")]
 pub mod avx512;
 mod scalar;
+#[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+pub mod wasm;
 
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
 
@@ -119,6 +121,8 @@ pub(crate) enum Isa {
     Avx2,
     #[cfg(target_arch = "x86_64")]
     Avx512,
+    #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+    Simd128,
 }
 
 impl Level {
@@ -138,6 +142,8 @@ impl Level {
                 found.push(Level(Isa::Avx2));
             }
         }
+        #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+        found.push(Level(Isa::Simd128));
         found.push(Level::SCALAR);
         found
     }
@@ -153,6 +159,8 @@ impl Level {
             Isa::Avx2 => "avx2",
             #[cfg(target_arch = "x86_64")]
             Isa::Avx512 => "avx512",
+            #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+            Isa::Simd128 => "simd128",
         }
     }
 
@@ -185,6 +193,10 @@ macro_rules! dispatch {
                     $crate::simd::Isa::Avx2 => return unsafe { avx2($($arg),*) },
                     $crate::simd::Isa::Scalar => {}
                 }
+            }
+            #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
+            if level.isa() == $crate::simd::Isa::Simd128 {
+                return $kernel::<$crate::simd::wasm::F32x4>($($arg),*);
             }
             let _ = level;
             $kernel::<f32>($($arg),*)

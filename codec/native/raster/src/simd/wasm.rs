@@ -1,0 +1,153 @@
+//! 4 lanes, WebAssembly simd128. The feature is a property of the whole build (there is no run-time detection inside of a
+//! module), so the instance exists where the build has it, and needs no `target_feature` functions.
+//!
+//! Why `unsafe` is sound here: loads and stores check the length of the slice first, and alignment does not matter to them.
+
+use std::arch::wasm32::*;
+use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
+
+use super::{Vector, exp2_poly};
+
+#[derive(Clone, Copy)]
+pub struct F32x4(v128);
+
+/// All bits of a lane set or none.
+#[derive(Clone, Copy)]
+pub struct Mask4(v128);
+
+macro_rules! binary {
+    ($type:ident, $trait:ident, $method:ident, $intrinsic:ident) => {
+        impl $trait for $type {
+            type Output = $type;
+            #[inline(always)]
+            fn $method(self, b: $type) -> $type {
+                $type($intrinsic(self.0, b.0))
+            }
+        }
+    };
+}
+binary!(F32x4, Add, add, f32x4_add);
+binary!(F32x4, Sub, sub, f32x4_sub);
+binary!(F32x4, Mul, mul, f32x4_mul);
+binary!(F32x4, Div, div, f32x4_div);
+binary!(Mask4, BitAnd, bitand, v128_and);
+binary!(Mask4, BitOr, bitor, v128_or);
+
+impl Neg for F32x4 {
+    type Output = F32x4;
+    #[inline(always)]
+    fn neg(self) -> F32x4 {
+        F32x4(f32x4_neg(self.0))
+    }
+}
+
+impl Not for Mask4 {
+    type Output = Mask4;
+    #[inline(always)]
+    fn not(self) -> Mask4 {
+        Mask4(v128_not(self.0))
+    }
+}
+
+/// 1.5 * 2^23: adding it rounds to whole numbers, which then stand in the low bits of the mantissa.
+const ROUND: f32 = 12_582_912.0;
+
+impl Vector for F32x4 {
+    const LANES: usize = 4;
+    type Mask = Mask4;
+
+    #[inline(always)]
+    fn splat(x: f32) -> Self {
+        F32x4(f32x4_splat(x))
+    }
+    #[inline(always)]
+    fn load(s: &[f32]) -> Self {
+        assert!(s.len() >= 4);
+        // SAFETY: see the head of this file.
+        unsafe { F32x4(v128_load(s.as_ptr().cast())) }
+    }
+    #[inline(always)]
+    fn store(self, d: &mut [f32]) {
+        assert!(d.len() >= 4);
+        // SAFETY: see the head of this file.
+        unsafe { v128_store(d.as_mut_ptr().cast(), self.0) }
+    }
+    #[inline(always)]
+    fn mul_add(self, b: Self, c: Self) -> Self {
+        self * b + c
+    }
+    #[inline(always)]
+    fn neg_mul_add(self, b: Self, c: Self) -> Self {
+        c - self * b
+    }
+    #[inline(always)]
+    fn min(self, b: Self) -> Self {
+        F32x4(f32x4_pmin(b.0, self.0)) // self < b ? self : b
+    }
+    #[inline(always)]
+    fn max(self, b: Self) -> Self {
+        F32x4(f32x4_pmax(b.0, self.0))
+    }
+    #[inline(always)]
+    fn abs(self) -> Self {
+        F32x4(f32x4_abs(self.0))
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        F32x4(f32x4_sqrt(self.0))
+    }
+    #[inline(always)]
+    fn recip(self) -> Self {
+        F32x4::splat(1.0) / self
+    }
+    #[inline(always)]
+    fn exp2(self) -> Self {
+        // the operand order of pmax/pmin lets NaN through
+        let x = f32x4_pmin(f32x4_pmax(self.0, f32x4_splat(-127.0)), f32x4_splat(128.0));
+        let z = f32x4_add(x, f32x4_splat(ROUND));
+        let p = exp2_poly(F32x4(f32x4_sub(x, f32x4_sub(z, f32x4_splat(ROUND)))));
+        // 2^n from the exponent field: 0 for n = -127, infinity for n = 128
+        let e = i32x4_shl(i32x4_add(z, i32x4_splat(127)), 23);
+        F32x4(f32x4_mul(p.0, e))
+    }
+    #[inline(always)]
+    fn split_exponent(self) -> (Self, Self) {
+        let e = i32x4_sub(u32x4_shr(self.0, 23), i32x4_splat(127));
+        let m = v128_or(v128_and(self.0, i32x4_splat(0x007f_ffff)), i32x4_splat(0x3f80_0000));
+        (F32x4(m), F32x4(f32x4_convert_i32x4(e)))
+    }
+    #[inline(always)]
+    fn ge(self, b: Self) -> Mask4 {
+        Mask4(f32x4_ge(self.0, b.0))
+    }
+    #[inline(always)]
+    fn lt(self, b: Self) -> Mask4 {
+        Mask4(f32x4_lt(self.0, b.0))
+    }
+    #[inline(always)]
+    fn select(self, m: Mask4, b: Self) -> Self {
+        F32x4(v128_bitselect(self.0, b.0, m.0))
+    }
+    #[inline(always)]
+    fn any(m: Mask4) -> bool {
+        v128_any_true(m.0)
+    }
+    #[inline(always)]
+    fn bits(m: Mask4) -> u32 {
+        u32::from(i32x4_bitmask(m.0))
+    }
+    #[inline(always)]
+    fn max_lane(self) -> f32 {
+        let mut a = [0.0; 4];
+        self.store(&mut a);
+        a.iter().fold(f32::NEG_INFINITY, |m, &x| if x > m { x } else { m })
+    }
+    #[inline(always)]
+    fn sum12(v: &[Self; 12], out: &mut [f32; 12]) {
+        for (v, out) in v.iter().zip(out) {
+            let mut a = [0.0; 4];
+            v.store(&mut a);
+            *out = (a[0] + a[2]) + (a[1] + a[3]);
+        }
+    }
+}
