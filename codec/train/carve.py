@@ -64,7 +64,7 @@ def _colors(points: np.ndarray, views) -> np.ndarray:
     return np.nanmedian(colors, axis=0)
 
 
-def carve(cameras, views, count: int) -> tuple[np.ndarray, np.ndarray, float]:
+def carve(cameras, views, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Surface of the visual hull.
 
     Args:
@@ -72,7 +72,7 @@ def carve(cameras, views, count: int) -> tuple[np.ndarray, np.ndarray, float]:
         count: about so many points.
 
     Returns:
-        points [P, 3], colours [P, 3] in 0..1, spacing in world units. P may be 0 if the masks agree nowhere.
+        points [P, 3], colours [P, 3] in 0..1. P may be 0 if the masks agree nowhere.
     """
     centre = meeting_point(cameras)
     half = min(np.linalg.norm(c.center - centre) for c in cameras)
@@ -81,7 +81,7 @@ def carve(cameras, views, count: int) -> tuple[np.ndarray, np.ndarray, float]:
     occupied, _ = _lattice(low, high, step)
     occupied = occupied[_inside(occupied, views)]
     if len(occupied) == 0:
-        return np.zeros((0, 3)), np.zeros((0, 3)), step
+        return np.zeros((0, 3)), np.zeros((0, 3))
     low, high = occupied.min(0) - step, occupied.max(0) + step
     # The surface of a hull with V voxels of size s has about 6 V^(2/3) of them: refine until it has `count`.
     volume = len(occupied) * step**3
@@ -98,10 +98,10 @@ def carve(cameras, views, count: int) -> tuple[np.ndarray, np.ndarray, float]:
         if 0.7 * count < len(surface) < 1.4 * count or len(surface) == 0:
             break
         step *= np.sqrt(len(surface) / count)
-    return surface, _colors(surface, views), float(step)
+    return surface, _colors(surface, views)
 
 
-def random_box(cameras, views, count: int, seed: int) -> tuple[np.ndarray, np.ndarray, float]:
+def random_box(cameras, views, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Random points in what the cameras see, nearer ones denser; for captures without masks.
 
     Depths along random pixels of random cameras are spread evenly in 1/depth between a quarter of and three times
@@ -124,4 +124,4 @@ def random_box(cameras, views, count: int, seed: int) -> tuple[np.ndarray, np.nd
         seen += (depth > 0.01) & (p >= 0).all(1) & (p < [c.width, c.height]).all(1)
     points = points[seen >= min(2, len(cameras))]
     points = points[rng.permutation(len(points))[:count]]
-    return points, _colors(points, views), float(distance / count ** (1 / 3))
+    return points, _colors(points, views)

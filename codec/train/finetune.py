@@ -17,12 +17,12 @@ import torch
 from gscodec.bitstream.quantization import Steps, trajectory_step
 from gscodec.bitstream.transform import dct_basis
 from gscodec.gaussians import Gaussians
-from gscodec.render.step import Workspace, render_loss
+from gscodec.render.workspace import Workspace
 from gscodec.train.keyframe import RATES
 from gscodec.train.model import Model
 from gscodec.train.motion import quat_multiply
 from gscodec.train.settings import TrainSettings
-from gscodec.train.views import Views
+from gscodec.train.views import Views, compare
 
 # attribute -> (channels, temporal frequencies that may be used)
 RESIDUALS = {"means": (3, 8), "quats": (3, 4), "sh0": (3, 4)}
@@ -37,7 +37,8 @@ def laplace_bits(x: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
     """
     b = torch.exp(log_scale)
     a = x.abs()
-    inner = 1 - 0.5 * (torch.exp((a - 0.5) / b) + torch.exp(-(a + 0.5) / b))  # |x| < 1/2
+    near = a.clamp(max=0.5)  # keeps the branch that is not taken, and its gradient, finite
+    inner = 1 - 0.5 * (torch.exp((near - 0.5) / b) + torch.exp(-(near + 0.5) / b))
     tail = torch.exp(-(a - 0.5).clamp(min=0) / b) * 0.5 * (-torch.expm1(-1 / b))
     p = torch.where(a < 0.5, inner, tail)
     far = (a - 0.5).clamp(min=0) / b / np.log(2) + 1 - torch.log2(-torch.expm1(-1 / b))  # where p underflows
@@ -141,17 +142,8 @@ RATE_EVERY = 4  # the rate term has every coefficient, an image few of them: onc
 def _step(group, views, frames, t, settings, optimizer, rng, generator, workspace, rates, fade) -> float:
     params = group.frame(t)
     target = views.draw(frames[t])
-    background = rng.uniform(0, 1, 3) if target.alpha is not None else np.zeros(3)
-    result = render_loss(
-        {n: p.detach() for n, p in params.items()},
-        target.camera,
-        target.rgb,
-        target.alpha,
-        background=tuple(background),
-        ssim_lambda=settings.ssim_lambda,
-        mask_lambda=settings.mask_lambda,
-        workspace=workspace,
-    )
+    pixels = target.rgb.shape[0] * target.rgb.shape[1]
+    result = compare(params, target, settings, rng, workspace)
     optimizer.zero_grad()
     heads = [params[n] for n in ("means", "quats", "sh0")]
     seeds = [result.grads[n] for n in ("means", "quats", "sh0")]
@@ -159,9 +151,9 @@ def _step(group, views, frames, t, settings, optimizer, rng, generator, workspac
     if t + 1 < len(frames):
         for name in group.coefficients:
             change = (group.residual(name, t + 1) - group.residual(name, t)) / group.unit[name]
-            penalty = penalty + settings.temporal_lambda * change.abs().sum() / (target.area * len(change[0]))
+            penalty = penalty + settings.temporal_lambda * change.abs().sum() / (pixels * len(change[0]))
     if rng.integers(RATE_EVERY) == 0:
-        per_frame = RATE_EVERY * settings.rate_lambda / (target.area * len(frames))
+        per_frame = RATE_EVERY * settings.rate_lambda / (pixels * len(frames))
         penalty = penalty + per_frame * group.bits(generator)
     if penalty.requires_grad:
         heads, seeds = [*heads, penalty], [*seeds, torch.ones(())]

@@ -1,8 +1,7 @@
 """Keyframe: one frame's Gaussians from its views. In: views, a starting model. Out: the model, densified and pruned.
 
 3D Gaussian Splatting's recipe (Kerbl et al. 2023) shortened: Gaussians that the image pulls at are cloned when small
-and split when large, those that hardly contribute to any view go. The background behind a mask is random, so that
-opacity is learned and not painted.
+and split when large, those that hardly contribute to any view go.
 """
 
 from __future__ import annotations
@@ -12,10 +11,10 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from gscodec.render.step import Workspace, render_loss
+from gscodec.render.workspace import Workspace
 from gscodec.train.model import Model
 from gscodec.train.settings import TrainSettings
-from gscodec.train.views import Views
+from gscodec.train.views import Views, compare
 
 RATES = {"quats": 2e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 5e-3, "shN": 2.5e-4}
 MEANS_RATE = (1.6e-3, 1.6e-5)  # start, end, times the radius of the subject
@@ -67,18 +66,7 @@ def train_keyframe(
     stats = Statistics(len(model))
     model.restart()
     for step in range(steps):
-        target = views.draw(frame)
-        background = rng.uniform(0, 1, 3) if target.alpha is not None else np.zeros(3)
-        result = render_loss(
-            model.params,
-            target.camera,
-            target.rgb,
-            target.alpha,
-            background=tuple(background),
-            ssim_lambda=settings.ssim_lambda,
-            mask_lambda=settings.mask_lambda,
-            workspace=workspace,
-        )
+        result = compare(model.params, views.draw(frame), settings, rng, workspace)
         stats.add(result)
         fade = step / max(steps - 1, 1)
         rate = radius * MEANS_RATE[0] * (MEANS_RATE[1] / MEANS_RATE[0]) ** fade

@@ -65,9 +65,18 @@ class Model:
         return Gaussians(**arrays)
 
 
-def from_points(points: np.ndarray, colors: np.ndarray, spacing: float, sh_count: int = 0) -> Model:
-    """Round Gaussians as wide as their spacing, half opaque, in the given colours (0..1)."""
+def from_points(points: np.ndarray, colors: np.ndarray, *, opacity: float, sh_count: int = 0) -> Model:
+    """Round Gaussians half as wide as the distance to their neighbours, in the given colours (0..1).
+
+    Args:
+        points: [N, 3]; colors: [N, 3].
+        opacity: high where points are known to lie on the subject, low where they are guesses.
+    """
+    from scipy.spatial import cKDTree
+
     n = len(points)
+    near = cKDTree(points).query(points, min(4, n))[0].reshape(n, -1)[:, 1:] if n > 1 else np.ones((n, 1))
+    spacing = np.maximum(near.mean(1), 1e-6 + 1e-3 * near.mean())
     tensor = lambda a: torch.tensor(np.ascontiguousarray(a), dtype=torch.float32)  # noqa: E731
     quats = np.zeros((n, 4))
     quats[:, 0] = 1
@@ -75,8 +84,8 @@ def from_points(points: np.ndarray, colors: np.ndarray, spacing: float, sh_count
         {
             "means": tensor(points),
             "quats": tensor(quats),
-            "log_scales": torch.full((n, 3), float(np.log(0.5 * spacing))),
-            "logit_opacities": torch.full((n,), 0.0),
+            "log_scales": tensor(np.log(0.5 * spacing)[:, None].repeat(3, 1)),
+            "logit_opacities": torch.full((n,), float(np.log(opacity / (1 - opacity)))),
             "sh0": tensor((colors - 0.5) / SH_C0),
             "shN": torch.zeros(n, sh_count, 3),
         }

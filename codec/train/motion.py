@@ -2,8 +2,8 @@
 
 V3's motion model (Wang et al. 2024): a multi-resolution hash grid and a shallow MLP, here one field a frame on top of
 the extrapolated pose of the two frames before, so that it only has to learn the change. The field sees nothing but the
-keyframe position, hence neighbours move alike; an as-rigid-as-possible term over the k-NN graph does the rest.
-In: keyframe model, views. Out: means [T, N, 3] and quats [T, N, 4] of all frames.
+keyframe position (plain and through the grid), hence neighbours move alike; an as-rigid-as-possible term over the
+k-NN graph does the rest. In: keyframe model, views. Out: means [T, N, 3] and turns [T, N, 4] of all frames.
 """
 
 from __future__ import annotations
@@ -13,17 +13,16 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from gscodec.render.step import Workspace, render_loss
+from gscodec.render.workspace import Workspace
 from gscodec.train.hashgrid import HashGrid
-from gscodec.train.keyframe import rotate
 from gscodec.train.model import Model
 from gscodec.train.settings import TrainSettings
-from gscodec.train.views import Views
+from gscodec.train.views import Views, compare
 
 GRAPH_NEIGHBORS = 6
-FIELD_RATE = 4e-3
-TRANSLATION_UNIT = 0.02  # of the subject's radius: what an output of 1 means
-ROTATION_UNIT = 0.1  # radians
+MLP_RATE, TABLE_RATE = 4e-3, 2e-2
+TRANSLATION_UNIT = 0.1  # of the subject's radius: what an output of 1 means
+ROTATION_UNIT = 0.3  # radians
 
 
 class MotionField(torch.nn.Module):
@@ -33,14 +32,14 @@ class MotionField(torch.nn.Module):
         super().__init__()
         self.grid = HashGrid(levels=8, features=2, log2_table=14, base_resolution=4, max_resolution=resolution)
         self.mlp = torch.nn.Sequential(
-            torch.nn.Linear(16, 32), torch.nn.ReLU(), torch.nn.Linear(32, 32), torch.nn.ReLU(), torch.nn.Linear(32, 6)
+            torch.nn.Linear(19, 32), torch.nn.ReLU(), torch.nn.Linear(32, 32), torch.nn.ReLU(), torch.nn.Linear(32, 6)
         )
         torch.nn.init.zeros_(self.mlp[-1].weight)
         torch.nn.init.zeros_(self.mlp[-1].bias)
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Shapes as the class says; zero for a fresh field."""
-        out = self.mlp(self.grid(x))
+        out = self.mlp(torch.cat([self.grid(x), 2 * x - 1], 1))
         return out[:, :3] * TRANSLATION_UNIT, out[:, 3:] * ROTATION_UNIT
 
 
@@ -57,6 +56,17 @@ def rotvec_to_quat(v: torch.Tensor) -> torch.Tensor:
     return torch.cat([torch.cos(half), v * 0.5 * torch.sinc(half / torch.pi)], 1)
 
 
+def quat_to_matrix(q: torch.Tensor) -> torch.Tensor:
+    """[N, 4] unit wxyz -> [N, 3, 3]."""
+    w, x, y, z = q.unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, 1).view(-1, 3, 3)
+
+
 class RigidGraph:
     """As-rigid-as-possible over the k-NN graph of the keyframe (Sorkine and Alexa 2007)."""
 
@@ -64,22 +74,23 @@ class RigidGraph:
         from scipy.spatial import cKDTree
 
         x = means.numpy()
-        k = min(GRAPH_NEIGHBORS, len(x) - 1)
-        distance, index = cKDTree(x).query(x, k + 1) if k > 0 else (np.ones((len(x), 1)), np.zeros((len(x), 1)))
-        self.i = torch.arange(len(x)).repeat_interleave(k)
+        n, k = len(x), min(GRAPH_NEIGHBORS, len(x) - 1)
+        distance, index = cKDTree(x).query(x, k + 1) if k > 0 else (np.ones((n, 1)), np.zeros((n, 1)))
+        self.count = k
         self.j = torch.from_numpy(index[:, 1:].astype(np.int64).ravel())
-        self.edge = means[self.j] - means[self.i]
+        self.edge = (means[self.j].view(n, k, 3) - means[:, None]).contiguous()
         # Far pairs (bridges across a gap) hold less: half at twice the median distance.
-        d = torch.from_numpy(distance[:, 1:].astype(np.float32).ravel())
-        self.weight = torch.exp2(-((d / (2 * d.median().clamp(min=1e-12))) ** 2))[:, None] / radius
-        self.median = float(d.median()) if len(d) else 1.0
+        d = torch.from_numpy(distance[:, 1:].astype(np.float32))
+        middle = d.median().clamp(min=1e-12) if k > 0 else torch.ones(())
+        self.weight = torch.exp2(-((d / (2 * middle)) ** 2))[..., None] / radius
 
     def loss(self, means: torch.Tensor, turned: torch.Tensor) -> torch.Tensor:
-        """Mean weighted length by which edges miss their rotated selves; `turned` [N, 4] from the keyframe."""
-        if len(self.j) == 0:
+        """Mean weighted length by which edges miss their rotated selves; `turned` [N, 4] unit, from the keyframe."""
+        if self.count == 0:
             return means.sum() * 0
-        miss = means[self.j] - means[self.i] - rotate(turned[self.i], self.edge)
-        return (self.weight * miss).square().sum(1).add(1e-12).sqrt().mean()
+        rotated = torch.bmm(self.edge, quat_to_matrix(turned).transpose(1, 2))
+        moved = means.index_select(0, self.j).view_as(rotated) - means[:, None]
+        return (self.weight * (moved - rotated)).square().sum(2).add(1e-12).sqrt().mean()
 
 
 def track(
@@ -122,27 +133,19 @@ def _fit_frame(key, views, frame, settings, radius, start, graph, on_step):
     torch.manual_seed(settings.seed * 1000003 + frame)
     rng = np.random.default_rng([settings.seed, frame, 1])
     field, workspace = MotionField(), Workspace()
-    optimizer = torch.optim.Adam(field.parameters(), lr=FIELD_RATE, betas=(0.9, 0.99), fused=True)
+    groups = [(field.mlp.parameters(), MLP_RATE), (field.grid.parameters(), TABLE_RATE)]
+    optimizer = torch.optim.Adam(
+        [{"params": list(p), "lr": r, "base": r} for p, r in groups], betas=(0.9, 0.99), fused=True
+    )
     steps = settings.motion_steps
     for step in range(steps):
         for g in optimizer.param_groups:
-            g["lr"] = FIELD_RATE * 0.1 ** (step / steps)
+            g["lr"] = g["base"] * 0.1 ** (step / steps)
         move, turn = field(unit)
         means = base + radius * move
         turned = torch.nn.functional.normalize(quat_multiply(rotvec_to_quat(turn), base_turned), dim=1)
         quats = quat_multiply(turned, key.params["quats"])
-        target = views.draw(frame)
-        background = rng.uniform(0, 1, 3) if target.alpha is not None else np.zeros(3)
-        result = render_loss(
-            {**key.params, "means": means.detach(), "quats": quats.detach()},
-            target.camera,
-            target.rgb,
-            target.alpha,
-            background=tuple(background),
-            ssim_lambda=settings.ssim_lambda,
-            mask_lambda=settings.mask_lambda,
-            workspace=workspace,
-        )
+        result = compare({**key.params, "means": means, "quats": quats}, views.draw(frame), settings, rng, workspace)
         rigid = settings.rigidity * graph.loss(means, turned)
         optimizer.zero_grad()
         torch.autograd.backward([means, quats, rigid], [result.grads["means"], result.grads["quats"], torch.ones(())])

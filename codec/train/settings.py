@@ -34,7 +34,7 @@ class TrainSettings:
     initial_points: int = 8000
     ssim_lambda: float = 0.2
     mask_lambda: float = 0.1
-    rigidity: float = 30.0
+    rigidity: float = 1.0
     rate_lambda: float = 1.0
     temporal_lambda: float = 0.05
     quality: float = 50.0

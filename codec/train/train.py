@@ -69,13 +69,13 @@ def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
         views.append((capture.cameras[i], v.rgb, v.alpha))
     known = [c for c, _, _ in views]
     if all(alpha is not None for _, _, alpha in views):
-        points, colors, spacing = carve(known, views, settings.initial_points)
+        points, colors = carve(known, views, settings.initial_points)
         if len(points):
-            return from_points(points, colors, spacing)
-    points, colors, spacing = random_box(known, views, settings.initial_points, settings.seed)
+            return from_points(points, colors, opacity=0.5)
+    points, colors = random_box(known, views, settings.initial_points, settings.seed)
     if len(points) == 0:
         raise CaptureError(f"{capture.name}: no point is seen by two cameras, expected cameras that overlap")
-    return from_points(points, colors, spacing)
+    return from_points(points, colors, opacity=0.1)
 
 
 class Checkpoint:
@@ -126,6 +126,8 @@ def train_groups(
     Raises:
         CaptureError: a frame cannot be read, or no view overlaps another.
     """
+    # Torch only handles small tensors here; its threads would spin against those of the native kernels.
+    torch.set_num_threads(1)
     ranges = group_ranges(capture.frame_count, settings.gop)
     store = Checkpoint(checkpoints)
     last = store.load(first_group - 1) if first_group else None

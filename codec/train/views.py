@@ -11,7 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-CACHE_BYTES = 2 << 30
+from gscodec.render.step import RenderLoss, Workspace, render_loss
+from gscodec.train.settings import TrainSettings
+
+CACHE_BYTES = 2 << 30  # of decoded targets
 MARGIN = 24  # pixels of background kept around the subject
 
 
@@ -23,13 +26,11 @@ class Target:
         camera: pinhole camera of the crop.
         rgb: [H, W, 3] u8, unassociated.
         alpha: [H, W] u8 or None.
-        area: H * W of the whole view, so that losses of crops add up as those of views.
     """
 
     camera: object
     rgb: np.ndarray
     alpha: np.ndarray | None
-    area: int
 
 
 class Views:
@@ -38,10 +39,11 @@ class Views:
     def __init__(self, capture, seed: int):
         self.capture = capture
         self.train_cameras = [i for i, c in enumerate(capture.cameras) if c.split == "train"]
-        self._random = np.random.default_rng(seed)
+        self._seed = seed
         self._held: OrderedDict[tuple[int, int], Target] = OrderedDict()
         self._bytes = 0
         self._order: dict[int, list[int]] = {}
+        self._rounds: dict[int, int] = {}
 
     def target(self, camera: int, frame: int) -> Target:
         """View of camera index `camera` at `frame`, cropped to the subject."""
@@ -56,10 +58,13 @@ class Views:
         return self._held[key]
 
     def draw(self, frame: int) -> Target:
-        """The next view of `frame`; every camera once before any comes again."""
+        """The next view of `frame`; every camera once before any comes again, in an order that depends on the frame
+        and not on what was drawn before (a resumed run draws the same)."""
         order = self._order.get(frame)
         if not order:
-            order = self._order[frame] = self._random.permutation(self.train_cameras).tolist()
+            turn = self._rounds[frame] = self._rounds.get(frame, 0) + 1
+            rng = np.random.default_rng([self._seed, frame, turn])
+            order = self._order[frame] = rng.permutation(self.train_cameras).tolist()
         return self.target(order.pop(), frame)
 
     @staticmethod
@@ -70,7 +75,7 @@ class Views:
         view, cam = self.capture.view(camera, frame), self.capture.cameras[camera]
         h, w = view.rgb.shape[:2]
         if view.alpha is None or not view.alpha.any():
-            return Target(cam, np.ascontiguousarray(view.rgb), view.alpha, h * w)
+            return Target(cam, np.ascontiguousarray(view.rgb), view.alpha)
         rows, cols = np.flatnonzero(view.alpha.any(1)), np.flatnonzero(view.alpha.any(0))
         top, bottom = max(rows[0] - MARGIN, 0), min(rows[-1] + 1 + MARGIN, h)
         left, right = max(cols[0] - MARGIN, 0), min(cols[-1] + 1 + MARGIN, w)
@@ -79,5 +84,20 @@ class Views:
             cam.cropped(left, top, right - left, bottom - top),
             np.ascontiguousarray(view.rgb[crop]),
             np.ascontiguousarray(view.alpha[crop]),
-            h * w,
         )
+
+
+def compare(params: dict, target: Target, settings: TrainSettings, rng, workspace: Workspace) -> RenderLoss:
+    """Loss of Gaussians (see `render_loss`) against a target; behind a mask the background is random in each step, so
+    that opacity is learned and not painted."""
+    background = rng.uniform(0, 1, 3) if target.alpha is not None else np.zeros(3)
+    return render_loss(
+        {name: p.detach() for name, p in params.items()},
+        target.camera,
+        target.rgb,
+        target.alpha,
+        background=tuple(background),
+        ssim_lambda=settings.ssim_lambda,
+        mask_lambda=settings.mask_lambda,
+        workspace=workspace,
+    )

@@ -9,7 +9,7 @@ use std::sync::atomic::AtomicU32;
 use crate::constants::{ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_STOP};
 use crate::project::Projected;
 use crate::simd::{Vector, c, dispatch};
-use crate::tile::{BATCH, BLOCK, Batch, PIXEL_X, PIXEL_Y, Plane};
+use crate::tile::{BATCH, BLOCK, Batch, Local, PIXEL_X, PIXEL_Y, Plane};
 
 /// Sums over the pixels of a pair. With a = dL/dalpha * alpha (the gradient by ln alpha) and w the blending weight:
 /// a, a u, a v, a u^2, a u v, a v^2, w g (3), w, largest w, unused.
@@ -35,17 +35,16 @@ pub struct Adjoint {
 struct Accumulator<V>([V; 12], V);
 
 #[inline(always)]
-fn block_backward<V: Vector>(s: &Projected, b: usize, adjoint: &mut Adjoint, acc: &mut Accumulator<V>) {
+fn block_backward<V: Vector>(s: &Local, b: usize, adjoint: &mut Adjoint, acc: &mut Accumulator<V>) {
     let [red, green, blue] = &adjoint.rgb;
     let g_rows = [&red.0[b & 15], &green.0[b & 15], &blue.0[b & 15]];
     let (t_row, r_row) = (&mut adjoint.transmittance.0[b & 15], &mut adjoint.remainder.0[b & 15]);
     let (px, py) = (&PIXEL_X.0[b & 15], &PIXEL_Y.0[b & 15]);
     for at in (0..BLOCK).step_by(V::LANES) {
         let zero = c::<V>(0.0);
-        let dx = V::load(&px[at..]) - c(s.x);
-        let dy = V::load(&py[at..]) - c(s.y);
-        let u = dx.mul_add(c(s.l11), dy * c(s.l21));
-        let v = dy * c(s.l22);
+        let (x, y) = (V::load(&px[at..]), V::load(&py[at..]));
+        let u = x.mul_add(c(s.l11), y.mul_add(c(s.l21), c(s.u0)));
+        let v = y.mul_add(c(s.l22), c(s.v0));
         let e = v.neg_mul_add(v, u.neg_mul_add(u, c(s.log2_opacity)));
         let raw = e.exp2();
         let alpha = raw.min(c(ALPHA_MAX));
@@ -53,9 +52,12 @@ fn block_backward<V: Vector>(s: &Projected, b: usize, adjoint: &mut Adjoint, acc
         let next = alpha.neg_mul_add(t, t);
         let hit = e.ge(c(LOG2_ALPHA_MIN));
         let draw = hit & next.ge(c(TRANSMITTANCE_STOP));
-        next.select(draw, t.min(-t).select(hit, t)).store(&mut t_row[at..]);
+        // Not a select of the old value: that would become a masked store, whose result the next load has to wait for.
+        let drawn_alpha = alpha.select(draw, zero);
+        let sign = c::<V>(-0.0).select(hit & !draw, zero);
+        drawn_alpha.neg_mul_add(t, t).or(sign).store(&mut t_row[at..]);
 
-        let weight = (alpha * t).select(draw, zero);
+        let weight = drawn_alpha * t;
         let g = [
             V::load(&g_rows[0][at..]),
             V::load(&g_rows[1][at..]),
@@ -65,7 +67,7 @@ fn block_backward<V: Vector>(s: &Projected, b: usize, adjoint: &mut Adjoint, acc
         let wd = weight * d;
         let rest = V::load(&r_row[at..]) - wd;
         rest.store(&mut r_row[at..]);
-        let odds = alpha * (c::<V>(1.0) - alpha).recip();
+        let odds = alpha * (c::<V>(1.0) - alpha).recip_fast();
         // the clamp at ALPHA_MAX stops the gradient
         let a = odds
             .neg_mul_add(rest, wd)
@@ -86,7 +88,7 @@ fn block_backward<V: Vector>(s: &Projected, b: usize, adjoint: &mut Adjoint, acc
     }
 }
 
-/// `masks` are those that the forward pass left; `sums` gets one row a pair.
+/// `masks` are those that the forward pass left for the pairs of the tile; `sums` gets one row a pair.
 #[inline(always)]
 fn backward_kernel<V: Vector>(
     projected: &[Projected],
@@ -98,7 +100,7 @@ fn backward_kernel<V: Vector>(
 ) {
     let mut batch = Batch::new();
     for (i, (masks, sums)) in masks.chunks(BATCH).zip(sums.chunks_mut(BATCH)).enumerate() {
-        batch.fill(projected, &pairs[i * BATCH..], origin);
+        batch.fill(projected, &pairs[i * BATCH..], masks.len(), origin);
         for ((splat, &mask), out) in batch.splats.iter().zip(masks).zip(sums) {
             if mask == 0 {
                 *out = Sums::ZERO;

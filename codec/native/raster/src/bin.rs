@@ -17,6 +17,7 @@ use crate::simd::prefetch;
 const CHUNKS: usize = 16;
 /// An entry of `owned` is chunk << OFFSET_BITS | offset in the chunk's list.
 const OFFSET_BITS: u32 = 28;
+const HIDDEN: u32 = u32::MAX;
 /// Items between a prefetch and its use.
 const AHEAD: usize = 12;
 
@@ -28,7 +29,7 @@ pub struct Bins {
     pub starts: Vec<u32>,
     /// Gaussian of each pair
     pub pairs: Vec<AtomicU32>,
-    /// [N] where a Gaussian's entry in the lists begins; only those of visible ones mean anything
+    /// [N] where a Gaussian's entry in the lists begins; HIDDEN for the invisible
     owned: Vec<AtomicU32>,
     /// of each chunk: for each Gaussian the number of its pairs, then their positions in `pairs`
     lists: Vec<Vec<u32>>,
@@ -83,26 +84,29 @@ impl Bins {
         self.starts[t] as usize..self.starts[t + 1] as usize
     }
 
-    /// Where the list entry of a visible Gaussian is: chunk and offset.
+    /// The list entry of a visible Gaussian and what follows it.
     #[inline(always)]
-    fn entry(&self, gaussian: usize) -> (&[u32], usize) {
-        let entry = self.owned[gaussian].load(Relaxed);
-        let list = &self.lists[(entry >> OFFSET_BITS) as usize];
-        (list, (entry & ((1 << OFFSET_BITS) - 1)) as usize)
+    fn entry(&self, gaussian: usize) -> Option<&[u32]> {
+        let entry = self.owned.get(gaussian)?.load(Relaxed);
+        let list = self.lists.get((entry >> OFFSET_BITS) as usize)?;
+        list.get((entry & ((1 << OFFSET_BITS) - 1)) as usize..)
     }
 
     /// Fetches what `places` will read.
     #[inline(always)]
     pub fn prefetch_places(&self, gaussian: usize) {
-        let (list, at) = self.entry(gaussian);
-        prefetch(list, at);
+        if let Some(list) = self.entry(gaussian) {
+            prefetch(list, 0);
+        }
     }
 
-    /// Positions in `pairs` of a visible Gaussian.
+    /// Positions in `pairs` of a Gaussian; none if it is invisible.
     #[inline(always)]
     pub fn places(&self, gaussian: usize) -> &[u32] {
-        let (list, at) = self.entry(gaussian);
-        &list[at + 1..at + 1 + list[at] as usize]
+        match self.entry(gaussian) {
+            Some([n, rest @ ..]) => &rest[..*n as usize],
+            _ => &[],
+        }
     }
 
     /// # Errors
@@ -113,7 +117,8 @@ impl Bins {
         self.cursors.clear();
         self.cursors.resize(CHUNKS * tiles, 0);
         self.lists.resize_with(CHUNKS, Vec::new);
-        self.owned.resize_with(projected.len(), AtomicU32::default);
+        self.owned.clear();
+        self.owned.resize_with(projected.len(), || AtomicU32::new(HIDDEN));
         let share = sorted.len().div_ceil(CHUNKS).max(1);
         let owned = &self.owned;
         self.lists.iter_mut().for_each(Vec::clear);

@@ -53,9 +53,8 @@ fn blend<V: Vector>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut 
     while rest != 0 {
         let s = &batch.splats[rest.trailing_zeros() as usize & (BATCH - 1)];
         rest &= rest - 1;
-        let (dx, dy) = (px - c(s.x), py - c(s.y));
-        let u = dx.mul_add(c(s.l11), dy * c(s.l21));
-        let v = dy * c(s.l22);
+        let u = px.mul_add(c(s.l11), py.mul_add(c(s.l21), c(s.u0)));
+        let v = py.mul_add(c(s.l22), c(s.v0));
         let e = v.neg_mul_add(v, u.neg_mul_add(u, c(s.log2_opacity)));
         let alpha = e.exp2().min(c(ALPHA_MAX));
         let next = alpha.neg_mul_add(t, t);
@@ -65,7 +64,7 @@ fn blend<V: Vector>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut 
         for ch in 0..3 {
             rgb[ch] = weight.mul_add(c(s.rgb[ch]), rgb[ch]);
         }
-        t = next.select(draw, t.min(-t).select(hit, t));
+        t = next.select(draw, t.negative().select(hit, t));
         if !V::any(c::<V>(0.0).lt(t)) {
             break;
         }
@@ -77,20 +76,22 @@ fn blend<V: Vector>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut 
     (hits & !rest, V::any(c::<V>(0.0).lt(t)))
 }
 
-/// Draws the pairs onto the canvas and leaves in `masks` the blocks that each Gaussian was drawn on, for the backward pass;
+/// Draws the first `count` pairs onto the canvas and leaves in `masks` the blocks that each Gaussian was drawn on, for the backward pass;
 /// an empty `masks` means that there is none.
 #[inline(always)]
 fn forward_kernel<V: Vector>(
     projected: &[Projected],
     pairs: &[AtomicU32],
+    count: usize,
     origin: [f32; 2],
     canvas: &mut Canvas,
     masks: &mut [u16],
 ) {
     let mut batch = Batch::new();
     masks.fill(0);
-    for first in (0..pairs.len()).step_by(BATCH) {
-        let n = batch.fill(projected, &pairs[first..], origin);
+    for first in (0..count).step_by(BATCH) {
+        let n = (count - first).min(BATCH);
+        batch.fill(projected, &pairs[first..], n, origin);
         let hits = batch.hits::<V>(n);
         let mut live = canvas.live;
         while live != 0 {
@@ -122,6 +123,7 @@ dispatch!(
     pub fn forward = forward_kernel(
         projected: &[Projected],
         pairs: &[AtomicU32],
+        count: usize,
         origin: [f32; 2],
         canvas: &mut Canvas,
         masks: &mut [u16],

@@ -2,7 +2,7 @@
 
 use crate::backward::Sums;
 use crate::bin::Bins;
-use crate::project::{CHUNK, Ewa, Lens, Projected, Soa, WHITEN, colour, direction, dot3, ewa};
+use crate::project::{CHUNK, Ewa, Lens, Soa, WHITEN, colour, direction, dot3, ewa};
 use crate::scene::{Gradients, Splats};
 use crate::sh;
 use crate::simd::{Vector, c, dispatch, prefetch};
@@ -24,10 +24,10 @@ impl GradientRows {
     }
 
     /// To the Gaussians `at ..` of `out`; 0 for the invisible.
-    pub fn write(&self, projected: &[Projected], sums: &[Row; 12], at: usize, k: usize, out: &mut Gradients) {
-        for (lane, p) in projected.iter().enumerate() {
+    pub fn write(&self, n: usize, seen: u16, sums: &[Row; 12], at: usize, k: usize, out: &mut Gradients) {
+        for lane in 0..n {
             let g = at + lane;
-            let keep = |v: f32| if p.visible() { v } else { 0.0 };
+            let keep = |v: f32| if seen >> lane & 1 == 1 { v } else { 0.0 };
             for d in 0..3 {
                 out.means[3 * g + d] = keep(self.rows[d][lane]);
                 out.log_scales[3 * g + d] = keep(self.rows[7 + d][lane]);
@@ -47,38 +47,33 @@ impl GradientRows {
     }
 }
 
-/// Adds up the pairs of 16 Gaussians, in the order of their tiles, and fetches those of the next 16. Lanes that are not
-/// visible become 0.
-pub fn gather(bins: &Bins, sums: &[Sums], projected: &[Projected], first: usize, n: usize) -> [Row; 12] {
-    let mut rows = [[0.0; CHUNK]; 12];
-    for (g, p) in projected.iter().enumerate().skip(first + 3 * CHUNK).take(CHUNK) {
-        if p.visible() {
-            bins.prefetch_places(g);
-        }
-    }
-    for (g, p) in projected.iter().enumerate().skip(first + CHUNK).take(CHUNK) {
-        if p.visible() {
-            bins.places(g).iter().for_each(|&place| prefetch(sums, place as usize));
-        }
-    }
+/// Gaussians between a prefetch of their pairs and its use; their places are fetched twice as early.
+const AHEAD: usize = 24;
+
+/// Adds up the pairs of 16 Gaussians, in the order of their tiles. Bit i of the mask is set if Gaussian first + i has any.
+pub fn gather(bins: &Bins, sums: &[Sums], first: usize, n: usize) -> ([Row; 12], u16) {
+    let (mut rows, mut seen) = ([[0.0; CHUNK]; 12], 0);
     for lane in 0..n {
         let g = first + lane;
-        if !projected[g].visible() {
-            continue;
-        }
+        bins.prefetch_places(g + 2 * AHEAD);
+        bins.places(g + AHEAD)
+            .iter()
+            .for_each(|&place| prefetch(sums, place as usize));
         let mut total = [0.0f32; 12];
-        for &place in bins.places(g) {
+        let places = bins.places(g);
+        for &place in places {
             let s = &sums[place as usize].0;
             for k in 0..10 {
                 total[k] += s[k];
             }
             total[10] = total[10].max(s[10]);
         }
+        seen |= u16::from(!places.is_empty()) << lane;
         for (row, v) in rows.iter_mut().zip(total) {
             row[lane] = v;
         }
     }
-    rows
+    (rows, seen)
 }
 
 /// Gradient by the camera-space mean and by M = J W R S, from those by the projected mean and the covariance.

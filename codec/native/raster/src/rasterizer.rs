@@ -211,20 +211,22 @@ impl Rasterizer {
         divide(0..bins.rows, 1, work, &cut, &|row, (image, alpha, mut masks)| {
             for column in 0..bins.columns {
                 let t = row.start * bins.columns + column;
-                let pairs = &bins.pairs[bins.tile(t)];
-                let (own, rest) = masks.split_at_mut(pairs.len().min(masks.len()));
+                let range = bins.tile(t);
+                let (own, rest) = masks.split_at_mut(range.len().min(masks.len()));
                 masks = rest;
                 let x = column * TILE;
-                if pairs.is_empty() {
+                if range.is_empty() {
                     finish_empty(shade, x, width, image, alpha);
                     continue;
                 }
                 let mut canvas = Canvas::new(width - x, alpha.len() / width);
+                let origin = [x as f32, (row.start * TILE) as f32];
                 forward(
                     level,
                     projected,
-                    pairs,
-                    [x as f32, (row.start * TILE) as f32],
+                    &bins.pairs[range.start..],
+                    range.len(),
+                    origin,
                     &mut canvas,
                     own,
                 );
@@ -302,7 +304,7 @@ impl Rasterizer {
                     }
                     let (x, y) = (column * TILE, row.start * TILE);
                     let mut adjoint = pixels.adjoint(x, y, shade);
-                    let (pairs, masks) = (&bins.pairs[range.clone()], &masks[range]);
+                    let (pairs, masks) = (&bins.pairs[range.start..], &masks[range]);
                     backward(level, projected, pairs, [x as f32, y as f32], masks, &mut adjoint, own);
                 }
             },
@@ -321,15 +323,9 @@ impl Rasterizer {
                 let mut rows = GradientRows::new();
                 for first in range.clone().step_by(CHUNK) {
                     let n = CHUNK.min(range.end - first);
-                    let sums = gather(&self.bins, &self.sums, &self.projected, first, n);
+                    let (sums, seen) = gather(&self.bins, &self.sums, first, n);
                     project_backward(self.level, splats, lens, first, &sums, &mut rows);
-                    rows.write(
-                        &self.projected[first..first + n],
-                        &sums,
-                        first - range.start,
-                        splats.sh_k,
-                        &mut out,
-                    );
+                    rows.write(n, seen, &sums, first - range.start, splats.sh_k, &mut out);
                 }
             },
         );

@@ -43,32 +43,56 @@ pub fn swizzle(x: usize, y: usize) -> (usize, usize) {
     ((y / 4 * 4 + x / 4) & 15, (y % 4 * 4 + x % 4) & 15)
 }
 
-/// Up to 64 Gaussians of the tile, copied together, positions relative to the tile.
+/// A Gaussian as the pixels of one tile see it: u = l11 x + l21 y + u0, v = l22 y + v0 with x, y in pixels of the tile.
+#[derive(Clone, Copy, Default)]
+#[repr(C, align(64))]
+pub struct Local {
+    pub l11: f32,
+    pub l21: f32,
+    pub u0: f32,
+    pub l22: f32,
+    pub v0: f32,
+    pub log2_opacity: f32,
+    pub rgb: [f32; 3],
+    x: f32,
+    y: f32,
+}
+
+/// Up to 64 Gaussians of the tile, copied together.
 pub struct Batch {
-    pub splats: [Projected; BATCH],
+    pub splats: [Local; BATCH],
     rows: [[f32; BATCH]; 6], // x y l11 l21 l22 reach
 }
 
 impl Batch {
     pub fn new() -> Batch {
         Batch {
-            splats: [Projected::default(); BATCH],
+            splats: [Local::default(); BATCH],
             rows: [[0.0; BATCH]; 6],
         }
     }
 
-    /// The first 64 of `pairs`; those after them are fetched for the next call. Returns how many.
+    /// The first `n` of `pairs`; those after them are fetched for the next call, be it for this tile or the next one.
     #[inline(always)]
-    pub fn fill(&mut self, projected: &[Projected], pairs: &[AtomicU32], origin: [f32; 2]) -> usize {
-        for pair in pairs.iter().skip(BATCH).take(BATCH) {
+    pub fn fill(&mut self, projected: &[Projected], pairs: &[AtomicU32], n: usize, origin: [f32; 2]) {
+        for pair in pairs.iter().skip(n).take(BATCH) {
             prefetch(projected, pair.load(Relaxed) as usize);
         }
-        for (s, pair) in self.splats.iter_mut().zip(pairs) {
-            *s = projected[pair.load(Relaxed) as usize];
-            s.x -= origin[0];
-            s.y -= origin[1];
+        for (s, pair) in self.splats[..n].iter_mut().zip(pairs) {
+            let p = &projected[pair.load(Relaxed) as usize];
+            let (x, y) = (p.x - origin[0], p.y - origin[1]);
+            *s = Local {
+                l11: p.l11,
+                l21: p.l21,
+                u0: -(p.l11 * x) - p.l21 * y,
+                l22: p.l22,
+                v0: -(p.l22 * y),
+                log2_opacity: p.log2_opacity,
+                rgb: p.rgb,
+                x,
+                y,
+            };
         }
-        pairs.len().min(BATCH)
     }
 
     /// Exact test of each ellipse against the pixel centres of each block: bit i of hits[b] is Gaussian i on block b.

@@ -37,7 +37,7 @@ fn functions_are_accurate_at_every_level() {
     for level in Level::available() {
         let mut worst = [1.0; 4];
         run_at(level, &mut worst);
-        assert!(worst.iter().all(|&w| w < 1e-6), "{}: {worst:?}", level.name());
+        assert!(worst.iter().all(|&w| w < 5e-6), "{}: {worst:?}", level.name());
     }
 }
 

@@ -1,0 +1,219 @@
+"""Training on tiny captures with known truth: carving, keyframe, motion, rate term, checkpoints."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from synthetic import blob, turning
+
+from gscodec import _native
+from gscodec.bitstream.quantization import steps_for, subject_radius
+from gscodec.camera import Camera, look_at
+from gscodec.capture.capture import Capture
+from gscodec.capture.images import View
+from gscodec.encode.group import group_integers
+from gscodec.errors import CaptureError, UsageError
+from gscodec.gaussians import GaussianSequence
+from gscodec.metrics.image import psnr
+from gscodec.render.image import render_image, render_rgba
+from gscodec.train import motion
+from gscodec.train.carve import carve, meeting_point, project
+from gscodec.train.finetune import GroupModel, laplace_bits
+from gscodec.train.keyframe import Statistics, grow, prune, train_keyframe
+from gscodec.train.model import from_gaussians
+from gscodec.train.settings import TrainSettings, train_settings
+from gscodec.train.train import Checkpoint, group_ranges, initial_model, train_groups
+from gscodec.train.views import Views
+
+SIZE = 64
+TINY = TrainSettings(
+    gop=3, keyframe_steps=150, motion_steps=60, finetune_steps=10, gaussians_max=600, initial_points=300
+)
+
+
+def rig(count=10):
+    """Cameras on two rings around the origin; the last one is held out."""
+    cameras = []
+    for i in range(count):
+        angle, z = 2.4 * i, (-1.2, 1.2, 0.2)[i % 3]
+        eye = np.array([3.2 * np.cos(angle), 3.2 * np.sin(angle), z])
+        K = np.array([[80.0, 0, SIZE / 2], [0, 80.0, SIZE / 2], [0, 0, 1]])
+        split = "test" if i == count - 1 else "train"
+        cameras.append(Camera(f"cam{i}", K, look_at(eye, np.zeros(3), [0, 0, 1]), SIZE, SIZE, split=split))
+    return cameras
+
+
+def capture_of(sequence: GaussianSequence, masks=True) -> Capture:
+    """What the rig sees of a sequence."""
+    cameras = rig()
+
+    def read(camera, frame):
+        g = sequence.frame(frame)
+        if not masks:
+            return View(render_image(g, cameras[camera], (0, 0, 0)), None)
+        rgba = render_rgba(g, cameras[camera])
+        rgb = rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6)
+        to_u8 = lambda x: np.rint(255 * np.clip(x, 0, 1)).astype(np.uint8)  # noqa: E731
+        return View(to_u8(rgb), to_u8(rgba[..., 3]))
+
+    return Capture("synthetic", 25.0, cameras, sequence.frame_count, masks, read)
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return capture_of(turning(300, frames=5))
+
+
+def psnr_of(model_or_gaussians, capture, frame):
+    g = model_or_gaussians.gaussians() if hasattr(model_or_gaussians, "gaussians") else model_or_gaussians
+    camera = capture.cameras[-1]
+    view = capture.view(len(capture.cameras) - 1, frame)
+    a = view.alpha[..., None] / 255
+    reference = np.rint(view.rgb * a + 127.5 * (1 - a)).astype(np.uint8)
+    return psnr(reference, render_image(g, camera))
+
+
+def test_axes_meet_where_the_cameras_look():
+    np.testing.assert_allclose(meeting_point(rig()), 0, atol=1e-6)
+
+
+def test_hull_lies_on_the_subject(capture):
+    views = [(c, capture.view(i, 0).rgb, capture.view(i, 0).alpha) for i, c in enumerate(capture.cameras)]
+    points, colors = carve(capture.cameras, views, 500)
+    assert 300 < len(points) < 800
+    distance = np.linalg.norm(points, axis=1)
+    assert np.median(distance) == pytest.approx(1.1, abs=0.2), "a sphere of radius 1, and the width of its Gaussians"
+    assert colors.min() >= 0
+    assert colors.max() <= 1
+
+
+def test_projection_is_the_renderers(capture):
+    camera = capture.cameras[0]
+    g = blob(1)
+    g = dataclasses.replace(
+        g, means=np.array([[0.3, 0.2, 0.1]], np.float32), log_scales=np.full((1, 3), -4, np.float32)
+    )
+    alpha = render_rgba(g, camera)[..., 3]
+    y, x = np.unravel_index(alpha.argmax(), alpha.shape)
+    p, depth = project(camera, g.means)
+    assert depth[0] > 0
+    assert np.abs(p[0] - [x + 0.5, y + 0.5]).max() <= 0.51
+
+
+@pytest.mark.parametrize("masks", [True, False])
+def test_keyframe_learns_a_view_it_has_not_seen(masks):
+    capture = capture_of(turning(300, frames=1), masks=masks)
+    points = 300 if masks else 2000  # a random box has most of its points where nothing is
+    settings = dataclasses.replace(TINY, initial_points=points, gaussians_max=2 * points)
+    model = initial_model(capture, 0, settings)
+    radius = subject_radius(model.params["means"].numpy())
+    losses = []
+    train_keyframe(
+        model, Views(capture, 0), 0, settings, steps=200, radius=radius, on_step=lambda _, loss: losses.append(loss)
+    )
+    assert np.mean(losses[-20:]) < 0.6 * np.mean(losses[:20])
+    assert len(model) <= settings.gaussians_max
+    if masks:
+        assert psnr_of(model, capture, 0) > 22
+
+
+def test_motion_field_finds_the_turn_and_is_what_finds_it(capture):
+    truth = turning(300, frames=5)
+    key = from_gaussians(truth.frame(0))
+    means, turned = motion.track(key, Views(capture, 0), range(3), TINY, radius=1.0)
+    still = np.abs(truth.frame(2).means - truth.frame(0).means).mean()
+    missed = np.abs(truth.frame(2).means - means[2].numpy()).mean()
+    assert missed < 0.25 * still, (missed, still)
+    angle = 2 * np.arccos(np.abs(turned[2, :, 0].numpy()).clip(0, 1))
+    assert np.median(angle) == pytest.approx(0.2, abs=0.08), "0.1 rad a frame"
+    moved = GroupModel(key, means, turned, steps_for(50, 1.0)).gaussians(2)
+    assert psnr_of(moved, capture, 2) > psnr_of(truth.frame(0), capture, 2) + 4
+
+
+def test_rigid_graph_is_zero_for_rigid_motion_and_not_otherwise():
+    g = torch.from_numpy(blob(200).means)
+    graph = motion.RigidGraph(g, 1.0)
+    q = motion.rotvec_to_quat(torch.tensor([[0.3, -0.2, 0.5]])).repeat(200, 1)
+    R = motion.quat_to_matrix(q)
+    assert graph.loss(torch.einsum("nij,nj->ni", R, g) + 1, q) < 1e-5
+    assert graph.loss(1.2 * g, q * 0 + torch.tensor([1.0, 0, 0, 0])) > 0.01
+
+
+def test_laplace_bits_are_code_lengths():
+    x = torch.arange(-200, 201).float()
+    for b in (0.1, 0.5, 2.0, 20.0):
+        bits = laplace_bits(x, torch.tensor(np.log(b)))
+        assert torch.exp2(-bits.double()).sum() == pytest.approx(1, abs=1e-3)
+    x = torch.tensor([0.3, 2.0, -7.0, 300.0], requires_grad=True)
+    laplace_bits(x, torch.tensor(-1.0)).sum().backward()
+    assert (x.grad * x.detach() > 0).all(), "every coefficient is pulled to zero, however far away"
+
+
+def test_rate_term_tracks_the_coders_bits():
+    """The loss and the coder agree on what a set of residual trajectories costs, up to 20 %."""
+    sequence = turning(6000, frames=4)
+    integers = group_integers(sequence.groups[0], 50, keep_all=True)
+    n = len(integers["positions"])
+    rng = np.random.default_rng(0)
+    predicted, coded = [], []
+    for scale in (0.15, 0.4, 1.0, 3.0):
+        c = np.rint(rng.laplace(0, scale, (2, 3, n))).astype(np.int32)
+        trajectories = {"means": {"coefficients": c, "step": 0.01}}
+        units = _native.encode_group({**integers, "trajectories": trajectories})[1]
+        coded.append(8 * sum(u["bytes"] for u in units if u["type"] == "trajectories"))
+        x = torch.from_numpy(c).float()
+        log_scale = torch.zeros(2, 1, 1, requires_grad=True)
+        optimizer = torch.optim.Adam([log_scale], lr=0.1)
+        for _ in range(100):
+            optimizer.zero_grad()
+            total = laplace_bits(x, log_scale).sum()
+            total.backward()
+            optimizer.step()
+        predicted.append(total.item())
+    assert np.corrcoef(predicted, coded)[0, 1] > 0.99
+    np.testing.assert_allclose(predicted, coded, rtol=0.2)
+
+
+def test_growing_and_pruning_keep_the_moments_in_step():
+    model = from_gaussians(blob(100))
+    stats = Statistics(100)
+    stats.pull += torch.linspace(0, 1, 100)
+    stats.seen += 1
+    stats.weight += 0.5
+    grow(model, stats, 105, 1.0, np.random.default_rng(0))
+    assert len(model) == 105, "no more than the most that is allowed"
+    model.params["logit_opacities"][:10] = -9
+    prune(model, Statistics(len(model)))
+    assert len(model) == 95
+    model.adam({n: torch.ones_like(p) for n, p in model.params.items()}, {"means": 0.1})
+    assert torch.isfinite(model.params["means"]).all()
+
+
+def test_groups_come_out_whole_and_a_stopped_run_goes_on(capture, tmp_path):
+    assert [list(r) for r in group_ranges(5, 3)] == [[0, 1, 2], [3, 4]]
+    done = []
+    groups = []
+    for group in train_groups(
+        capture, TINY, checkpoints=tmp_path, on_progress=lambda p: done.append((p.done, p.total))
+    ):
+        groups.append(group)
+        if len(groups) == 1:
+            assert Checkpoint(tmp_path).load(0) is not None
+    assert [len(g) for g in groups] == [3, 2]
+    assert done[-1][0] == done[-1][1], "progress ends at its total"
+    assert psnr_of(groups[1].frames[1], capture, 4) > 21
+    # The first group again from nothing, the second from the checkpoint of the first.
+    first = next(iter(train_groups(capture, TINY, checkpoints=tmp_path / "again")))
+    np.testing.assert_array_equal(first.frames[2].means, groups[0].frames[2].means)
+    (rest,) = train_groups(capture, TINY, first_group=1, checkpoints=tmp_path / "again")
+    np.testing.assert_array_equal(rest.frames[1].means, groups[1].frames[1].means)
+
+
+def test_what_cannot_be_trained_is_said():
+    with pytest.raises(UsageError, match="fast, medium, slow"):
+        train_settings("turbo")
+    capture = capture_of(turning(50, frames=1))
+    held = dataclasses.replace(capture, cameras=[dataclasses.replace(c, split="test") for c in capture.cameras])
+    with pytest.raises(CaptureError, match="training camera"):
+        next(train_groups(held, TINY))
