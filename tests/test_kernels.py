@@ -34,6 +34,32 @@ def test_image_loss_of_equal_images_is_zero():
     assert image.grad.abs().max() < 1e-6
 
 
+def test_image_loss_of_local_differences_matches_the_reference():
+    # Mostly equal images: the kernels skip what is equal, and must not skip more.
+    g = torch.Generator().manual_seed(3)
+    target = torch.rand(90, 400, 3, generator=g, dtype=torch.float64)
+    exact = target.clone()
+    for y, x in ((0, 0), (37, 131), (38, 290), (60, 5), (89, 399)):
+        exact[y, x] += 0.3
+    weight = torch.rand(90, 400, generator=g, dtype=torch.float64)
+    exact.requires_grad_()
+    for w in (None, weight):
+        want = image_loss_reference(exact, target, 0.5, w)
+        (want_grad,) = torch.autograd.grad(want, exact)
+        image = exact.detach().float().requires_grad_()
+        got = image_loss(image, target.float(), 0.5, None if w is None else w.float())
+        (grad,) = torch.autograd.grad(got, image)
+        assert abs(got.item() - want.item()) < 1e-6
+        # the sign of L1 where the images are equal is 0 here; torch agrees
+        assert (grad - want_grad).norm() < 1e-4 * want_grad.norm()
+
+
+def test_image_loss_shows_nan():
+    image = torch.zeros(20, 30, 3)
+    image[3, 4, 1] = float("nan")
+    assert torch.isnan(image_loss(image, torch.zeros(20, 30, 3)))
+
+
 def test_image_loss_names_wrong_shapes():
     with pytest.raises(UsageError, match=r"expected \[H, W, 3\]"):
         image_loss(torch.zeros(4, 4), torch.zeros(4, 4))

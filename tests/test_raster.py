@@ -6,7 +6,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from gscodec.camera import Camera, look_at  # noqa: E402
-from gscodec.errors import UsageError  # noqa: E402
+from gscodec.errors import LimitError, UsageError  # noqa: E402
 from gscodec.gaussians import Gaussians  # noqa: E402
 from gscodec.render.image import render_image, render_rgba  # noqa: E402
 from gscodec.render.rasterize import rasterize  # noqa: E402
@@ -68,6 +68,21 @@ def test_picture_and_gradients_match_the_torch_reference(simd, k):
     assert (alpha - want_alpha).abs().max() < 1e-5
     for name, g, w in zip(PARAMETERS, got, want, strict=True):
         assert (g - w).norm() <= 1e-4 * w.norm(), name
+
+
+def test_gaussians_beyond_the_field_of_view_match_the_reference():
+    # Wide ones whose centres are past the clamp of the Jacobian, and some nearer than the near plane.
+    cam, exact = camera(), scene(n=60, k=3, log_scale=-0.8)
+    with torch.no_grad():
+        exact[0][:, :2].mul_(6)
+        exact[0][::9, 2] = -2.6
+        exact[3].sub_(1.0)
+    params = [p.detach().float().requires_grad_() for p in exact]
+    want_image, _, want = gradients(rasterize_reference, exact, cam)
+    image, _, got = gradients(rasterize, params, cam)
+    assert (image - want_image).abs().max() < 1e-4
+    for name, g, w in zip(PARAMETERS, got, want, strict=True):
+        assert (g - w).norm() <= 1e-3 * w.norm(), name
 
 
 def test_reference_gradients_match_finite_differences():
@@ -210,6 +225,14 @@ def test_region_is_a_crop():
     np.testing.assert_allclose(part, whole[21:91, 37:127], atol=2e-5)
 
 
+def test_8_bit_image_is_the_float_image_rounded():
+    cam, g = camera(203, 150), dense()
+    params = tuple(getattr(g, k) for k in PARAMETERS)
+    image, _ = Workspace().forward(params, cam, BACKGROUND)
+    want = np.floor(np.clip(image, 0, 1) * 255 + 0.5)
+    np.testing.assert_array_equal(render_image(g, cam, BACKGROUND), want)
+
+
 def test_statistics():
     cam, params = camera(), [p.detach().float().requires_grad_() for p in scene()]
     image, alpha, info = rasterize(*params, cam)
@@ -240,6 +263,8 @@ def test_wrong_arguments_are_named():
         Workspace().forward(tuple(params), cam, BACKGROUND, (0, 0, 0, 3))
     with pytest.raises(UsageError, match='simd "neon9" is not available'):
         Workspace(simd="neon9")
+    with pytest.raises(LimitError, match="more than 16384 pixels on a side"):
+        render_image(g, Camera("c", cam.K, cam.viewmat, 20000, 10))
     with pytest.raises(UsageError, match="distortion"):
         render_image(g, Camera("c", cam.K, cam.viewmat, 61, 45, np.array([0.1])))
 

@@ -20,7 +20,7 @@ def render_rgba(gaussians: Gaussians, camera: Camera, *, workspace: Workspace | 
     Returns:
         [H, W, 4] f32: colour premultiplied by alpha (not clamped at 1), and alpha.
     """
-    image, alpha = _draw(gaussians, camera, (0.0, 0.0, 0.0), workspace)
+    image, alpha = _workspace(workspace).forward(_params(gaussians), camera, (0.0, 0.0, 0.0))
     return np.concatenate([image, alpha[..., None]], axis=2)
 
 
@@ -36,17 +36,16 @@ def render_image(
     Returns:
         [H, W, 3] uint8, rounded.
     """
-    image, _ = _draw(gaussians, camera, background, workspace)
-    np.clip(image, 0.0, 1.0, out=image)
-    image *= 255.0
-    image += 0.5
-    return image.astype(np.uint8)
+    return _workspace(workspace).draw(_params(gaussians), camera, background)
 
 
-def _draw(gaussians: Gaussians, camera: Camera, background, workspace: Workspace | None):
-    if workspace is None:
-        if not _shared:
-            _shared.append(Workspace())
-        workspace = _shared[0]
-    params = tuple(np.ascontiguousarray(getattr(gaussians, name), np.float32) for name in PARAMETERS)
-    return workspace.forward(params, camera, background)
+def _workspace(workspace: Workspace | None) -> Workspace:
+    if workspace is not None:
+        return workspace
+    if not _shared:
+        _shared.append(Workspace())
+    return _shared[0]
+
+
+def _params(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
+    return tuple(np.ascontiguousarray(getattr(gaussians, name), np.float32) for name in PARAMETERS)

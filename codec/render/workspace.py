@@ -9,7 +9,7 @@ import numpy as np
 
 from gscodec import _native
 from gscodec.camera import Camera
-from gscodec.errors import UsageError
+from gscodec.errors import LimitError, UsageError
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 STATISTICS = ("grad2d", "max_weight", "sum_weight")
@@ -61,6 +61,13 @@ class Workspace:
         image, alpha = call(self.native.forward, params, view(camera, region), rgb(background), training)
         return image.reshape(region[3], region[2], 3), alpha.reshape(region[3], region[2])
 
+    def draw(self, params, camera: Camera, background) -> np.ndarray:
+        """Draws `params` and returns [H, W, 3] uint8, rounded."""
+        self.calls += 1
+        whole = (0, 0, camera.width, camera.height)
+        flat = call(self.native.draw, params, view(camera, whole), rgb(background))
+        return flat.reshape(camera.height, camera.width, 3)
+
     def gradients(self, params) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
         """Arrays in the shapes of `params`, and three statistics [N]; the same ones as long as the shapes stay."""
         n = len(params[0])
@@ -100,8 +107,15 @@ def rgb(colour) -> list[float]:
 
 
 def call(function, *args):
-    """Calls into the native side; what it refuses is a mistake in the arguments."""
+    """Calls into the native side.
+
+    Raises:
+        UsageError: wrong arguments.
+        LimitError: too many Gaussians, pixels, or Gaussian-tile pairs.
+    """
     try:
         return function(*args)
+    except OverflowError as e:
+        raise LimitError(f"rasterizer: {e}") from None
     except ValueError as e:
         raise UsageError(f"rasterizer: {e}") from None

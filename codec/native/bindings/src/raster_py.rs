@@ -1,10 +1,12 @@
 //! `_native.Rasterizer`: numpy arrays in, numpy arrays out. Parameters come as the tuple (means, quats, log_scales,
 //! logit_opacities, sh0, shN), f32 and contiguous; gradients as those and (grad2d, max_weight, sum_weight), written in place.
 
+mod kernels;
+
 use numpy::{PyArray1, PyReadonlyArrayDyn, PyReadwriteArrayDyn, prelude::*};
-use pyo3::exceptions::PyValueError;
+use pyo3::exceptions::{PyOverflowError, PyValueError};
 use pyo3::prelude::*;
-use raster::{Gradients, ImageLoss, Lambdas, Level, Pair, RasterError, Region, Shade, Splats, Step, Target, View};
+use raster::{Gradients, Lambdas, Level, RasterError, Region, Shade, Splats, Step, Target, View};
 
 type In<'py> = PyReadonlyArrayDyn<'py, f32>;
 type InOut<'py> = PyReadwriteArrayDyn<'py, f32>;
@@ -17,8 +19,12 @@ type Grads<'py> = (
 /// (image, alpha), flat
 type Picture<'py> = (Bound<'py, PyArray1<f32>>, Bound<'py, PyArray1<f32>>);
 
+/// ValueError for wrong arguments, OverflowError for what is too large.
 fn usage(e: RasterError) -> PyErr {
-    PyValueError::new_err(e.to_string())
+    match e {
+        RasterError::TooMany { .. } => PyOverflowError::new_err(e.to_string()),
+        _ => PyValueError::new_err(e.to_string()),
+    }
 }
 
 fn contiguous<T>(r: Result<T, impl std::fmt::Display>) -> PyResult<T> {
@@ -193,6 +199,25 @@ impl Rasterizer {
         Ok((v.loss, v.image.l1, v.image.mse, v.image.ssim, v.mask, v.gain))
     }
 
+    /// Draws and returns the picture as 8 bits, flat.
+    fn draw<'py>(
+        &mut self,
+        py: Python<'py>,
+        params: Params<'py>,
+        view: ViewArgs,
+        background: [f32; 3],
+    ) -> PyResult<Bound<'py, PyArray1<u8>>> {
+        let (splats, view) = (splats(&params)?, view.view());
+        view.check().map_err(usage)?; // before its size is allocated
+        let mut out = vec![0; 3 * view.region.pixels()];
+        py.detach(|| {
+            self.inner.forward(&splats, &view, Shade::over(background), false)?;
+            self.inner.bytes(&mut out)
+        })
+        .map_err(usage)?;
+        Ok(PyArray1::from_vec(py, out))
+    }
+
     /// The picture of the last pass.
     fn picture<'py>(&self, py: Python<'py>) -> Picture<'py> {
         (
@@ -212,89 +237,6 @@ impl Rasterizer {
     }
 }
 
-/// (loss, l1, mse, ssim, gradient [H * W * 3]) of an image [H, W, 3].
-#[pyfunction]
-#[pyo3(signature = (image, target, weight, ssim_lambda, simd="auto"))]
-#[allow(clippy::type_complexity)]
-fn image_loss<'py>(
-    py: Python<'py>,
-    image: In,
-    target: In,
-    weight: Option<In>,
-    ssim_lambda: f32,
-    simd: &str,
-) -> PyResult<(f64, f64, f64, f64, Bound<'py, PyArray1<f32>>)> {
-    let (level, width) = (level(simd)?, image.shape().get(1).copied().unwrap_or(0));
-    let weight = weight.as_ref().map(|w| contiguous(w.as_slice())).transpose()?;
-    let (x, y) = (contiguous(image.as_slice())?, contiguous(target.as_slice())?);
-    let pair = Pair {
-        image: x,
-        target: y,
-        width,
-        weight,
-    };
-    let (value, grad) = py
-        .detach(|| {
-            let mut grad = vec![0.0; x.len()];
-            ImageLoss::default()
-                .run(level, pair, ssim_lambda, &mut grad)
-                .map(|v| (v, grad))
-        })
-        .map_err(usage)?;
-    Ok((
-        value.loss,
-        value.l1,
-        value.mse,
-        value.ssim,
-        PyArray1::from_vec(py, grad),
-    ))
-}
-
-/// Instant-NGP grid: `cells` on a side of each level, `table` entries at most a level.
-#[pyclass(frozen)]
-struct HashGrid {
-    inner: raster::HashGrid,
-}
-
-#[pymethods]
-impl HashGrid {
-    #[new]
-    fn new(features: usize, cells: Vec<u32>, table: usize) -> PyResult<Self> {
-        Ok(HashGrid {
-            inner: raster::HashGrid::new(features, &cells, table).map_err(usage)?,
-        })
-    }
-
-    #[getter]
-    fn entries(&self) -> usize {
-        self.inner.entries()
-    }
-
-    /// points [N, 3], table [entries, F] -> out [N, L * F], written in place.
-    fn forward(&self, py: Python, points: In, table: In, mut out: InOut) -> PyResult<()> {
-        let (points, table) = (contiguous(points.as_slice())?, contiguous(table.as_slice())?);
-        let out = contiguous(out.as_slice_mut())?;
-        py.detach(|| self.inner.forward(points, table, out)).map_err(usage)
-    }
-
-    /// Adds to grad_table and overwrites grad_points.
-    fn backward(
-        &self,
-        py: Python,
-        points: In,
-        table: In,
-        grad_out: In,
-        mut grad_table: InOut,
-        mut grad_points: Option<InOut>,
-    ) -> PyResult<()> {
-        let (points, table) = (contiguous(points.as_slice())?, contiguous(table.as_slice())?);
-        let (grad_out, grad_table) = (contiguous(grad_out.as_slice())?, contiguous(grad_table.as_slice_mut())?);
-        let grad_points = grad_points.as_mut().map(|g| contiguous(g.as_slice_mut())).transpose()?;
-        py.detach(|| self.inner.backward(points, table, grad_out, grad_table, grad_points))
-            .map_err(usage)
-    }
-}
-
 /// Names of the instruction sets that this machine can use, fastest first.
 #[pyfunction]
 fn simd_levels() -> Vec<&'static str> {
@@ -303,7 +245,7 @@ fn simd_levels() -> Vec<&'static str> {
 
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<Rasterizer>()?;
-    m.add_class::<HashGrid>()?;
-    m.add_function(wrap_pyfunction!(image_loss, m)?)?;
+    m.add_class::<kernels::HashGrid>()?;
+    m.add_function(wrap_pyfunction!(kernels::image_loss, m)?)?;
     m.add_function(wrap_pyfunction!(simd_levels, m)?)
 }

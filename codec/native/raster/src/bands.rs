@@ -103,7 +103,12 @@ mod tests {
             center: [width as f32 / 2.0, height as f32 / 2.0],
             rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
             translation: [0.0; 3],
-            region: Region { x: 0, y: 0, width, height },
+            region: Region {
+                x: 0,
+                y: 0,
+                width,
+                height,
+            },
         }
     }
 
@@ -129,7 +134,8 @@ mod tests {
                 assert_eq!(band.first, row);
                 assert!(band.rows > 0);
                 let (from, to) = (3 * 150 * row, 3 * 150 * (row + band.rows));
-                draw.draw([150, band.rows], shade, |p| p.clone_from(&band.splats)).unwrap();
+                draw.draw([150, band.rows], shade, |p| p.clone_from(&band.splats))
+                    .unwrap();
                 for (a, b) in draw.image().iter().zip(&whole.image()[from..to]) {
                     assert!((a - b).abs() < 1e-4, "{count} bands: {a} {b}");
                 }

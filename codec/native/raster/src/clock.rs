@@ -1,19 +1,31 @@
-//! The clock of the timings. wasm32-unknown-unknown has none (`std::time::Instant` panics there); its host measures.
+//! Time since a moment, in milliseconds. There is no clock in bare WebAssembly, where all times are 0.
 
-#[cfg(not(target_arch = "wasm32"))]
-pub use std::time::Instant;
-
-#[cfg(target_arch = "wasm32")]
+#[cfg(not(target_family = "wasm"))]
 #[derive(Clone, Copy)]
-pub struct Instant;
+pub struct Clock(std::time::Instant);
 
-#[cfg(target_arch = "wasm32")]
-impl Instant {
-    pub fn now() -> Instant {
-        Instant
+#[cfg(not(target_family = "wasm"))]
+impl Clock {
+    pub fn start() -> Clock {
+        Clock(std::time::Instant::now())
     }
 
-    pub fn elapsed(self) -> std::time::Duration {
-        std::time::Duration::ZERO
+    pub fn ms(self) -> f64 {
+        self.0.elapsed().as_secs_f64() * 1e3
+    }
+}
+
+#[cfg(target_family = "wasm")]
+#[derive(Clone, Copy)]
+pub struct Clock;
+
+#[cfg(target_family = "wasm")]
+impl Clock {
+    pub fn start() -> Clock {
+        Clock
+    }
+
+    pub fn ms(self) -> f64 {
+        0.0
     }
 }

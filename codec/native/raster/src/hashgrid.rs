@@ -1,8 +1,7 @@
 //! Multi-resolution hash grid (Instant-NGP, Mueller et al. 2022): [N, 3] in [0, 1] -> [N, L * F], trilinear at each level.
 //!
-//! A level whose vertices fit the table is dense, the others are hashed. The forward pass is parallel over points, the
-//! gradient of the table over levels: a level is one task that walks the points in order, so sums need no atomics and do
-//! not depend on the threads.
+//! A level whose vertices fit the table is dense, the others are hashed. A level is one task that walks all points in order:
+//! its part of the table stays in the cache, and gradients need no atomics and do not depend on the threads.
 
 use rayon::prelude::*;
 
@@ -10,7 +9,7 @@ use crate::divide::divide;
 use crate::scene::{RasterError, check_length};
 
 const PRIMES: [u32; 3] = [1, 2_654_435_761, 805_459_861]; // x is not multiplied
-/// Points of one task; their features stay in the cache while the levels are walked.
+/// Points of one task where levels are put together.
 const POINTS: usize = 256;
 
 /// Shape of a grid; the table is [entries, F], level after level.
@@ -18,6 +17,7 @@ pub struct HashGrid {
     features: usize,
     levels: Vec<Level>,
     entries: usize,
+    scratch: Vec<f32>, // [L, N, F] or [L, N, 3], kept from call to call
 }
 
 #[derive(Clone, Copy)]
@@ -88,18 +88,17 @@ impl Cell {
         ]
     }
 
-    /// Derivative of the weight of a corner by coordinate `d`, in units of cells.
+    /// Derivatives of sum(weight * value) by the coordinates, in units of cells; 0 outside of [0, 1].
     #[inline(always)]
-    fn slope(&self, corner: usize, d: usize) -> f32 {
-        let side = |d: usize| {
-            if corner >> d & 1 == 1 {
-                self.frac[d]
-            } else {
-                1.0 - self.frac[d]
-            }
+    fn slopes(&self, value: &[f32; 8]) -> [f32; 3] {
+        let [x, y, z] = self.frac;
+        let mix = |a: f32, b: f32, t: f32| a + t * (b - a);
+        let face = |step: usize, i: usize, j: usize, s: f32, t: f32| {
+            let rise = |at: usize| value[at + step] - value[at];
+            mix(mix(rise(0), rise(i), s), mix(rise(j), rise(i + j), s), t)
         };
-        let sign = if corner >> d & 1 == 1 { 1.0 } else { -1.0 };
-        sign * side((d + 1) % 3) * side((d + 2) % 3)
+        let all = [face(1, 2, 4, y, z), face(2, 1, 4, x, z), face(4, 1, 2, x, y)];
+        std::array::from_fn(|d| if self.inside[d] { all[d] } else { 0.0 })
     }
 }
 
@@ -147,6 +146,7 @@ impl HashGrid {
             features,
             levels,
             entries: first,
+            scratch: Vec::new(),
         })
     }
 
@@ -164,7 +164,7 @@ impl HashGrid {
     ///
     /// # Errors
     /// Wrong lengths.
-    pub fn forward(&self, points: &[f32], table: &[f32], out: &mut [f32]) -> Result<(), RasterError> {
+    pub fn forward(&mut self, points: &[f32], table: &[f32], out: &mut [f32]) -> Result<(), RasterError> {
         self.check(points, table, out.len())?;
         match self.features {
             1 => self.forward_of::<1>(points, table, out),
@@ -181,28 +181,33 @@ impl HashGrid {
         check_length("features", outputs, points.len() / 3 * self.outputs())
     }
 
-    fn forward_of<const F: usize>(&self, points: &[f32], table: &[f32], out: &mut [f32]) {
-        let stride = self.outputs().max(1);
+    fn forward_of<const F: usize>(&mut self, points: &[f32], table: &[f32], out: &mut [f32]) {
+        let (n, stride) = (points.len() / 3, self.outputs().max(1));
+        self.scratch.resize(n * stride, 0.0);
         let (table, _) = table.as_chunks::<F>();
-        out.par_chunks_mut(POINTS * stride)
-            .zip(points.par_chunks(3 * POINTS))
-            .for_each(|(out, points)| {
-                for (l, level) in self.levels.iter().enumerate() {
-                    let rows = &table[level.first..level.first + level.entries];
-                    for (out, point) in out.chunks_exact_mut(stride).zip(points.as_chunks::<3>().0) {
-                        let cell = level.cell(point);
-                        let weights = cell.weights();
-                        let mut sum = [0.0; F];
-                        for corner in 0..8 {
-                            let (w, row) = (weights[corner], &rows[cell.rows[corner] as usize]);
-                            for f in 0..F {
-                                sum[f] += w * row[f];
-                            }
-                        }
-                        out[l * F..(l + 1) * F].copy_from_slice(&sum);
+        let levels = self.levels.par_iter().zip(self.scratch.par_chunks_mut((n * F).max(1)));
+        levels.for_each(|(level, out)| {
+            let rows = &table[level.first..level.first + level.entries];
+            for (out, point) in out.as_chunks_mut::<F>().0.iter_mut().zip(points.as_chunks::<3>().0) {
+                let cell = level.cell(point);
+                let weights = cell.weights();
+                *out = [0.0; F];
+                for corner in 0..8 {
+                    let (w, row) = (weights[corner], &rows[cell.rows[corner] as usize]);
+                    for f in 0..F {
+                        out[f] += w * row[f];
                     }
                 }
-            });
+            }
+        });
+        let scratch = self.scratch.as_chunks::<F>().0;
+        out.par_chunks_mut(POINTS * stride).enumerate().for_each(|(i, out)| {
+            for (k, point) in out.chunks_exact_mut(stride).enumerate() {
+                for (l, features) in point.as_chunks_mut::<F>().0.iter_mut().enumerate() {
+                    *features = scratch[l * n + i * POINTS + k];
+                }
+            }
+        });
     }
 
     /// Gradients from `grad_out` [N, L * F]: `grad_table` is added to, `grad_points` (if wanted) overwritten.
@@ -210,7 +215,7 @@ impl HashGrid {
     /// # Errors
     /// Wrong lengths.
     pub fn backward(
-        &self,
+        &mut self,
         points: &[f32],
         table: &[f32],
         grad_out: &[f32],
@@ -225,9 +230,13 @@ impl HashGrid {
             4 => self.table_backward::<4>(points, grad_out, grad_table),
             _ => self.table_backward::<8>(points, grad_out, grad_table),
         }
-        if let Some(grad_points) = grad_points {
-            check_length("gradient of the points", grad_points.len(), points.len())?;
-            self.points_backward(points, table, grad_out, grad_points);
+        let Some(grad_points) = grad_points else { return Ok(()) };
+        check_length("gradient of the points", grad_points.len(), points.len())?;
+        match self.features {
+            1 => self.points_backward::<1>(points, table, grad_out, grad_points),
+            2 => self.points_backward::<2>(points, table, grad_out, grad_points),
+            4 => self.points_backward::<4>(points, table, grad_out, grad_points),
+            _ => self.points_backward::<8>(points, table, grad_out, grad_points),
         }
         Ok(())
     }
@@ -255,30 +264,42 @@ impl HashGrid {
         });
     }
 
-    fn points_backward(&self, points: &[f32], table: &[f32], grad_out: &[f32], grad_points: &mut [f32]) {
-        let (stride, features) = (self.outputs().max(1), self.features);
-        let chunks = grad_points
-            .par_chunks_mut(3 * POINTS)
-            .zip(points.par_chunks(3 * POINTS));
-        chunks
-            .zip(grad_out.par_chunks(POINTS * stride))
-            .for_each(|((out, points), grad_out)| {
-                out.fill(0.0);
-                for (l, level) in self.levels.iter().enumerate() {
-                    let items = out.chunks_exact_mut(3).zip(points.as_chunks::<3>().0);
-                    for ((out, point), g) in items.zip(grad_out.chunks_exact(stride)) {
-                        let (cell, g) = (level.cell(point), &g[l * features..(l + 1) * features]);
-                        for corner in 0..8 {
-                            let at = (level.first + cell.rows[corner] as usize) * features;
-                            let dot: f32 = table[at..at + features].iter().zip(g).map(|(a, b)| a * b).sum();
-                            for d in 0..3 {
-                                if cell.inside[d] {
-                                    out[d] += dot * cell.slope(corner, d) * level.cells as f32;
-                                }
-                            }
-                        }
+    fn points_backward<const F: usize>(
+        &mut self,
+        points: &[f32],
+        table: &[f32],
+        grad_out: &[f32],
+        grad_points: &mut [f32],
+    ) {
+        let (n, stride) = (points.len() / 3, self.outputs().max(1));
+        self.scratch.resize(3 * n * self.levels.len(), 0.0);
+        let (table, _) = table.as_chunks::<F>();
+        let levels = self
+            .levels
+            .par_iter()
+            .zip(self.scratch.par_chunks_mut((3 * n).max(1)))
+            .enumerate();
+        levels.for_each(|(l, (level, out))| {
+            let rows = &table[level.first..level.first + level.entries];
+            let items = out.as_chunks_mut::<3>().0.iter_mut().zip(points.as_chunks::<3>().0);
+            for ((out, point), g) in items.zip(grad_out.chunks_exact(stride)) {
+                let (cell, g) = (level.cell(point), &g[l * F..(l + 1) * F]);
+                let mut value = [0.0; 8];
+                for corner in 0..8 {
+                    let row = &rows[cell.rows[corner] as usize];
+                    for f in 0..F {
+                        value[corner] += row[f] * g[f];
                     }
                 }
-            });
+                *out = cell.slopes(&value).map(|s| s * level.cells as f32);
+            }
+        });
+        let scratch = &self.scratch;
+        grad_points.par_chunks_mut(3 * POINTS).enumerate().for_each(|(i, out)| {
+            for (k, v) in out.iter_mut().enumerate() {
+                let at = |l: usize| scratch[l * 3 * n + 3 * POINTS * i + k];
+                *v = (0..self.levels.len()).map(at).sum();
+            }
+        });
     }
 }

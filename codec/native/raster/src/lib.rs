@@ -1,7 +1,7 @@
 //! CPU rasterizer and training kernels: Gaussians + view -> image, and gradients back; image loss; hash grid.
 //!
-//! scene -> project -> sort -> bin -> forward (tiles) -> image; backward (tiles) -> project_backward (Gaussians). `simd` is the
-//! only place with `unsafe`. This crate never sees bytes of a stream: everything here may be fed floats of any value.
+//! scene -> soa -> project -> sort -> bin -> forward (tiles) -> picture; backward (tiles) -> project_backward (Gaussians).
+//! `simd` is the only place with `unsafe`. This crate never sees bytes of a stream: everything here may be fed floats of any value.
 
 // Kernels index several arrays in step; iterators over some of them would hide that.
 #![allow(clippy::needless_range_loop)]
@@ -15,12 +15,14 @@ mod divide;
 mod forward;
 mod hashgrid;
 mod loss;
+mod picture;
 mod project;
 mod project_backward;
 mod rasterizer;
 mod scene;
 mod sh;
 mod simd;
+mod soa;
 mod sort;
 mod ssim;
 mod step;

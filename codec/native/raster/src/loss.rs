@@ -157,7 +157,7 @@ fn columns(spans: &[Range<usize>], band: &Range<usize>, reach: usize, margin: us
 
 #[inline(always)]
 fn differ<V: Vector>(x: &[f32], y: &[f32], at: usize) -> bool {
-    V::any(c::<V>(0.0).lt((V::load(&x[at..]) - V::load(&y[at..])).abs()))
+    V::any(!c::<V>(0.0).ge((V::load(&x[at..]) - V::load(&y[at..])).abs())) // NaN differs from everything
 }
 
 /// From the first to the last value that differs, give or take a vector.

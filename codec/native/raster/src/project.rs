@@ -9,14 +9,12 @@ use crate::constants::{FOV_MARGIN, LOG2_ALPHA_MIN, LOW_PASS, NEAR};
 use crate::scene::{Splats, View};
 use crate::sh;
 use crate::simd::{Vector, c, dispatch};
+use crate::soa::{CHUNK, Row, Soa, load_rows};
 
 /// Side of a tile in pixels.
 pub const TILE: usize = 16;
 /// Widens the box and the ellipse a little, so that rounding never loses a pixel that the blending would have drawn.
 pub const SLACK: f32 = 1e-3;
-/// Gaussians in one SoA chunk.
-pub const CHUNK: usize = 16;
-type Row = [f32; CHUNK];
 
 /// A Gaussian on the image; x and y in pixels of the region.
 ///
@@ -47,60 +45,6 @@ impl Projected {
 
 /// u^2 = log2(e)/2 * (whitened distance)^2
 pub const WHITEN: f32 = 0.5 * std::f32::consts::LOG2_E;
-
-/// Parameters of 16 Gaussians, one lane each. Lanes past the end hold NaN means and are culled by that.
-pub struct Soa {
-    pub means: [Row; 3],
-    pub quats: [Row; 4],
-    pub log_scales: [Row; 3],
-    pub logits: Row,
-    pub sh0: [Row; 3],
-    pub sh_n: [[Row; 3]; 15],
-}
-
-impl Soa {
-    pub fn new() -> Soa {
-        let z = [0.0; CHUNK];
-        Soa {
-            means: [z; 3],
-            quats: [z; 4],
-            log_scales: [z; 3],
-            logits: z,
-            sh0: [z; 3],
-            sh_n: [[z; 3]; 15],
-        }
-    }
-
-    /// Gaussians first .. first + 16 of `s`, fewer at the end.
-    pub fn fill(&mut self, s: &Splats, first: usize) -> usize {
-        let n = CHUNK.min(s.len() - first);
-        self.means = [[f32::NAN; CHUNK]; 3];
-        columns(&mut self.means, &s.means[3 * first..3 * (first + n)]);
-        columns(&mut self.quats, &s.quats[4 * first..4 * (first + n)]);
-        columns(&mut self.log_scales, &s.log_scales[3 * first..3 * (first + n)]);
-        columns(&mut self.sh0, &s.sh0[3 * first..3 * (first + n)]);
-        self.logits[..n].copy_from_slice(&s.logit_opacities[first..first + n]);
-        let stride = 3 * s.sh_k;
-        for k in 0..s.sh_k {
-            for lane in 0..n {
-                let at = (first + lane) * stride + 3 * k;
-                for ch in 0..3 {
-                    self.sh_n[k][ch][lane] = s.sh_n[at + ch];
-                }
-            }
-        }
-        n
-    }
-}
-
-/// [n, D] -> D rows of n.
-fn columns<const D: usize>(rows: &mut [Row; D], flat: &[f32]) {
-    for (lane, item) in flat.chunks_exact(D).enumerate() {
-        for d in 0..D {
-            rows[d][lane] = item[d];
-        }
-    }
-}
 
 /// The view with what all Gaussians need of it.
 pub struct Lens {
@@ -180,15 +124,6 @@ fn rotation<V: Vector>([w, x, y, z]: [V; 4]) -> [[V; 3]; 3] {
 #[inline(always)]
 pub fn exp<V: Vector>(x: V) -> V {
     (x * c::<V>(std::f32::consts::LOG2_E)).exp2()
-}
-
-#[inline(always)]
-pub fn load_rows<V: Vector, const D: usize>(rows: &[Row; D], at: usize) -> [V; D] {
-    let mut v = [c::<V>(0.0); D];
-    for d in 0..D {
-        v[d] = V::load(&rows[d][at..]);
-    }
-    v
 }
 
 /// The lanes `at ..` of the chunk.

@@ -2,12 +2,11 @@
 
 use crate::backward::Sums;
 use crate::bin::Bins;
-use crate::project::{CHUNK, Ewa, Lens, Soa, WHITEN, colour, direction, dot3, ewa};
+use crate::project::{Ewa, Lens, WHITEN, colour, direction, dot3, ewa};
 use crate::scene::{Gradients, Splats};
 use crate::sh;
 use crate::simd::{Vector, c, dispatch, prefetch};
-
-type Row = [f32; CHUNK];
+use crate::soa::{CHUNK, Row, Soa};
 
 /// Rows of the chunk: means 0-2, quats 3-6, log_scales 7-9, logit 10, sh0 11-13, grad2d 14; and shN.
 pub struct GradientRows {
@@ -37,12 +36,17 @@ impl GradientRows {
                 out.quats[4 * g + d] = keep(self.rows[3 + d][lane]);
             }
             out.logit_opacities[g] = keep(self.rows[10][lane]);
-            for i in 0..3 * k {
-                out.sh_n[3 * k * g + i] = keep(self.sh_n[i / 3][i % 3][lane]);
-            }
             out.grad2d[g] = keep(self.rows[14][lane]);
             out.sum_weight[g] = sums[9][lane];
             out.max_weight[g] = sums[10][lane];
+            let sh_n = &mut out.sh_n[3 * k * g..3 * k * (g + 1)];
+            if seen >> lane & 1 == 0 {
+                sh_n.fill(0.0);
+                continue;
+            }
+            for (out, rows) in sh_n.as_chunks_mut::<3>().0.iter_mut().zip(&self.sh_n) {
+                *out = [rows[0][lane], rows[1][lane], rows[2][lane]];
+            }
         }
     }
 }

@@ -7,17 +7,18 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::backward::{Adjoint, Sums, backward};
+use crate::backward::{Sums, backward};
 use crate::bin::Bins;
-use crate::clock::Instant;
+use crate::clock::Clock;
 use crate::divide::divide;
 use crate::forward::{Canvas, forward};
-use crate::project::{CHUNK, Lens, Projected, TILE, project};
+use crate::picture::{Pixels, finish, finish_empty};
+use crate::project::{Lens, Projected, TILE, project};
 use crate::project_backward::{GradientRows, gather, project_backward};
 use crate::scene::{Gradients, RasterError, Region, Splats, View, check_length, check_size};
 use crate::simd::Level;
+use crate::soa::CHUNK;
 use crate::sort::DepthSort;
-use crate::tile::{Plane, swizzle};
 
 /// Gaussians of one task.
 const SHARE: usize = 256;
@@ -31,10 +32,6 @@ pub struct Timings {
     pub backward_tiles: f64,
     pub backward_project: f64,
     pub loss: f64,
-}
-
-pub(crate) fn ms(since: Instant) -> f64 {
-    since.elapsed().as_secs_f64() * 1e3
 }
 
 /// Colours around and on the Gaussians.
@@ -101,6 +98,22 @@ impl Rasterizer {
         &self.alpha
     }
 
+    /// The last image as 8 bits, rounded and clamped.
+    ///
+    /// # Errors
+    /// A length other than that of the image.
+    pub fn bytes(&self, out: &mut [u8]) -> Result<(), RasterError> {
+        check_length("8-bit image", out.len(), self.image.len())?;
+        out.par_chunks_mut(1 << 14)
+            .zip(self.image.par_chunks(1 << 14))
+            .for_each(|(out, image)| {
+                for (o, v) in out.iter_mut().zip(image) {
+                    *o = (v.clamp(0.0, 1.0) * 255.0 + 0.5) as i32 as u8;
+                }
+            });
+        Ok(())
+    }
+
     pub fn projected(&self) -> &[Projected] {
         &self.projected
     }
@@ -118,8 +131,8 @@ impl Rasterizer {
         Ok(&self.projected)
     }
 
-    /// The second half of `forward` alone: draws ellipses that were projected elsewhere onto a picture of `width` x `height`.
-    /// `fill` sets them; they are those of the last call.
+    /// The second half of `forward` alone: `fill` gets those of the last call and sets the ellipses to draw on a picture of
+    /// width x height, which must be what `project` made for one of that size.
     ///
     /// # Errors
     /// As `forward`.
@@ -130,7 +143,12 @@ impl Rasterizer {
         fill: impl FnOnce(&mut Vec<Projected>),
     ) -> Result<(), RasterError> {
         fill(&mut self.projected);
-        let region = Region { x: 0, y: 0, width, height };
+        let region = Region {
+            x: 0,
+            y: 0,
+            width,
+            height,
+        };
         check_size(region, width, height)?;
         self.drawn = None;
         self.run(|s| s.draw_here(region, shade, false))
@@ -176,25 +194,25 @@ impl Rasterizer {
     }
 
     fn project_here(&mut self, splats: &Splats, lens: &Lens) {
-        let (level, start) = (self.level, Instant::now());
+        let (level, start) = (self.level, Clock::start());
         self.projected.resize(splats.len(), Projected::default());
         self.projected.par_chunks_mut(SHARE).enumerate().for_each(|(i, out)| {
             project(level, splats, lens, i * SHARE, out);
         });
-        self.timings.project = ms(start);
+        self.timings.project = start.ms();
     }
 
     fn draw_here(&mut self, region: Region, shade: Shade, training: bool) -> Result<(), RasterError> {
-        let start = Instant::now();
+        let start = Clock::start();
         let sorted = self.sort.sort(&self.projected);
         self.bins.build(&self.projected, sorted, region)?;
-        self.timings.bin = ms(start);
-        let start = Instant::now();
+        self.timings.bin = start.ms();
+        let start = Clock::start();
         self.masks.resize(if training { self.bins.pairs.len() } else { 0 }, 0);
         self.image.resize(3 * region.pixels(), 0.0);
         self.alpha.resize(region.pixels(), 0.0);
         self.blend(region, shade);
-        self.timings.blend = ms(start);
+        self.timings.blend = start.ms();
         Ok(())
     }
 
@@ -268,13 +286,13 @@ impl Rasterizer {
         )?;
         check_length("gradient of the image", grad_image.len(), 3 * region.pixels())?;
         check_length("gradient of alpha", grad_alpha.len(), region.pixels())?;
-        let start = Instant::now();
+        let start = Clock::start();
         self.sums.resize(self.bins.pairs.len(), Sums::ZERO);
         self.backward_tiles(region.width, shade, grad_image, grad_alpha);
-        self.timings.backward_tiles = ms(start);
-        let start = Instant::now();
+        self.timings.backward_tiles = start.ms();
+        let start = Clock::start();
         self.backward_gaussians(splats, &lens, out);
-        self.timings.backward_project = ms(start);
+        self.timings.backward_project = start.ms();
         self.drawn = Some((lens, region, shade));
         Ok(())
     }
@@ -336,92 +354,4 @@ impl Rasterizer {
 fn cut_pairs<'a, T>(pairs: &'a mut [T], bins: &Bins, first: usize, middle: usize) -> (&'a mut [T], &'a mut [T]) {
     let start = |row: usize| bins.starts[row * bins.columns] as usize;
     pairs.split_at_mut((start(middle) - start(first)).min(pairs.len()))
-}
-
-/// Writes a finished tile to the rows of its band.
-fn finish(canvas: &Canvas, shade: Shade, x: usize, width: usize, image: &mut [f32], alpha: &mut [f32]) {
-    let (gain, back) = (shade.gain.unwrap_or([1.0; 3]), shade.background);
-    let whole = width - x >= TILE;
-    for (y, (image, alpha)) in image
-        .chunks_exact_mut(3 * width)
-        .zip(alpha.chunks_exact_mut(width))
-        .enumerate()
-    {
-        let mut rgb_row = [0.0; 3 * TILE];
-        let mut alpha_row = [0.0; TILE];
-        let four = y % 4 * 4..y % 4 * 4 + 4;
-        for column in 0..4 {
-            let b = (y / 4 * 4 + column) & 15;
-            let t = &canvas.transmittance.0[b][four.clone()];
-            let [r, g, b] = [0, 1, 2].map(|ch| &canvas.rgb[ch].0[b][four.clone()]);
-            for i in 0..4 {
-                let (at, t) = (4 * column + i, t[i].abs());
-                rgb_row[3 * at] = gain[0] * r[i] + t * back[0];
-                rgb_row[3 * at + 1] = gain[1] * g[i] + t * back[1];
-                rgb_row[3 * at + 2] = gain[2] * b[i] + t * back[2];
-                alpha_row[at] = 1.0 - t;
-            }
-        }
-        let (image, alpha) = (&mut image[3 * x..], &mut alpha[x..]);
-        if whole {
-            image[..3 * TILE].copy_from_slice(&rgb_row);
-            alpha[..TILE].copy_from_slice(&alpha_row);
-        } else {
-            image.copy_from_slice(&rgb_row[..image.len()]);
-            alpha.copy_from_slice(&alpha_row[..alpha.len()]);
-        }
-    }
-}
-
-/// A tile without Gaussians.
-fn finish_empty(shade: Shade, x: usize, width: usize, image: &mut [f32], alpha: &mut [f32]) {
-    let columns = TILE.min(width - x);
-    for (image, alpha) in image.chunks_exact_mut(3 * width).zip(alpha.chunks_exact_mut(width)) {
-        image[3 * x..3 * (x + columns)]
-            .as_chunks_mut::<3>()
-            .0
-            .fill(shade.background);
-        alpha[x..x + columns].fill(0.0);
-    }
-}
-
-/// A rendered region and the gradient of the loss by it.
-struct Pixels<'a> {
-    image: &'a [f32],
-    alpha: &'a [f32],
-    grad_image: &'a [f32],
-    grad_alpha: &'a [f32],
-    width: usize,
-}
-
-impl Pixels<'_> {
-    /// The tile at (x, y). With image = gain sum(w rgb) + T background and alpha = 1 - T, the remainder of the whole pixel,
-    /// g . sum(w rgb) + T (g . background - g_alpha), is g . image - T g_alpha.
-    fn adjoint(&self, x: usize, y: usize, shade: Shade) -> Adjoint {
-        let mut a = Adjoint {
-            transmittance: Plane::ZERO,
-            remainder: Plane::ZERO,
-            rgb: [Plane::ZERO; 3],
-        };
-        let (rows, gain) = (
-            (self.alpha.len() / self.width - y).min(TILE),
-            shade.gain.unwrap_or([1.0; 3]),
-        );
-        let columns = TILE.min(self.width - x);
-        for j in 0..rows {
-            let at = (y + j) * self.width + x;
-            let image = &self.image[3 * at..3 * (at + columns)];
-            let grad = &self.grad_image[3 * at..3 * (at + columns)];
-            let (alpha, grad_alpha) = (&self.alpha[at..at + columns], &self.grad_alpha[at..at + columns]);
-            for (i, (g, c)) in grad.as_chunks::<3>().0.iter().zip(image.as_chunks::<3>().0).enumerate() {
-                let (b, k) = swizzle(i, j);
-                a.transmittance.0[b][k] = 1.0;
-                for ch in 0..3 {
-                    a.rgb[ch].0[b][k] = g[ch] * gain[ch];
-                }
-                a.remainder.0[b][k] = g[0] * c[0] + g[1] * c[1] + g[2] * c[2] - (1.0 - alpha[i]) * grad_alpha[i];
-            }
-        }
-        a
-    }
 }

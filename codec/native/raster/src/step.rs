@@ -5,9 +5,9 @@
 
 use rayon::prelude::*;
 
-use crate::clock::Instant;
+use crate::clock::Clock;
 use crate::loss::{ImageLoss, LossValue, Pair};
-use crate::rasterizer::{Rasterizer, Shade, ms};
+use crate::rasterizer::{Rasterizer, Shade};
 use crate::scene::{Gradients, RasterError, Splats, View, check_length};
 
 /// What the picture of a view should be: [H, W, 3], [H, W] and [H, W] of the whole image, not of the region.
@@ -77,9 +77,9 @@ impl Step {
         check_length("weight", target.weight.map_or(pixels, <[f32]>::len), pixels)?;
         rasterizer.run(|r| {
             r.forward_here(splats, view, shade, true)?;
-            let start = Instant::now();
+            let start = Clock::start();
             let value = self.compare(r, view, shade, target, lambdas)?;
-            r.timings.loss = ms(start);
+            r.timings.loss = start.ms();
             r.backward_here(splats, &self.grad_image, &self.grad_alpha, out)?;
             Ok(value)
         })

@@ -90,7 +90,12 @@ impl Player {
         };
         group.frame(t, &mut self.frame);
         self.sh_k = sh_coefficients(group.group().header.sh_degree);
-        for (logit, shown) in self.frame.logit_opacities.iter_mut().zip(group.visible(t).into_iter().flatten()) {
+        for (logit, shown) in self
+            .frame
+            .logit_opacities
+            .iter_mut()
+            .zip(group.visible(t).into_iter().flatten())
+        {
             if !shown {
                 *logit = f32::NEG_INFINITY; // the projection leaves it out
             }
@@ -162,7 +167,8 @@ impl Player {
         self.pixels.clear();
         let byte = |v: f32| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8; // as `codec.render.image`
         let colours = self.raster.image().as_chunks::<3>().0;
-        self.pixels.extend(colours.iter().map(|c| [byte(c[0]), byte(c[1]), byte(c[2]), 255]));
+        self.pixels
+            .extend(colours.iter().map(|c| [byte(c[0]), byte(c[1]), byte(c[2]), 255]));
         self.done(drawn)
     }
 
@@ -194,6 +200,11 @@ fn view(bytes: &[u8]) -> View {
         center: [v[4], v[5]],
         rotation: std::array::from_fn(|i| std::array::from_fn(|j| m(i, j))),
         translation: std::array::from_fn(|i| m(i, 3)),
-        region: Region { x: 0, y: 0, width, height },
+        region: Region {
+            x: 0,
+            y: 0,
+            width,
+            height,
+        },
     }
 }

@@ -1,5 +1,5 @@
 //! One vector interface for all kernels. A kernel is written once, generic over `Vector`; the instances are `f32` (the plain
-//! reference), AVX2 + FMA and AVX-512, chosen at run time by `Level`, and simd128 in a wasm build. `dispatch!` makes the entry point of a kernel: it
+//! reference), AVX2 + FMA and AVX-512, chosen at run time by `Level`, and WebAssembly simd128, chosen by the build. `dispatch!` makes the entry point of a kernel: it
 //! compiles the instance inside a function that has the target features, which is what lets the intrinsics inline.
 
 #[cfg(target_arch = "x86_64")]
@@ -8,7 +8,7 @@ pub mod avx2;
 pub mod avx512;
 mod scalar;
 #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
-pub mod wasm;
+pub mod wasm128;
 
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
 
@@ -115,7 +115,7 @@ pub(crate) fn exp2_poly<V: Vector>(f: V) -> V {
     let p = f.mul_add(c(9.570_097e-3), c(5.591_786e-2));
     let p = f.mul_add(p, c(2.402_474_5e-1));
     let p = f.mul_add(p, c(6.931_218e-1));
-    f.mul_add(p, c(9.999_992_6e-1))
+    f.mul_add(p, c(9.999_992e-1))
 }
 
 /// An instruction set that this machine has been found to have. There is no other way to make one, so kernels may rely on it.
@@ -130,7 +130,7 @@ pub(crate) enum Isa {
     #[cfg(target_arch = "x86_64")]
     Avx512,
     #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
-    Simd128,
+    Wasm128,
 }
 
 impl Level {
@@ -151,7 +151,7 @@ impl Level {
             }
         }
         #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
-        found.push(Level(Isa::Simd128));
+        found.push(Level(Isa::Wasm128));
         found.push(Level::SCALAR);
         found
     }
@@ -168,7 +168,7 @@ impl Level {
             #[cfg(target_arch = "x86_64")]
             Isa::Avx512 => "avx512",
             #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
-            Isa::Simd128 => "simd128",
+            Isa::Wasm128 => "wasm128",
         }
     }
 
@@ -203,8 +203,8 @@ macro_rules! dispatch {
                 }
             }
             #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
-            if level.isa() == $crate::simd::Isa::Simd128 {
-                return $kernel::<$crate::simd::wasm::F32x4>($($arg),*);
+            if level.isa() == $crate::simd::Isa::Wasm128 {
+                return $kernel::<$crate::simd::wasm128::F32x4>($($arg),*);
             }
             let _ = level;
             $kernel::<f32>($($arg),*)

@@ -1,7 +1,6 @@
-//! 4 lanes, WebAssembly simd128. The feature is a property of the whole build (there is no run-time detection inside of a
-//! module), so the instance exists where the build has it, and needs no `target_feature` functions.
+//! 4 lanes, WebAssembly simd128, chosen when the target is built with it (there is no run-time detection on the web).
 //!
-//! Why `unsafe` is sound here: loads and stores check the length of the slice first, and alignment does not matter to them.
+//! Why `unsafe` is sound here: only loads and stores need it, and they check the length of the slice first.
 
 use std::arch::wasm32::*;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
@@ -49,7 +48,16 @@ impl Not for Mask4 {
     }
 }
 
-/// 1.5 * 2^23: adding it rounds to whole numbers, which then stand in the low bits of the mantissa.
+/// The sum of the four vectors' lanes, as a vector.
+#[inline(always)]
+fn sum4(a: v128, b: v128, c: v128, d: v128) -> v128 {
+    let ab = f32x4_add(i32x4_shuffle::<0, 4, 1, 5>(a, b), i32x4_shuffle::<2, 6, 3, 7>(a, b));
+    let cd = f32x4_add(i32x4_shuffle::<0, 4, 1, 5>(c, d), i32x4_shuffle::<2, 6, 3, 7>(c, d));
+    f32x4_add(i32x4_shuffle::<0, 1, 4, 5>(ab, cd), i32x4_shuffle::<2, 3, 6, 7>(ab, cd))
+}
+
+/// 1.5 * 2^23: adding it rounds to whole numbers, which then stand in the low bits. Engines convert to integers slowly, since
+/// they must saturate.
 const ROUND: f32 = 12_582_912.0;
 
 impl Vector for F32x4 {
@@ -63,13 +71,13 @@ impl Vector for F32x4 {
     #[inline(always)]
     fn load(s: &[f32]) -> Self {
         assert!(s.len() >= 4);
-        // SAFETY: see the head of this file.
+        // SAFETY: four values are there.
         unsafe { F32x4(v128_load(s.as_ptr().cast())) }
     }
     #[inline(always)]
     fn store(self, d: &mut [f32]) {
         assert!(d.len() >= 4);
-        // SAFETY: see the head of this file.
+        // SAFETY: four values are there.
         unsafe { v128_store(d.as_mut_ptr().cast(), self.0) }
     }
     #[inline(always)]
@@ -82,7 +90,7 @@ impl Vector for F32x4 {
     }
     #[inline(always)]
     fn min(self, b: Self) -> Self {
-        F32x4(f32x4_pmin(b.0, self.0)) // self < b ? self : b
+        F32x4(f32x4_pmin(b.0, self.0))
     }
     #[inline(always)]
     fn max(self, b: Self) -> Self {
@@ -93,17 +101,26 @@ impl Vector for F32x4 {
         F32x4(f32x4_abs(self.0))
     }
     #[inline(always)]
+    fn or(self, b: Self) -> Self {
+        F32x4(v128_or(self.0, b.0))
+    }
+    #[inline(always)]
+    fn negative(self) -> Self {
+        F32x4(v128_or(self.0, f32x4_splat(-0.0)))
+    }
+    #[inline(always)]
     fn sqrt(self) -> Self {
         F32x4(f32x4_sqrt(self.0))
     }
     #[inline(always)]
     fn recip(self) -> Self {
-        F32x4::splat(1.0) / self
+        F32x4(f32x4_div(f32x4_splat(1.0), self.0))
     }
     #[inline(always)]
     fn exp2(self) -> Self {
-        // the operand order of pmax/pmin lets NaN through
-        let x = f32x4_pmin(f32x4_pmax(self.0, f32x4_splat(-127.0)), f32x4_splat(128.0));
+        // pmin and pmax return their first operand where the second is NaN or not beyond it
+        let x = f32x4_pmax(self.0, f32x4_splat(-127.0));
+        let x = f32x4_pmin(x, f32x4_splat(128.0));
         let z = f32x4_add(x, f32x4_splat(ROUND));
         let p = exp2_poly(F32x4(f32x4_sub(x, f32x4_sub(z, f32x4_splat(ROUND)))));
         // 2^n from the exponent field: 0 for n = -127, infinity for n = 128
@@ -138,16 +155,13 @@ impl Vector for F32x4 {
     }
     #[inline(always)]
     fn max_lane(self) -> f32 {
-        let mut a = [0.0; 4];
-        self.store(&mut a);
-        a.iter().fold(f32::NEG_INFINITY, |m, &x| if x > m { x } else { m })
+        let m = f32x4_max(self.0, i32x4_shuffle::<2, 3, 0, 1>(self.0, self.0));
+        f32x4_extract_lane::<0>(f32x4_max(m, i32x4_shuffle::<1, 0, 3, 2>(m, m)))
     }
     #[inline(always)]
     fn sum12(v: &[Self; 12], out: &mut [f32; 12]) {
-        for (v, out) in v.iter().zip(out) {
-            let mut a = [0.0; 4];
-            v.store(&mut a);
-            *out = (a[0] + a[2]) + (a[1] + a[3]);
-        }
+        F32x4(sum4(v[0].0, v[1].0, v[2].0, v[3].0)).store(&mut out[..4]);
+        F32x4(sum4(v[4].0, v[5].0, v[6].0, v[7].0)).store(&mut out[4..8]);
+        F32x4(sum4(v[8].0, v[9].0, v[10].0, v[11].0)).store(&mut out[8..]);
     }
 }

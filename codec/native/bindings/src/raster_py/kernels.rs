@@ -1,0 +1,90 @@
+//! Training kernels that work on arrays alone: image loss and hash grid.
+
+use numpy::{PyArray1, prelude::*};
+use pyo3::prelude::*;
+use raster::{ImageLoss, Pair};
+
+use super::{In, InOut, contiguous, level, usage};
+
+/// (loss, l1, mse, ssim, gradient [H * W * 3]) of an image [H, W, 3].
+#[pyfunction]
+#[pyo3(signature = (image, target, weight, ssim_lambda, simd="auto"))]
+#[allow(clippy::type_complexity)]
+pub fn image_loss<'py>(
+    py: Python<'py>,
+    image: In,
+    target: In,
+    weight: Option<In>,
+    ssim_lambda: f32,
+    simd: &str,
+) -> PyResult<(f64, f64, f64, f64, Bound<'py, PyArray1<f32>>)> {
+    let (level, width) = (level(simd)?, image.shape().get(1).copied().unwrap_or(0));
+    let weight = weight.as_ref().map(|w| contiguous(w.as_slice())).transpose()?;
+    let (x, y) = (contiguous(image.as_slice())?, contiguous(target.as_slice())?);
+    let pair = Pair {
+        image: x,
+        target: y,
+        width,
+        weight,
+    };
+    let (value, grad) = py
+        .detach(|| {
+            let mut grad = vec![0.0; x.len()];
+            ImageLoss::default()
+                .run(level, pair, ssim_lambda, &mut grad)
+                .map(|v| (v, grad))
+        })
+        .map_err(usage)?;
+    Ok((
+        value.loss,
+        value.l1,
+        value.mse,
+        value.ssim,
+        PyArray1::from_vec(py, grad),
+    ))
+}
+
+/// Instant-NGP grid: `cells` on a side of each level, `table` entries at most a level.
+#[pyclass]
+pub struct HashGrid {
+    inner: raster::HashGrid,
+}
+
+#[pymethods]
+impl HashGrid {
+    #[new]
+    fn new(features: usize, cells: Vec<u32>, table: usize) -> PyResult<Self> {
+        Ok(HashGrid {
+            inner: raster::HashGrid::new(features, &cells, table).map_err(usage)?,
+        })
+    }
+
+    #[getter]
+    fn entries(&self) -> usize {
+        self.inner.entries()
+    }
+
+    /// points [N, 3], table [entries, F] -> out [N, L * F], written in place.
+    fn forward(&mut self, py: Python, points: In, table: In, mut out: InOut) -> PyResult<()> {
+        let (points, table) = (contiguous(points.as_slice())?, contiguous(table.as_slice())?);
+        let out = contiguous(out.as_slice_mut())?;
+        py.detach(|| self.inner.forward(points, table, out)).map_err(usage)
+    }
+
+    /// Adds to grad_table and overwrites grad_points.
+    fn backward(
+        &mut self,
+        py: Python,
+        points: In,
+        table: In,
+        grad_out: In,
+        mut grad_table: InOut,
+        mut grad_points: Option<InOut>,
+    ) -> PyResult<()> {
+        let (points, table) = (contiguous(points.as_slice())?, contiguous(table.as_slice())?);
+        let (grad_out, grad_table) = (contiguous(grad_out.as_slice())?, contiguous(grad_table.as_slice_mut())?);
+        let grad_points = grad_points.as_mut().map(|g| contiguous(g.as_slice_mut())).transpose()?;
+        py.detach(|| self.inner.backward(points, table, grad_out, grad_table, grad_points))
+            .map_err(usage)
+    }
+}

@@ -1,0 +1,72 @@
+//! Arrays of Gaussians, [N, D], -> rows of 16 lanes, and vectors from rows.
+
+use crate::scene::Splats;
+use crate::simd::{Vector, c};
+
+/// Gaussians in one chunk.
+pub const CHUNK: usize = 16;
+pub type Row = [f32; CHUNK];
+
+/// Parameters of 16 Gaussians, one lane each. Lanes past the end hold NaN means and are culled by that.
+pub struct Soa {
+    pub means: [Row; 3],
+    pub quats: [Row; 4],
+    pub log_scales: [Row; 3],
+    pub logits: Row,
+    pub sh0: [Row; 3],
+    pub sh_n: [[Row; 3]; 15],
+}
+
+impl Soa {
+    pub fn new() -> Soa {
+        let z = [0.0; CHUNK];
+        Soa {
+            means: [z; 3],
+            quats: [z; 4],
+            log_scales: [z; 3],
+            logits: z,
+            sh0: [z; 3],
+            sh_n: [[z; 3]; 15],
+        }
+    }
+
+    /// Gaussians first .. first + 16 of `s`, fewer at the end.
+    pub fn fill(&mut self, s: &Splats, first: usize) -> usize {
+        let n = CHUNK.min(s.len() - first);
+        self.means = [[f32::NAN; CHUNK]; 3];
+        columns(&mut self.means, &s.means[3 * first..3 * (first + n)]);
+        columns(&mut self.quats, &s.quats[4 * first..4 * (first + n)]);
+        columns(&mut self.log_scales, &s.log_scales[3 * first..3 * (first + n)]);
+        columns(&mut self.sh0, &s.sh0[3 * first..3 * (first + n)]);
+        self.logits[..n].copy_from_slice(&s.logit_opacities[first..first + n]);
+        if s.sh_k > 0 {
+            let own = s.sh_n[3 * s.sh_k * first..].chunks_exact(3 * s.sh_k);
+            for (lane, item) in own.take(n).enumerate() {
+                for (rows, rgb) in self.sh_n.iter_mut().zip(item.as_chunks::<3>().0) {
+                    for ch in 0..3 {
+                        rows[ch][lane] = rgb[ch];
+                    }
+                }
+            }
+        }
+        n
+    }
+}
+
+/// [n, D] -> D rows of n.
+fn columns<const D: usize>(rows: &mut [Row; D], flat: &[f32]) {
+    for (lane, item) in flat.chunks_exact(D).enumerate() {
+        for d in 0..D {
+            rows[d][lane] = item[d];
+        }
+    }
+}
+
+#[inline(always)]
+pub fn load_rows<V: Vector, const D: usize>(rows: &[Row; D], at: usize) -> [V; D] {
+    let mut v = [c::<V>(0.0); D];
+    for d in 0..D {
+        v[d] = V::load(&rows[d][at..]);
+    }
+    v
+}
