@@ -32,5 +32,7 @@ def play_stream(path: Path, *, host: str, port: int, browser: bool, say: Callabl
         webbrowser.open(server.url)
     try:
         server.serve_forever()
+    except KeyboardInterrupt:
+        pass  # the way to end it
     finally:
         server.server_close()

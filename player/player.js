@@ -58,6 +58,7 @@ export class GsvPlayer extends HTMLElement {
 
   connectedCallback() {
     this.hasAttribute("tabindex") || this.setAttribute("tabindex", "-1");
+    this.engine = null;
     if (this.getAttribute("src")) this.#open();
   }
 
@@ -66,7 +67,7 @@ export class GsvPlayer extends HTMLElement {
   }
 
   attributeChangedCallback(name, before, value) {
-    if (name === "src" && this.isConnected && value !== before) this.#open();
+    if (name === "src" && this.engine !== undefined && this.isConnected && value !== before) this.#open();
     if (name === "loop") this.$("[data-do=loop]").setAttribute("aria-pressed", value !== null);
     if (name === "speed" && Number(value) > 0) this.speed = Number(value);
     if (name === "quality" && value) this.quality = value === "auto" ? value : Math.min(Math.max(Number(value) || 1, 0.1), 1);

@@ -65,12 +65,13 @@ class Stream:
 
     def __init__(self, path: Path):
         self.path = Path(path)
-        self.growing = self.path.suffix == ".part"
-        self._held = open(self.path, "rb") if self.growing else None  # noqa: SIM115
+        self._held = open(self.path, "rb")
+        if self.path.suffix != ".part":
+            self._held.close()
 
     def open(self):
         """A file object of its own for one request."""
-        if self._held is None:
+        if self._held.closed:
             return open(self.path, "rb")
         return os.fdopen(os.open(f"/proc/self/fd/{self._held.fileno()}", os.O_RDONLY), "rb")
 

@@ -50,6 +50,7 @@ export class Source extends EventTarget {
     this.native = native; // whose demuxer is used
     const head = await this.#read(0, HEAD);
     if (!head.length) throw new StreamError("The file is empty.");
+    this.total ??= await this.#size();
     this.native.push(head);
     let d = this.native.describe();
     while (!d.config && (await this.#more())) d = this.native.describe();
@@ -204,6 +205,12 @@ export class Source extends EventTarget {
     return out;
   }
 
+  // Asked where no answer to a range has told it; null if this does not either.
+  async #size() {
+    const response = await fetch(this.url, { method: "HEAD", signal: this.#closing.signal, cache: "no-store" }).catch(() => null);
+    return (response?.ok && Number(response.headers.get("content-length"))) || null;
+  }
+
   // One request; `take` gets the bytes as they come. True if the file has no more.
   async #request(start, end, take, signal) {
     const watch = new AbortController();
@@ -257,6 +264,11 @@ export class Source extends EventTarget {
     }
     const bytes = Number(response.headers.get("content-length") ?? 0);
     this.#say("received", { bytes, ms: performance.now() - began });
+    // another origin hides Content-Range, but not the length of what it sent
+    if (status === 206 && !range && bytes && bytes < end - start) {
+      this.total = start + bytes;
+      return true;
+    }
     if (status === 200) {
       this.#whole = new Uint8Array(await new Blob(chunks).arrayBuffer());
       this.total = this.#whole.length;
