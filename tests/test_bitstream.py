@@ -11,6 +11,7 @@ import pytest
 from gscodec import _native
 from gscodec.bitstream import attributes
 from gscodec.bitstream.levels import LEVELS, smallest_level
+from gscodec.decode import open_stream
 from gscodec.errors import BitstreamError, LimitError
 
 CAMERA = {"name": "cam00", "K": [[500, 0, 320], [0, 510, 240], [0, 0, 1]], "viewmat": np.eye(4)}
@@ -244,6 +245,12 @@ def test_node_weights_where_distances_vanish():
     np.testing.assert_array_equal(weight, 0.25)
 
 
+def test_node_weights_take_grid_points_only():
+    p = np.full((2, 3), 5, np.uint32)
+    with pytest.raises(ValueError, match=r"nodes: expected grid coordinates below 2\^21"):
+        _native.node_weights(p, np.full((6, 3), 1 << 21, np.uint32), 4)
+
+
 def test_damage_is_an_error():
     payload, _ = _native.encode_group(moving_group(40))
     rng = np.random.default_rng(2)
@@ -255,6 +262,63 @@ def test_damage_is_an_error():
     for size in rng.integers(0, len(payload) - 200, 50):
         with pytest.raises(BitstreamError):
             _native.DecodedGroup(payload[:size], 1)
+
+
+def flipped(payload, unit_type, attribute=None):
+    """The payload with a bit in the middle of one unit changed."""
+    u = next(u for u in _native.units(payload) if (u["type"], u["attribute"]) == (unit_type, attribute))
+    bad = bytearray(payload)
+    bad[u["offset"] + u["bytes"] - 2] ^= 4
+    return bytes(bad), u["unit"]
+
+
+def test_what_is_not_damaged_decodes():
+    payload, _ = _native.encode_group(moving_group(40))
+    sound = _native.DecodedGroup(payload, 1, strict=False)
+    assert sound.damage() == []
+    bad, unit = flipped(payload, "trajectories", "sh0")
+    decoded = _native.DecodedGroup(bad, 1, strict=False)
+    [damage] = decoded.damage()
+    assert damage.pop("message").endswith("the unit is damaged")
+    assert damage == {"unit": unit, "type": "trajectories", "attribute": "sh0"}
+    for t in (0, 5):
+        frame, want = decoded.frame(t), sound.frame(t)
+        np.testing.assert_array_equal(frame["means"], want["means"])
+        np.testing.assert_array_equal(frame["sh0"], decoded.frame(1)["sh0"])  # held
+    assert not np.array_equal(sound.frame(0)["sh0"], sound.frame(5)["sh0"])
+
+    decoded = _native.DecodedGroup(flipped(payload, "channels", "log_scales")[0], 1, strict=False)
+    channel = decoded.integers()["channels"]["log_scales"]
+    assert not channel["values"].any()
+    assert channel["offsets"] == [0.5] * 3
+    np.testing.assert_array_equal(decoded.frame(3)["sh0"], sound.frame(3)["sh0"])
+    for name in ("positions", "group_header"):
+        with pytest.raises(BitstreamError, match="CRC"):
+            _native.DecodedGroup(flipped(payload, name)[0], 1, strict=False)
+
+
+def test_streams_tell_of_damage(tmp_path):
+    payload, _ = _native.encode_group(moving_group(40))
+    bad, unit = flipped(payload, "trajectories", "means")
+    frames = _native.DecodedGroup(payload, 1).frames
+    path = tmp_path / "damaged.gsv"
+    config = {**CONFIG, "sh_degree": 3}
+    parts = [
+        _native.fragment(p, i + 1, i * frames, frames, True, config)
+        for i, p in enumerate((payload, bad, payload, payload))
+    ]
+    path.write_bytes(_native.init_segment(config) + b"".join(parts))
+    with pytest.raises(BitstreamError, match=r"group 1 .*CRC"):
+        open_stream(path).frame(frames)
+    stream = open_stream(path, strict=False)
+    assert stream.frame(0).means.shape == (len(stream.frame(frames)), 3)
+    assert stream.frame_count == 4 * frames
+    for i in (0, 2, 3, 1):  # decoded again, told once
+        stream.group(i)
+    [damage] = stream.damage
+    assert (damage["group"], damage["unit"], damage["type"], damage["attribute"]) == (1, unit, "trajectories", "means")
+    with pytest.raises(IndexError):
+        stream.frame(4 * frames)
 
 
 def test_levels_are_caps():

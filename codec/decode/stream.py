@@ -6,15 +6,17 @@ Any frame is one evaluation away from its group's coefficients, so seeking costs
 from __future__ import annotations
 
 import mmap
+from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Sequence
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 
 from gscodec import _native
 from gscodec.camera import Camera
-from gscodec.errors import BitstreamError
+from gscodec.errors import BitstreamError, LimitError
 from gscodec.gaussians import Gaussians, GaussianSequence, Group
 
 GROUPS_HELD = 2  # decoded groups in memory: the one that plays and the next
@@ -27,13 +29,16 @@ class Stream:
         config: the config box: fps, level, sh_degree, up, background, cameras, ...
         groups: list of {offset, size, start_frame, frames, sync}.
         complete: false if the file ends inside a group (that group is left out).
+        strict: damage is an error; otherwise what is not damaged is decoded, and `damage` tells of the rest.
     """
 
-    def __init__(self, data, name: str = "stream"):
-        self.name, self._data = name, data
+    def __init__(self, data, name: str = "stream", *, strict: bool = True):
+        self.name, self._data, self.strict = name, data, strict
         index = _native.demux(data)
         self.config, self.groups, self.complete = index["config"], index["groups"], index["complete"]
         self._held: OrderedDict[int, object] = OrderedDict()
+        self._damage: dict[int, list[dict]] = {}
+        self._ends: list[int] = list(accumulate(g["frames"] for g in self.groups))  # frames up to and with each group
 
     @property
     def fps(self) -> float:
@@ -44,7 +49,16 @@ class Stream:
     @property
     def frame_count(self) -> int:
         """Frames in whole groups."""
-        return sum(g["frames"] for g in self.groups)
+        return self._ends[-1] if self._ends else 0
+
+    @property
+    def damage(self) -> list[dict]:
+        """What was damaged in the groups decoded so far: dicts of group, unit, type, attribute, message.
+
+        Damaged trajectories stand still, and a damaged attribute has its offsets everywhere. `unit` is None where a
+        unit is missing because one before it is damaged. A group without sound header and positions stays an error.
+        """
+        return [{"group": i, **d} for i, found in sorted(self._damage.items()) for d in found]
 
     @property
     def byte_count(self) -> int:
@@ -68,20 +82,31 @@ class Stream:
         """Group `i`, decoded (`_native.DecodedGroup`).
 
         Raises:
-            BitstreamError: a unit of it is damaged.
+            BitstreamError: a unit of it is damaged (not strict: header or positions), or it contradicts the file.
+            LimitError: it exceeds the level of the file.
         """
         if i not in self._held:
             try:
-                self._held[i] = _native.DecodedGroup(self.payload(i), self.config["level"])
-            except BitstreamError as e:
-                raise BitstreamError(f"{self.name}: group {i} (frames {self._span(i)}): {e}") from None
-            if self._held[i].frames != self.groups[i]["frames"]:
-                told, got = self.groups[i]["frames"], self._held.pop(i).frames
-                raise BitstreamError(f"{self.name}: group {i}: its header says {got} frames, its sample {told}")
+                group = _native.DecodedGroup(self.payload(i), self.config["level"], self.strict)
+            except (BitstreamError, LimitError) as e:
+                raise type(e)(f"{self.name}: group {i} (frames {self._span(i)}): {e}") from None
+            self._check(i, group)
+            if found := group.damage():
+                self._damage[i] = found
+            self._held[i] = group
             while len(self._held) > GROUPS_HELD:
                 self._held.popitem(last=False)
         self._held.move_to_end(i)
         return self._held[i]
+
+    def _check(self, i: int, group) -> None:
+        """What the header of a group must have in common with the file (spec 4), which a group does not know."""
+        frames, degree = self.groups[i]["frames"], self.config["sh_degree"]
+        if group.frames != frames or group.sh_degree > degree:
+            raise BitstreamError(
+                f"{self.name}: group {i}: the file says {frames} frames and an SH degree of at most {degree}, "
+                f"the header of the group {group.frames} frames and degree {group.sh_degree}"
+            )
 
     def _span(self, i: int) -> str:
         g = self.groups[i]
@@ -93,11 +118,10 @@ class Stream:
         Raises:
             IndexError: `t` is not in the file.
         """
-        for i, g in enumerate(self.groups):
-            if 0 <= t < g["frames"]:
-                return self._frame_of_group(i, t)
-            t -= g["frames"]
-        raise IndexError(f"{self.name} has {self.frame_count} frames")
+        if not 0 <= t < self.frame_count:
+            raise IndexError(f"{self.name} has {self.frame_count} frames")
+        i = bisect_right(self._ends, t)
+        return self._frame_of_group(i, t - self._ends[i] + self.groups[i]["frames"])
 
     def _frame_of_group(self, i: int, t: int) -> Gaussians:
         group = self.group(i)
@@ -139,8 +163,8 @@ class _Frames(Sequence):
         return Gaussians(**self.stream.group(self.i).frame(t))
 
 
-def open_stream(path: str | Path) -> Stream:
-    """Opens a .gsv file.
+def open_stream(path: str | Path, *, strict: bool = True) -> Stream:
+    """Opens a .gsv file; not `strict`: what is not damaged is decoded, `Stream.damage` tells of the rest.
 
     Raises:
         FileNotFoundError: nothing is there.
@@ -152,6 +176,6 @@ def open_stream(path: str | Path) -> Stream:
             raise BitstreamError(f"{path}: the file is empty, expected a .gsv stream")
         data = mmap.mmap(f.fileno(), 0, access=mmap.ACCESS_READ)
     try:
-        return Stream(data, str(path))
+        return Stream(data, str(path), strict=strict)
     except BitstreamError as e:
         raise BitstreamError(f"{path}: {e}") from None

@@ -27,7 +27,9 @@ from gscodec.train.views import Views, compare
 # attribute -> (channels, temporal frequencies that may be used)
 RESIDUALS = {"means": (3, 8), "quats": (3, 4), "sh0": (3, 4)}
 RESIDUAL_RATE = {"means": 0.02, "quats": 0.02, "sh0": 0.02}  # in steps of the stream a step of the optimiser
+LAPLACE_RATE = 0.02
 MEANS_RATE = 4e-5  # of the canonical means, times the radius
+RATE_EVERY = 4  # the rate term has every coefficient, an image few of them: once in so many steps, so much stronger
 
 
 def laplace_bits(x: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
@@ -102,6 +104,53 @@ class GroupModel:
         return Gaussians(**arrays)
 
 
+class _Finetuner:
+    """State of one fine-tuning run; `step` is one view of one frame."""
+
+    def __init__(self, group: GroupModel, views: Views, frames: range, settings: TrainSettings, radius: float):
+        self.group, self.views, self.frames, self.settings = group, views, frames, settings
+        self.rng = np.random.default_rng([settings.seed, frames[0], 2])
+        self.noise = torch.Generator().manual_seed(settings.seed)
+        self.workspace = Workspace()
+        residuals = [(c, RESIDUAL_RATE[n]) for n, c in group.coefficients.items()]
+        scales = [(s, LAPLACE_RATE) for s in group.log_scales.values()]
+        self.optimizer = torch.optim.Adam(
+            [{"params": [p], "lr": r, "base": r} for p, r in residuals + scales], betas=(0.9, 0.99), fused=True
+        )
+        self.canonical_rates = {"means": MEANS_RATE * radius, **{n: 0.3 * r for n, r in RATES.items()}}
+        group.key.restart()
+
+    def step(self, t: int, fade: float) -> float:
+        """One step on frame `t`, all rates times `fade`; returns the image loss."""
+        for g in self.optimizer.param_groups:
+            g["lr"] = g["base"] * fade
+        params = self.group.frame(t)
+        target = self.views.draw(self.frames[t])
+        result = compare(params, target, self.settings, self.rng, self.workspace)
+        penalty = self._penalty(t, target.rgb.shape[0] * target.rgb.shape[1])
+        heads, seeds = [params[n] for n in RESIDUALS], [result.grads[n] for n in RESIDUALS]
+        if penalty.requires_grad:
+            heads, seeds = [*heads, penalty], [*seeds, torch.ones(())]
+        self.optimizer.zero_grad()
+        torch.autograd.backward(heads, seeds)
+        self.optimizer.step()
+        back = self.group.turned[t] * torch.tensor([1.0, -1, -1, -1])
+        grads = {**result.grads, "quats": quat_multiply(back, result.grads["quats"])}  # to the canonical pose
+        self.group.key.adam(grads, {n: r * fade for n, r in self.canonical_rates.items()})
+        return result.loss
+
+    def _penalty(self, t: int, pixels: int) -> torch.Tensor:
+        """Temporal and rate terms, in the image loss's unit (a mean over pixels)."""
+        s, group, penalty = self.settings, self.group, torch.zeros(())
+        if t + 1 < len(self.frames):
+            for name in group.coefficients:
+                change = (group.residual(name, t + 1) - group.residual(name, t)) / group.unit[name]
+                penalty = penalty + s.temporal_lambda * change.abs().mean(1).sum() / pixels
+        if self.rng.integers(RATE_EVERY) == 0:
+            penalty = penalty + RATE_EVERY * s.rate_lambda / (pixels * len(self.frames)) * group.bits(self.noise)
+        return penalty
+
+
 def finetune(
     group: GroupModel,
     views: Views,
@@ -113,54 +162,10 @@ def finetune(
 ) -> None:
     """Optimises canonical attributes and coefficients over all frames; `on_step` gets (step, loss)."""
     steps = settings.finetune_steps * len(frames)
-    rng = np.random.default_rng([settings.seed, frames[0], 2])
-    generator = torch.Generator().manual_seed(settings.seed)
-    workspace = Workspace()
-    optimizer = torch.optim.Adam(
-        [{"params": [c], "lr": RESIDUAL_RATE[n], "base": RESIDUAL_RATE[n]} for n, c in group.coefficients.items()]
-        + [{"params": list(group.log_scales.values()), "lr": 0.02, "base": 0.02}],
-        betas=(0.9, 0.99),
-        fused=True,
-    )
-    group.key.restart()
-    rates = {"means": MEANS_RATE * radius, **{n: 0.3 * r for n, r in RATES.items()}}
+    run = _Finetuner(group, views, frames, settings, radius)
     order: list[int] = []
     for step in range(steps):
-        fade = 0.05 ** (step / steps)
-        for g in optimizer.param_groups:
-            g["lr"] = g["base"] * fade
-        order = order or rng.permutation(len(frames)).tolist()
-        t = order.pop()
-        loss = _step(group, views, frames, t, settings, optimizer, rng, generator, workspace, rates, fade)
+        order = order or run.rng.permutation(len(frames)).tolist()
+        loss = run.step(order.pop(), 0.05 ** (step / steps))
         if on_step:
             on_step(step, loss)
-
-
-RATE_EVERY = 4  # the rate term has every coefficient, an image few of them: once in so many steps, so much stronger
-
-
-def _step(group, views, frames, t, settings, optimizer, rng, generator, workspace, rates, fade) -> float:
-    params = group.frame(t)
-    target = views.draw(frames[t])
-    pixels = target.rgb.shape[0] * target.rgb.shape[1]
-    result = compare(params, target, settings, rng, workspace)
-    optimizer.zero_grad()
-    heads = [params[n] for n in ("means", "quats", "sh0")]
-    seeds = [result.grads[n] for n in ("means", "quats", "sh0")]
-    penalty = torch.zeros(())
-    if t + 1 < len(frames):
-        for name in group.coefficients:
-            change = (group.residual(name, t + 1) - group.residual(name, t)) / group.unit[name]
-            penalty = penalty + settings.temporal_lambda * change.abs().sum() / (pixels * len(change[0]))
-    if rng.integers(RATE_EVERY) == 0:
-        per_frame = RATE_EVERY * settings.rate_lambda / (pixels * len(frames))
-        penalty = penalty + per_frame * group.bits(generator)
-    if penalty.requires_grad:
-        heads, seeds = [*heads, penalty], [*seeds, torch.ones(())]
-    torch.autograd.backward(heads, seeds)
-    optimizer.step()
-    grads = dict(result.grads)
-    turned = group.turned[t] * torch.tensor([1.0, -1, -1, -1])
-    grads["quats"] = quat_multiply(turned, result.grads["quats"])  # back to the canonical frame
-    group.key.adam(grads, {n: r * fade for n, r in rates.items()})
-    return result.loss

@@ -15,6 +15,7 @@ from gscodec import _native
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import reference_decoder as reference
+from reference_container import boxes
 
 CHANNELS = {"log_scales": 3, "quats": 3, "logit_opacities": 1, "sh0": 3}
 
@@ -166,7 +167,7 @@ def box(kind, body):
 
 def split_boxes(data):
     """[(type, bytes)] of the top-level boxes."""
-    return [(kind, data[start:end]) for kind, start, _, end in reference.boxes(data, 0, len(data), top_level=True)]
+    return [(kind, data[start:end]) for kind, start, _, end in boxes(data, 0, len(data), top_level=True)]
 
 
 def shift_data(moof, by):
@@ -244,6 +245,33 @@ def no_mdat():
 
 def truncated():
     return groups_file(make_group(30, 2), make_group(30, 2, seed=2), finish=False)[:-10]
+
+
+def second_moof():
+    """A moof without a traf of our track between a moof and its mdat."""
+    parts = split_boxes(groups_file(make_group(30, 2), finish=False))
+    empty = box(b"moof", full_box(b"mfhd", 0, 2))
+    (_, ftyp), (_, moov), (_, moof), (_, mdat) = parts
+    return ftyp + moov + shift_data(moof, len(empty)) + empty + mdat
+
+
+def truncated_to_end():
+    """An mdat of size 0 whose sample goes on past the end of the file, after a whole group."""
+    return other_mdat_sizes()[:-10]
+
+
+def ignored_fields():
+    """Values of later versions in fields that a reader does not look at."""
+    data = groups_file(make_group(30, 2))
+    entry = data.index(b"stsd") + 20  # the body of the sample entry
+    for at, new in (
+        (12, u32(7)),  # minor_version of ftyp
+        (data.index(b"hdlr") + 8, u32(1)),  # pre_defined
+        (data.index(b"vvhd") + 4, b"\1\0\0\1"),  # version and flags
+        (entry, b"later!\0\2" + b"\xff" * 32),  # reserved, data_reference_index, compressor_name
+    ):
+        data = poke(data, at, new)
+    return data
 
 
 def truncated_after_sample():

@@ -27,13 +27,19 @@ pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<decoded::DecodedGroup>()
 }
 
+/// Rows of a matrix of grid points.
+fn grid(a: &PyReadonlyArray2<u32>, name: &str) -> PyResult<Vec<[u32; 3]>> {
+    let p = rows(a, name)?;
+    if p.iter().flatten().any(|v| *v >= 1 << 21) {
+        return invalid(format!("{name}: expected grid coordinates below 2^21"));
+    }
+    Ok(p)
+}
+
 /// Stable permutation [N] u32 that puts positions [N, 3] u32 into Morton order.
 #[pyfunction]
 fn morton_order<'py>(py: Python<'py>, positions: PyReadonlyArray2<'py, u32>) -> PyResult<Bound<'py, PyArray1<u32>>> {
-    let p = rows(&positions, "positions")?;
-    if p.iter().flatten().any(|v| *v >= 1 << 21) {
-        return invalid("positions: expected grid coordinates below 2^21".into());
-    }
+    let p = grid(&positions, "positions")?;
     Ok(py.detach(|| gsv::morton::order(&p)).into_pyarray(py))
 }
 
@@ -45,7 +51,7 @@ fn node_weights<'py>(
     nodes: PyReadonlyArray2<'py, u32>,
     neighbors: usize,
 ) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
-    let (p, n) = (rows(&positions, "positions")?, rows(&nodes, "nodes")?);
+    let (p, n) = (grid(&positions, "positions")?, grid(&nodes, "nodes")?);
     if !(1..=gsv::blend::NEIGHBORS_MAX).contains(&neighbors) {
         return invalid(format!(
             "expected 1 to {} neighbors, got {neighbors}",

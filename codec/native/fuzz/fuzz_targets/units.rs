@@ -15,6 +15,7 @@ fuzz_target!(|input: (u8, &[u8])| {
     let victim = usize::from(input.0) % units.len();
     units[victim].payload = input.1;
     if let Ok(group) = decode_units(&units, &LEVELS[0]) {
+        group.validate().expect("a group");
         Evaluator::new(group).frame(1, &mut Frame::default());
     }
 });

@@ -2,12 +2,14 @@
 //!
 //! Positions first, since all contexts come from them; then every other unit, in parallel. Memory is taken only for what
 //! the header announces and the level allows, and trajectories grow against what is left of the level's symbols.
+//! Damage (spec 3) is an error, or what is not affected is decoded and the rest stands still or takes its offsets.
 
 use crate::attributes::Attribute;
 use crate::channels;
 use crate::error::{Error, Result};
 use crate::group::Group;
-use crate::header::Header;
+use crate::header::{Header, NodeHeader};
+use crate::inventory::{self, Damage};
 use crate::levels::Level;
 use crate::lifetimes;
 use crate::morton;
@@ -35,20 +37,37 @@ pub fn decode_group(payload: &[u8], level: &Level) -> Result<Group> {
     decode_units(&unit::split(payload)?, level)
 }
 
+/// Decodes what is not damaged: damaged trajectories are none, damaged channels 0, damaged node units no nodes or no motion
+/// of theirs, and damaged lifetimes leave all Gaussians shown.
+///
+/// # Errors
+/// As `decode_group`, for damage only if it is in the header or in the positions.
+pub fn decode_damaged(payload: &[u8], level: &Level) -> Result<(Group, Vec<Damage>)> {
+    level.cap("group", "bytes", payload.len() as u64, level.bytes)?;
+    decode(&unit::scan(payload)?, level)
+}
+
 /// Decodes units whose checksums were verified, or are of no interest (fuzzing).
 pub fn decode_units(units: &[Unit], level: &Level) -> Result<Group> {
+    Ok(decode(units, level)?.0)
+}
+
+fn decode(units: &[Unit], level: &Level) -> Result<(Group, Vec<Damage>)> {
     let Some(first) = units.first() else {
         return Err(Error::bitstream(0, "unit 0", "a group header"));
     };
-    let header = Header::read(first.payload).map_err(|e| e.at(first.payload_offset, &first.label(0)))?;
+    let mut header = Header::read(first.payload).map_err(|e| e.at(first.payload_offset, &first.label(0)))?;
     let known = header.check(level)?;
+    let damage = inventory::check(units, &header)?;
+    if header.nodes.count > 0 && inventory::find(units, UnitType::NodePositions, None).is_none() {
+        header.nodes = NodeHeader::default();
+    }
     let decoder = GroupDecoder {
         header: &header,
         units,
         level,
         symbols: AtomicU64::new(known),
     };
-    decoder.announced()?;
     let points = |kind, count| decoder.points(kind, count);
     let (positions, node_positions) = rayon::join(
         || points(UnitType::Positions, header.count),
@@ -64,7 +83,12 @@ pub fn decode_units(units: &[Unit], level: &Level) -> Result<Group> {
     let near = neighbors::nearest(&positions);
     let near_nodes = neighbors::nearest(&node_positions);
     let decode = |(i, u): (usize, &Unit)| decoder.part(i, u, &near, &near_nodes).map(|p| p.map(|p| (i, p)));
-    let parts = units.par_iter().enumerate().map(decode).collect::<Result<Vec<_>>>()?;
+    let parts = units
+        .par_iter()
+        .enumerate()
+        .filter(|(_, u)| u.damage.is_none())
+        .map(decode)
+        .collect::<Result<Vec<_>>>()?;
     let mut group = Group {
         positions,
         node_positions,
@@ -76,7 +100,25 @@ pub fn decode_units(units: &[Unit], level: &Level) -> Result<Group> {
         place(&mut group, &header, units[i].attribute, part);
     }
     group.header = header;
-    Ok(group)
+    fill(&mut group);
+    Ok((group, damage))
+}
+
+/// Stands in for units that are damaged: channels of 0, no trajectories.
+fn fill(group: &mut Group) {
+    let (h, n) = (&group.header, group.positions.len());
+    for (values, scale) in group.channels.iter_mut().zip(&h.scales) {
+        values.resize(n * scale.steps.len(), 0);
+    }
+    for (t, head) in group.trajectories.iter_mut().zip(&h.trajectories) {
+        if t.channels == 0 {
+            *t = Trajectories::still(head.attribute.channels(h.sh_degree), n);
+        }
+    }
+    let nodes = group.node_positions.len();
+    if group.node_trajectories.len() != nodes {
+        group.node_trajectories = Trajectories::still(6, nodes);
+    }
 }
 
 fn place(group: &mut Group, header: &Header, attribute: Option<Attribute>, part: Part) {
@@ -106,54 +148,8 @@ struct GroupDecoder<'a> {
 }
 
 impl GroupDecoder<'_> {
-    fn find(&self, kind: UnitType, attribute: Option<Attribute>) -> Option<usize> {
-        self.units
-            .iter()
-            .position(|u| u.kind == Some(kind) && u.attribute == attribute)
-    }
-
-    /// Units and header must announce the same.
-    fn announced(&self) -> Result<()> {
-        let h = self.header;
-        let nodes: &[UnitType] = if h.nodes.count > 0 {
-            &[UnitType::NodePositions, UnitType::NodeTrajectories]
-        } else {
-            &[]
-        };
-        let mut required = vec![(UnitType::GroupHeader, None), (UnitType::Positions, None)];
-        required.extend(nodes.iter().map(|k| (*k, None)));
-        required.extend(h.attributes().iter().map(|a| (UnitType::Channels, Some(*a))));
-        required.extend(
-            h.trajectories
-                .iter()
-                .map(|t| (UnitType::Trajectories, Some(t.attribute))),
-        );
-        let end = self.units.last().map_or(0, |u| u.payload_offset + u.payload.len());
-        for (kind, attribute) in &required {
-            if self.find(*kind, *attribute).is_none() {
-                let name = attribute.map_or("", Attribute::name);
-                return Err(Error::bitstream(
-                    end,
-                    "group",
-                    format!("a {} unit {name}, found none", kind.name()),
-                ));
-            }
-        }
-        required.push((UnitType::Lifetimes, None));
-        for (i, u) in self.units.iter().enumerate() {
-            if u.kind.is_some_and(|k| !required.contains(&(k, u.attribute))) {
-                return Err(Error::bitstream(
-                    u.offset,
-                    u.label(i),
-                    "only units that the header announces",
-                ));
-            }
-        }
-        Ok(())
-    }
-
     fn points(&self, kind: UnitType, count: u32) -> Result<Vec<[u32; 3]>> {
-        let Some(i) = self.find(kind, None) else {
+        let Some(i) = inventory::find(self.units, kind, None) else {
             return Ok(Vec::new());
         };
         let unit = &self.units[i];

@@ -28,6 +28,15 @@ impl Trajectories {
         }
     }
 
+    /// `count` Gaussians without coefficients.
+    pub fn still(channels: usize, count: usize) -> Self {
+        Trajectories {
+            channels,
+            start: vec![0; count + 1],
+            values: Vec::new(),
+        }
+    }
+
     /// Appends one Gaussian: `coefficients` holds its values, `channels` per coefficient; zeros at the end are left out.
     pub fn push(&mut self, coefficients: &[i32]) {
         let used = coefficients

@@ -79,6 +79,8 @@ pub struct Unit<'a> {
     pub payload_offset: usize,
     pub size: usize,
     pub payload: &'a [u8],
+    /// What is wrong with the unit, if it is damaged; then the other fields are what its bytes claim.
+    pub damage: Option<Error>,
     dependencies: Vec<u8>,
 }
 
@@ -97,52 +99,85 @@ const UNITS_MAX: usize = 255;
 
 /// Splits a group payload; every CRC and dependency is checked.
 pub fn split(payload: &[u8]) -> Result<Vec<Unit<'_>>> {
+    let mut units = scan(payload)?;
+    match units.iter_mut().find_map(|u| u.damage.take()) {
+        Some(damage) => Err(damage),
+        None => Ok(units),
+    }
+}
+
+/// Splits a group payload and marks damaged units (spec 3): those with a wrong CRC, those that name them, what the payload
+/// ends in, and what breaks a rule behind a damaged unit, whose length may be false.
+///
+/// # Errors
+/// Unit 0 is damaged, or sound bytes break a rule.
+pub fn scan(payload: &[u8]) -> Result<Vec<Unit<'_>>> {
     let mut units: Vec<Unit> = Vec::new();
-    let mut offset = 0;
-    while offset < payload.len() || units.is_empty() {
+    let (mut offset, mut damaged) = (0, false);
+    while (offset < payload.len() && units.len() <= UNITS_MAX) || units.is_empty() {
         let index = units.len();
-        let name = format!("unit {index}");
-        let unit = read(&payload[offset..], offset).map_err(|e| e.at(offset, &name))?;
-        check(&unit, &units).map_err(|expected| Error::bitstream(offset, unit.label(index), expected))?;
+        let mut unit = read(&payload[offset..], offset, index);
+        if unit.damage.is_none() {
+            let checked = check(&unit, &units).map_err(|e| Error::bitstream(offset, unit.label(index), e));
+            unit.damage = checked.err();
+            if !damaged && let Some(e) = unit.damage {
+                return Err(e);
+            }
+        }
+        if index == 0
+            && let Some(e) = unit.damage
+        {
+            return Err(e);
+        }
+        damaged |= unit.damage.is_some();
         offset += unit.size;
         units.push(unit);
     }
     Ok(units)
 }
 
-fn read(data: &[u8], offset: usize) -> Result<Unit<'_>> {
-    let mut r = Reader::new(data);
+/// The unit that `data` starts with; the rest of the data if it ends in the unit.
+fn read(data: &[u8], offset: usize, index: usize) -> Unit<'_> {
     let mut h = [0u8; 4];
-    r.bytes(&mut h)?;
+    h.iter_mut().zip(data).for_each(|(h, b)| *h = *b);
     let [number, layer, attribute, dependency_count] = h;
-    let dependencies = r.take(usize::from(dependency_count))?.to_vec();
-    let (mut length, mut crc) = (0, 0);
-    r.u32(&mut length)?;
-    let head = &data[..r.position()];
-    r.u32(&mut crc)?;
-    let payload_offset = r.position();
-    let payload = r.take(length as usize)?;
-    let computed = crc32(&[head, payload]);
-    if crc != computed {
-        return Err(Error::bitstream(
-            0,
-            "",
-            format!("CRC-32 {computed:08x}, found {crc:08x}: the unit is damaged"),
-        ));
-    }
     let kind = UnitType::from_number(number);
-    Ok(Unit {
+    let mut unit = Unit {
         number,
         kind,
         layer,
         attribute: Attribute::from_number(attribute).filter(|_| kind.is_some()),
         attribute_number: attribute,
         offset,
-        payload_offset: offset + payload_offset,
-        size: r.position(),
-        payload,
-        dependencies,
-    })
+        payload_offset: offset + data.len(),
+        size: data.len(),
+        payload: &[],
+        damage: None,
+        dependencies: Vec::new(),
+    };
+    let mut r = Reader::new(data);
+    if let Err(e) = body(&mut unit, &mut r, data, usize::from(dependency_count)) {
+        unit.damage = Some(e.at(offset, &format!("unit {index}")));
+    }
+    unit
+}
+
+fn body<'a>(unit: &mut Unit<'a>, r: &mut Reader<'a>, data: &'a [u8], dependency_count: usize) -> Result<()> {
+    r.take(4)?;
+    unit.dependencies = r.take(dependency_count)?.to_vec();
+    let (mut length, mut crc) = (0, 0);
+    r.u32(&mut length)?;
+    let head = &data[..r.position()];
+    r.u32(&mut crc)?;
+    let payload_offset = r.position();
+    unit.payload = r.take(length as usize)?;
+    (unit.payload_offset, unit.size) = (unit.offset + payload_offset, r.position());
+    let computed = crc32(&[head, unit.payload]);
+    if crc == computed {
+        return Ok(());
+    }
+    let expected = format!("CRC-32 {computed:08x}, found {crc:08x}: the unit is damaged");
+    Err(Error::bitstream(0, "", expected))
 }
 
 /// The rules of spec 3 on a unit after those in `before`; what was expected if one is broken.
@@ -157,7 +192,12 @@ fn check(unit: &Unit, before: &[Unit]) -> std::result::Result<(), String> {
     if !unit.dependencies.is_sorted_by(|a, b| a < b) || unit.dependencies.iter().any(|d| usize::from(*d) >= index) {
         return Err("dependencies on earlier units in increasing order".into());
     }
-    if before.iter().any(|u| u.layer > unit.layer) {
+    let damaged = |d: &&u8| before[usize::from(**d)].damage.is_some();
+    if let Some(d) = unit.dependencies.iter().find(damaged) {
+        return Err(format!("sound units to depend on, but unit {d} is damaged"));
+    }
+    let sound = || before.iter().filter(|u| u.damage.is_none());
+    if sound().any(|u| u.layer > unit.layer) {
         return Err("layers in increasing order".into());
     }
     let Some(kind) = unit.kind else { return Ok(()) };
@@ -175,10 +215,7 @@ fn check(unit: &Unit, before: &[Unit]) -> std::result::Result<(), String> {
     if !allowed.contains(&unit.attribute_number) {
         return Err(format!("an attribute of {allowed:?}, found {}", unit.attribute_number));
     }
-    if before
-        .iter()
-        .any(|u| (u.number, u.layer, u.attribute) == (unit.number, unit.layer, unit.attribute))
-    {
+    if sound().any(|u| (u.number, u.layer, u.attribute) == (unit.number, unit.layer, unit.attribute)) {
         return Err("one unit of each type, layer and attribute".into());
     }
     let found = |need| {

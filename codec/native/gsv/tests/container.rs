@@ -205,3 +205,21 @@ fn frame_rates() {
     assert!((f64::from(n) / f64::from(d) - 0.1234567).abs() < 1e-6);
     assert!(rate(f64::NAN).is_err() && rate(0.0).is_err());
 }
+
+/// Spec 2.4: the sample of a moof lies in an mdat, nowhere else.
+#[test]
+fn a_sample_needs_its_mdat() {
+    let config = config();
+    let init = init_segment(&config).unwrap();
+    let sound = fragment(&[7; 50], 1, 0, 20, true, &config).unwrap();
+    let mut other = sound.clone();
+    let mdat = other.len() - 54;
+    other[mdat..mdat + 4].copy_from_slice(b"what");
+    let mut d = parsed(&[&init, &other]);
+    assert!(d.groups().is_empty() && d.pending().is_some());
+    let message = d.push(&sound).unwrap_err().to_string();
+    assert!(message.contains("mdat"), "{message}");
+    let empty = fragment(&[], 1, 0, 20, true, &config).unwrap();
+    assert!(parsed(&[&init, &empty[..empty.len() - 8]]).groups().is_empty());
+    assert_eq!(parsed(&[&init, &empty]).groups().len(), 1);
+}

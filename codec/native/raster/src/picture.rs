@@ -44,11 +44,10 @@ pub fn finish(canvas: &Canvas, shade: Shade, x: usize, width: usize, image: &mut
 /// A tile without Gaussians.
 pub fn finish_empty(shade: Shade, x: usize, width: usize, image: &mut [f32], alpha: &mut [f32]) {
     let columns = TILE.min(width - x);
+    let mut row = [0.0; 3 * TILE];
+    row.as_chunks_mut::<3>().0.fill(shade.background);
     for (image, alpha) in image.chunks_exact_mut(3 * width).zip(alpha.chunks_exact_mut(width)) {
-        image[3 * x..3 * (x + columns)]
-            .as_chunks_mut::<3>()
-            .0
-            .fill(shade.background);
+        image[3 * x..3 * (x + columns)].copy_from_slice(&row[..3 * columns]);
         alpha[x..x + columns].fill(0.0);
     }
 }
@@ -81,13 +80,20 @@ impl Pixels<'_> {
             let image = &self.image[3 * at..3 * (at + columns)];
             let grad = &self.grad_image[3 * at..3 * (at + columns)];
             let (alpha, grad_alpha) = (&self.alpha[at..at + columns], &self.grad_alpha[at..at + columns]);
-            for (i, (g, c)) in grad.as_chunks::<3>().0.iter().zip(image.as_chunks::<3>().0).enumerate() {
-                let (b, k) = swizzle(i, j);
-                a.transmittance.0[b][k] = 1.0;
-                for ch in 0..3 {
-                    a.rgb[ch].0[b][k] = g[ch] * gain[ch];
+            let four = grad
+                .chunks(12)
+                .zip(image.chunks(12))
+                .zip(alpha.chunks(4).zip(grad_alpha.chunks(4)));
+            for (column, ((g, c), (t, gt))) in four.enumerate() {
+                let (b, first) = swizzle(4 * column, j);
+                for (i, (g, c)) in g.as_chunks::<3>().0.iter().zip(c.as_chunks::<3>().0).enumerate() {
+                    let k = (first + i) & 15;
+                    a.transmittance.0[b][k] = 1.0;
+                    for ch in 0..3 {
+                        a.rgb[ch].0[b][k] = g[ch] * gain[ch];
+                    }
+                    a.remainder.0[b][k] = g[0] * c[0] + g[1] * c[1] + g[2] * c[2] - (1.0 - t[i]) * gt[i];
                 }
-                a.remainder.0[b][k] = g[0] * c[0] + g[1] * c[1] + g[2] * c[2] - (1.0 - alpha[i]) * grad_alpha[i];
             }
         }
         a

@@ -2,7 +2,9 @@
 
 use super::values::{bytes_of, raise};
 use gsv::attributes::sh_coefficients;
+use gsv::decode::{decode_damaged, decode_group};
 use gsv::evaluate::{Evaluator, Frame};
+use gsv::inventory::Damage;
 use gsv::levels::Level;
 use gsv::map::Map;
 use gsv::trajectories::Trajectories;
@@ -18,22 +20,31 @@ use pyo3::types::{PyDict, PyList};
 pub struct DecodedGroup {
     evaluator: Evaluator,
     units: Vec<(String, Option<&'static str>, u8, usize, usize)>,
+    damage: Vec<Damage>,
 }
 
 #[pymethods]
 impl DecodedGroup {
+    /// `strict`: damage is an error; otherwise `damage` lists what was not decoded.
     #[new]
-    fn new(py: Python, payload: &Bound<PyAny>, level: u8) -> PyResult<Self> {
+    #[pyo3(signature = (payload, level, strict = true))]
+    fn new(py: Python, payload: &Bound<PyAny>, level: u8, strict: bool) -> PyResult<Self> {
         let bytes = bytes_of(payload)?.as_slice()?.to_vec(); // ours while the GIL is released
         let decoded = py.detach(|| {
-            let group = gsv::decode::decode_group(&bytes, &Level::get(level)?)?;
-            let units = unit::split(&bytes)?;
+            let level = Level::get(level)?;
+            let (group, damage) = if strict {
+                (decode_group(&bytes, &level)?, Vec::new())
+            } else {
+                decode_damaged(&bytes, &level)?
+            };
+            let units = unit::scan(&bytes)?;
             let label = |u: &unit::Unit| u.kind.map_or("unknown", |k| k.name()).to_string();
             let units = units
                 .iter()
                 .map(|u| (label(u), u.attribute.map(|a| a.name()), u.layer, u.offset, u.size));
             Ok(DecodedGroup {
                 units: units.collect(),
+                damage,
                 evaluator: Evaluator::new(group),
             })
         });
@@ -94,6 +105,20 @@ impl DecodedGroup {
             d.set_item("layer", layer)?;
             d.set_item("offset", offset)?;
             d.set_item("bytes", bytes)?;
+            list.append(d)?;
+        }
+        Ok(list)
+    }
+
+    /// Units that are damaged, or missing where others are (unit: None): dicts of unit, type, attribute, message.
+    fn damage<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
+        let list = PyList::empty(py);
+        for damage in &self.damage {
+            let d = PyDict::new(py);
+            d.set_item("unit", damage.unit)?;
+            d.set_item("type", damage.kind.map_or("unknown", |k| k.name()))?;
+            d.set_item("attribute", damage.attribute.map(|a| a.name()))?;
+            d.set_item("message", &damage.message)?;
             list.append(d)?;
         }
         Ok(list)

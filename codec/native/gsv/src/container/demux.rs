@@ -31,8 +31,8 @@ enum State {
         head: u64,
         size: usize,
     },
-    /// Passing over a body.
-    Skip { left: u64 },
+    /// Passing over a body; `media`: that of an mdat, the only place of samples (spec 2.4).
+    Skip { left: u64, media: bool },
 }
 
 pub struct Demuxer {
@@ -92,22 +92,27 @@ impl Demuxer {
 
     /// Bytes from `position` that need not be pushed.
     pub fn skippable(&self) -> u64 {
-        if let State::Skip { left } = self.state { left } else { 0 }
+        if let State::Skip { left, .. } = self.state {
+            left
+        } else {
+            0
+        }
     }
 
     /// Passes over `n` bytes, at most `skippable`.
     pub fn skip(&mut self, n: u64) {
-        let State::Skip { left } = &mut self.state else { return };
+        let State::Skip { left, media } = &mut self.state else {
+            return;
+        };
+        let media = *media;
         let n = n.min(*left);
         self.position = self.position.saturating_add(n);
         *left -= n;
         if *left == 0 {
             self.state = State::Head;
         }
-        if let Some(group) = self
-            .pending
-            .take_if(|g| g.offset.saturating_add(g.size) <= self.position)
-        {
+        let whole = |g: &mut Entry| media && g.offset.saturating_add(g.size) <= self.position;
+        if let Some(group) = self.pending.take_if(whole) {
             self.groups.push(group);
         }
     }
@@ -130,7 +135,7 @@ impl Demuxer {
     /// Takes the next bytes of the file.
     pub fn push(&mut self, mut data: &[u8]) -> Result<()> {
         while !data.is_empty() {
-            if let State::Skip { left } = self.state {
+            if let State::Skip { left, .. } = self.state {
                 let n = left.min(data.len() as u64);
                 self.skip(n);
                 data = &data[n as usize..];
@@ -190,12 +195,13 @@ impl Demuxer {
             _ => return fail("a box size that covers the header of the box"),
         };
         self.buffer.clear();
-        if &kind == b"mdat" {
+        let media = &kind == b"mdat";
+        if media {
             self.sample_within(body)
                 .map_err(|expected| Error::bitstream(start as usize, "mdat box", expected))?;
         }
         if !matches!(&kind, b"ftyp" | b"moov" | b"moof" | b"sidx") {
-            self.state = State::Skip { left: body };
+            self.state = State::Skip { left: body, media };
             self.skip(0);
         } else if body > HEADER_BOX_MAX {
             return Err(Error::limit(
