@@ -72,5 +72,13 @@ def _remaps() -> list[str]:
     return [f"--remap-path-prefix={f}={'crates' if f != NATIVE else 'native'}" for f in folders]
 
 
+def check_committed() -> None:
+    """Raises SystemExit if the files in the repository are not those of its sources."""
+    if not HASH.exists() or HASH.read_text().strip() != source_hash():
+        sys.exit("error: player/native.wasm was built from other sources; run `make player` and commit player/native.*")
+
+
 if __name__ == "__main__":
+    if "--committed" in sys.argv[1:]:  # CI: the committed files must be current, and the tests run on rebuilt ones
+        check_committed()
     build()

@@ -188,7 +188,9 @@ class Server(ThreadingHTTPServer):
             super().__init__((host, port), handler)
         except (OSError, OverflowError) as e:
             reason = getattr(e, "strerror", None) or e
-            raise UsageError(f"cannot serve on {host} port {port}: {reason}; choose others with --host and --port") from None
+            raise UsageError(
+                f"cannot serve on {host} port {port}: {reason}; choose others with --host and --port"
+            ) from None
 
     @property
     def url(self) -> str:

@@ -92,7 +92,9 @@ class Browser:
 
     def resize(self, width: int, height: int, *, mobile: bool = False, scale: float = 1) -> None:
         """Sets the size of the window."""
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=mobile)
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=mobile
+        )
         self.call("Emulation.setTouchEmulationEnabled", enabled=mobile)
 
     def goto(self, url: str) -> None:

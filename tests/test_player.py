@@ -49,7 +49,10 @@ def cameras() -> list[Camera]:
 
     K = np.array([[300.0, 0, 130], [0, 290, 90], [0, 0, 1]])
     eyes = ([3.0, 0.5, -2], [-2.5, 1, 2.5])
-    return [Camera(f"cam{i}", K, look_at(np.array(e), np.zeros(3), np.array([0, 1.0, 0])), 256, 192) for i, e in enumerate(eyes)]
+    return [
+        Camera(f"cam{i}", K, look_at(np.array(e), np.zeros(3), np.array([0, 1.0, 0])), 256, 192)
+        for i, e in enumerate(eyes)
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +60,9 @@ def gsv(tmp_path_factory) -> Path:
     """A stream of 5 groups of 6 frames."""
     path = tmp_path_factory.mktemp("player") / "a.gsv"
     s = sequence(sh_count=3)
-    config = stream_config(fps=FPS, sh_degree=1, gaussians=400, frames=LENGTH, cameras=cameras(), background=(0.2, 0.3, 0.5))
+    config = stream_config(
+        fps=FPS, sh_degree=1, gaussians=400, frames=LENGTH, cameras=cameras(), background=(0.2, 0.3, 0.5)
+    )
     encode_groups(lambda done: iter(s.groups[done:]), path, config, EncodeSettings(quality=80), fingerprint={})
     return path
 
@@ -97,7 +102,14 @@ def test_the_whole_file(server, gsv):
 
 @pytest.mark.parametrize(
     ("value", "start", "end"),
-    [("bytes=0-0", 0, 1), ("bytes=5-9", 5, 10), ("bytes=7-", 7, None), ("bytes=-4", -4, None), ("bytes=3-99999999", 3, None), ("bytes=-99999999", 0, None)],
+    [
+        ("bytes=0-0", 0, 1),
+        ("bytes=5-9", 5, 10),
+        ("bytes=7-", 7, None),
+        ("bytes=-4", -4, None),
+        ("bytes=3-99999999", 3, None),
+        ("bytes=-99999999", 0, None),
+    ],
 )
 def test_ranges(server, gsv, value, start, end):
     data = gsv.read_bytes()
@@ -164,7 +176,15 @@ def test_only_the_stream_and_the_page(server):
         assert status == 200, path
         assert body
         assert headers["Content-Type"] == FILES[path[1:] or "index.html"]
-    outside = ("/server.py", "/build.py", "/../pyproject.toml", "/%2e%2e/pyproject.toml", "//etc/passwd", "/a.gsv", "/..")
+    outside = (
+        "/server.py",
+        "/build.py",
+        "/../pyproject.toml",
+        "/%2e%2e/pyproject.toml",
+        "//etc/passwd",
+        "/a.gsv",
+        "/..",
+    )
     for path in outside:
         assert ask(server, path)[0] == 404, path
     assert ask(server, "/", method="POST")[0] == 501
@@ -380,7 +400,9 @@ def test_keys_and_buttons(browser, server):
     assert "Gaussians" in browser.wait(f"{part('.stats')}.textContent")
     browser.eval(f"{part('[data-do=play]')}.click()")
     assert not browser.eval(f"{PLAYER}.paused")
-    browser.eval(f"{part('[data-set=speed]')}.value = '2'; {part('[data-set=speed]')}.dispatchEvent(new Event('change', {{bubbles: true}}))")
+    browser.eval(
+        f"{part('[data-set=speed]')}.value = '2'; {part('[data-set=speed]')}.dispatchEvent(new Event('change', {{bubbles: true}}))"
+    )
     assert browser.eval(f"{PLAYER}.speed") == 2
 
 
@@ -420,7 +442,9 @@ def test_a_phone(browser, server, tmp_path):
         load(browser, server.url)
         assert browser.eval("document.documentElement.scrollWidth") <= 390
         for name in ("play", "loop", "reset", "stats"):
-            x, y, w, h = browser.eval(f"(({{x, y, width, height}}) => [x, y, width, height])({part(f'[data-do={name}]')}.getBoundingClientRect())")
+            x, y, w, h = browser.eval(
+                f"(({{x, y, width, height}}) => [x, y, width, height])({part(f'[data-do={name}]')}.getBoundingClientRect())"
+            )
             assert x >= 0
             assert x + w <= 390
             assert y + h <= 844
@@ -561,7 +585,9 @@ def test_a_seek_fetches_what_it_needs(browser, server, other, tmp_path):
     load(browser, server.url, src=url, size="64x64", autoplay="off", loop="off")
     browser.eval(f"{PLAYER}.show({4 * LENGTH})")
     asked = [tuple(map(int, value[6:].split("-"))) for value in handler.log]
-    touched = {i for i, g in enumerate(groups) for a, b in asked[1:] if a < g["offset"] + g["size"] and b >= g["offset"]}
+    touched = {
+        i for i, g in enumerate(groups) for a, b in asked[1:] if a < g["offset"] + g["size"] and b >= g["offset"]
+    }
     assert 4 in touched
     assert len(asked) < 8
     assert {0, 4} <= touched
@@ -596,7 +622,11 @@ def test_a_server_that_is_gone(browser, server):
 
 
 def test_a_file_that_is_no_stream(browser, server, other):
-    for data, word in ((b"not a stream at all, but long enough", "ftyp"), (b"", "empty"), (b"\0\0\0\x14ftypgsv1", "ends before")):
+    for data, word in (
+        (b"not a stream at all, but long enough", "ftyp"),
+        (b"", "empty"),
+        (b"\0\0\0\x14ftypgsv1", "ends before"),
+    ):
         url, _ = other(data)
         browser.goto(f"{server.url}?src={url}")
         assert word in error_text(browser)
