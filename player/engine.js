@@ -3,6 +3,7 @@
 //   source --payload--> group worker (decode, evaluate, project) --ellipses of a band--> raster worker --pixels--> canvas
 
 import { Native, load } from "./native.js";
+import { Ladder } from "./ladder.js";
 import { Source } from "./source.js";
 
 const IN_FLIGHT = 2; // pictures at work: one is projected while the one before is blended
@@ -32,7 +33,7 @@ export class Engine extends EventTarget {
     this.canvas = canvas;
     this.context = canvas.getContext("2d", { alpha: false });
     this.base = base;
-    this.source = new Source(src);
+    this.source = /\.mpd($|[?#])/.test(src) ? new Ladder(src) : new Source(src);
     this.source.addEventListener("received", ({ detail: { bytes, ms } }) => {
       if (bytes > 20_000) this.stats.link = (8e-3 * bytes) / ms;
     });
@@ -47,7 +48,7 @@ export class Engine extends EventTarget {
     const module = await load(new URL("native.wasm", this.base));
     if (this.closed) return;
     this.#connect(module);
-    await this.source.open(await Native.create(module));
+    await this.source.open(() => Native.create(module));
   }
 
   #connect(module) {
@@ -137,7 +138,7 @@ export class Engine extends EventTarget {
       const held = (w) => [...this.groups.values()].filter((g) => g.worker === w).length;
       entry.worker = this.#workers.reduce((a, b) => (held(b) < held(a) ? b : a));
       entry.state = "decoding";
-      const { level } = this.source.config;
+      const level = this.source.level(i);
       entry.worker.postMessage({ type: "decode", group: i, payload, level, bounds: !this.bounds });
     } catch (e) {
       if (this.groups.get(i) !== entry || abort.signal.aborted) return;
@@ -177,6 +178,7 @@ export class Engine extends EventTarget {
     const entry = this.groups.get(m.group);
     if (m.type === "decoded") {
       this.stats.decode = m.ms / m.header.frames;
+      this.source.decoded?.(m.group, this.stats.decode);
       this.bounds ??= m.header.bounds;
       if (!entry) return worker.postMessage({ type: "release", group: m.group });
       entry.state = "ready";

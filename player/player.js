@@ -1,6 +1,6 @@
 // <gsv-player src="URL"> plays a .gsv file: the clock, the size of the picture, and what the viewer is told.
 //
-// Attributes: src; autoplay; loop; speed="0.5"; size="512x512" (else the picture fills the element); quality="auto" or 0.1 to 1.
+// Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the picture fills the element); quality="auto" or 0.1 to 1.
 // Properties: paused, frame, frameCount, fps, camera, stats. Methods: play(), pause(), show(frame). Events: ready, picture,
 // ended, error.
 
@@ -232,7 +232,7 @@ export class GsvPlayer extends HTMLElement {
       this.#position = groups[i].start_frame;
       return i;
     }
-    if (engine.source.complete) this.#fail("This file is damaged", sentence(engine.failed.get(group)));
+    if (engine.source.complete) this.#fail("This file is damaged", `None of its groups can be decoded (group ${group}: ${engine.failed.get(group)}).`);
     return null;
   }
 
@@ -342,6 +342,7 @@ export class GsvPlayer extends HTMLElement {
       ["blend", `${s.blend.toFixed(1)} ms`],
       ["stream", `${rate.toFixed(2)} Mbit/s`],
       ["link", s.link ? `${s.link.toFixed(1)} Mbit/s` : "–"],
+      ...(source.quality ? [["quality", source.quality]] : []),
       ["received", `${(s.received / 1e6).toFixed(2)} MB`],
     ].map(([name, value]) => `${name.padEnd(10)}${value}`).join("\n");
   }
@@ -360,14 +361,15 @@ export class GsvPlayer extends HTMLElement {
     if (note.textContent !== text) note.textContent = text;
   }
 
-  #damaged({ frames, message }) {
-    this.#note("damage", `Frames ${frames} are damaged and left out: ${sentence(message)}`, true);
+  #damaged({ group, frames, message }) {
+    this.#note("damage", `Frames ${frames} are damaged and left out (group ${group}: ${message}).`, true);
   }
 
   #fail(title, message) {
     if (!this.$(".error").hidden) return;
     this.pause();
     this.$(".busy").hidden = true;
+    this.$(".notes").replaceChildren();
     this.$(".error h2").textContent = title;
     this.$(".error p").textContent = message;
     this.$(".error").hidden = false;

@@ -1,8 +1,8 @@
-"""The server behind `gscodec play`: one stream, the page's own files, and nothing else; by default for this machine only.
+"""The server behind `gscodec play`: one stream, the page's own files and nothing else, by default for this machine only.
 
 Ranges as in RFC 9110 (206, 416, HEAD, If-Range), since the page reads nothing but ranges; a range of several parts is
-answered with the whole file, which the RFC allows. A file that is still being written (OUT.gsv.part) grows under the same
-address: it is held open, so that it stays readable when the encoder replaces it by the finished file.
+answered with the whole file, which the RFC allows. A file that is still being written (OUT.gsv.part) grows under the
+same address: it is held open, so that it stays readable when the encoder replaces it by the finished file.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ FILES = {
     "player.js": "text/javascript; charset=utf-8",
     "engine.js": "text/javascript; charset=utf-8",
     "source.js": "text/javascript; charset=utf-8",
+    "ladder.js": "text/javascript; charset=utf-8",
     "worker.js": "text/javascript; charset=utf-8",
     "native.js": "text/javascript; charset=utf-8",
     "camera.js": "text/javascript; charset=utf-8",

@@ -46,9 +46,9 @@ export class Source extends EventTarget {
   missing = 0;
 
   // Resolves when the first group is known.
-  async open(native) {
+  async open(create) {
+    const [native, head] = await Promise.all([create(), this.#read(0, HEAD)]);
     this.native = native; // whose demuxer is used
-    const head = await this.#read(0, HEAD);
     if (!head.length) throw new StreamError("The file is empty.");
     this.total ??= await this.#size();
     this.native.push(head);
@@ -63,6 +63,10 @@ export class Source extends EventTarget {
       this.#walk().catch((e) => this.#say("error", e));
       while (!this.groups.length && !this.complete) await new Promise((done) => this.addEventListener("groups", done, { once: true }));
     }
+  }
+
+  level() {
+    return this.config.level;
   }
 
   has(i) {

@@ -467,6 +467,7 @@ class Trouble(http.server.BaseHTTPRequestHandler):
     fail_first = 0
     ranges = True
     kind = "video/mp4"
+    rate: int | None = None  # bytes a second
 
     def do_HEAD(self):
         self.send_response(200)
@@ -503,7 +504,10 @@ class Trouble(http.server.BaseHTTPRequestHandler):
             self.connection.shutdown(socket.SHUT_RDWR)
             self.close_connection = True
             return
-        self.wfile.write(self.data[start:end])
+        for at in range(start, end, 2000):
+            self.wfile.write(self.data[at : min(at + 2000, end)])
+            if self.rate:
+                time.sleep(2000 / self.rate)
 
     def cors(self):
         self.send_header("Content-Type", self.kind)
@@ -520,10 +524,11 @@ def other(gsv):
     started = []
 
     def start(data, **attributes):
+        path = attributes.pop("path", "/some/where.gsv")
         handler = type("T", (Trouble,), {"data": data, "log": [], **attributes})
         s = serving(http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler))
         started.append(s)
-        return f"http://127.0.0.1:{s.server_address[1]}/some/where.gsv", handler
+        return f"http://127.0.0.1:{s.server_address[1]}{path}", handler
 
     yield start
     for s in started:
@@ -571,6 +576,34 @@ def test_the_element_on_another_page(browser, gsv, other, tmp_path):
     browser.wait(playing)
     assert browser.eval(f"{PLAYER}.getBoundingClientRect().height") == 200
     host.shutdown()
+
+
+@pytest.mark.parametrize(("rate", "rung"), [(20_000, 1), (None, 2)])
+def test_a_ladder_is_played_at_the_rate_of_the_link(browser, server, gsv, other, rate, rung):
+    """Two qualities of one capture; `rate` in bytes a second, None: unlimited."""
+    s = sequence()
+    small = gsv.with_name("small.gsv")
+    if not small.exists():
+        config = stream_config(fps=FPS, sh_degree=0, gaussians=400, frames=LENGTH)
+        encode_groups(lambda done: iter(s.groups[done:]), small, config, EncodeSettings(quality=10), fingerprint={})
+    rungs = []
+    for path in (gsv, small):
+        url, handler = other(path.read_bytes(), rate=rate)
+        bandwidth = 8 * path.stat().st_size * FPS // (GROUPS * LENGTH)
+        rungs.append(f'<Representation id="{path.stem}" bandwidth="{bandwidth}"><BaseURL>{url}</BaseURL></Representation>')
+    manifest = f"""<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011" type="static"><Period>
+        <AdaptationSet mimeType="video/mp4">{"".join(rungs)}</AdaptationSet></Period></MPD>"""
+    url, _ = other(manifest.encode(), kind="application/dash+xml", path="/a.mpd")
+    load(browser, server.url, src=url, size="64x64", loop="off")
+    browser.wait(f"{PLAYER}.frame > {2 * LENGTH}")
+    show(browser, GROUPS * LENGTH - 1)
+    assert browser.eval(f"{PLAYER}.engine.source.quality") == f"{rung} of 2"
+
+
+def test_a_manifest_of_nothing(browser, server, other):
+    url, _ = other(b"<MPD/>", path="/a.mpd")
+    browser.goto(f"{server.url}?src={url}")
+    assert "names no files" in error_text(browser)
 
 
 def test_a_seek_fetches_what_it_needs(browser, server, other, tmp_path):
