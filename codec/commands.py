@@ -64,7 +64,7 @@ def _encode_splats(source, out, settings, frames, gop, bar) -> EncodeReport:
         up=up_axis(cameras) if cameras else "-y",  # what 3DGS trainers leave when nothing is known
     )
     return encode_groups(
-        lambda done: (sequence.groups[i] for i in range(done, len(sequence.groups))),
+        lambda done, _: (sequence.groups[i] for i in range(done, len(sequence.groups))),
         out,
         config,
         settings,
@@ -106,7 +106,7 @@ def _restrict(sequence: GaussianSequence, frames: str | None) -> GaussianSequenc
 
 def _encode_capture(source, out, settings, preset, frames, gop, bar) -> EncodeReport:
     from gscodec.train.settings import train_settings
-    from gscodec.train.train import train_groups
+    from gscodec.train.train import Checkpoint, train_groups
 
     capture = _open_capture(source, frames)
     recipe = train_settings(preset, gop=gop, quality=settings.quality)
@@ -120,10 +120,10 @@ def _encode_capture(source, out, settings, preset, frames, gop, bar) -> EncodeRe
         up=up_axis(capture.cameras),
     )
     report = encode_groups(
-        lambda done: train_groups(
+        lambda _, frames_done: train_groups(
             capture,
             recipe,
-            first_group=done,
+            first_frame=frames_done,
             checkpoints=work,
             on_progress=lambda p: bar.update(p.stage, p.done, p.total),
         ),
@@ -133,10 +133,7 @@ def _encode_capture(source, out, settings, preset, frames, gop, bar) -> EncodeRe
         fingerprint={"input": str(source.resolve()), "frames": frames, **asdict(recipe), **asdict(settings)},
     )
     if not report.interrupted:
-        for f in work.glob("group_*.npz"):
-            f.unlink()
-        if work.exists():
-            work.rmdir()
+        Checkpoint(work).clear()
     return report
 
 

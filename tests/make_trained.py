@@ -28,7 +28,7 @@ def codec(quality: int, folder: Path) -> dict:
     config = stream_config(fps=30, sh_degree=0, gaussians=4000, frames=4)
     out = folder / "a.gsv"
     report = encode_groups(
-        lambda done: iter(sequence.groups), out, config, EncodeSettings(quality=quality), fingerprint={}
+        lambda done, frames: iter(sequence.groups), out, config, EncodeSettings(quality=quality), fingerprint={}
     )
     m = evaluate_splats(open_stream(out).frame, sequence, frames=[0, 3], size=report.bytes)
     return {k: round(m[k], 3) for k in ("kb_per_frame", "codec_psnr", "codec_psnr_fg")}

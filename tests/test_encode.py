@@ -24,7 +24,7 @@ from gscodec.gaussians import Gaussians, Group
 def write(sequence, out, quality=50.0, **settings):
     config = stream_config(fps=sequence.fps, sh_degree=sequence.frame(0).sh_degree, gaussians=400, frames=8)
     return encode_groups(
-        lambda done: iter(sequence.groups[done:]),
+        lambda done, frames: iter(sequence.groups[done:]),
         out,
         config,
         EncodeSettings(quality=quality, **settings),
@@ -154,7 +154,7 @@ def test_ctrl_c_leaves_a_playable_file_and_a_second_run_goes_on(tmp_path):
     config = stream_config(fps=25, sh_degree=0, gaussians=100, frames=6)
     out = tmp_path / "a.gsv"
 
-    def interrupted(done):
+    def interrupted(done, frames):
         assert done == 0
         yield from groups[:2]
         raise KeyboardInterrupt
@@ -164,7 +164,7 @@ def test_ctrl_c_leaves_a_playable_file_and_a_second_run_goes_on(tmp_path):
     assert open_stream(out).frame_count == 6
     started = []
 
-    def rest(done):
+    def rest(done, frames):
         started.append(done)
         yield from groups[done:]
 
@@ -174,7 +174,7 @@ def test_ctrl_c_leaves_a_playable_file_and_a_second_run_goes_on(tmp_path):
     assert open_stream(out).frame_count == 12
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.gsv"]
     whole = tmp_path / "b.gsv"
-    encode_groups(lambda done: iter(groups), whole, config, EncodeSettings(), fingerprint={})
+    encode_groups(lambda done, frames: iter(groups), whole, config, EncodeSettings(), fingerprint={})
     assert whole.read_bytes() == out.read_bytes()
 
 

@@ -27,7 +27,7 @@ def player(tmp_path_factory):
     sequence = turning(100, frames=3)
     write_sequence(sequence, path / "plys")
     encode_groups(
-        lambda done: iter(sequence.groups),
+        lambda done, frames: iter(sequence.groups),
         path / "a.gsv",
         stream_config(fps=25, sh_degree=0, gaussians=100, frames=6),
         EncodeSettings(),

@@ -26,7 +26,7 @@ def test_codec_alone(tmp_path, quality):
     out = tmp_path / "a.gsv"
     config = stream_config(fps=30, sh_degree=0, gaussians=4000, frames=4)
     report = encode_groups(
-        lambda done: iter(sequence.groups), out, config, EncodeSettings(quality=quality), fingerprint={}
+        lambda done, frames: iter(sequence.groups), out, config, EncodeSettings(quality=quality), fingerprint={}
     )
     measured = evaluate_splats(open_stream(out).frame, sequence, frames=[0, 3], size=report.bytes)
     recorded = RECORDED["codec"][str(quality)]

@@ -99,7 +99,7 @@ def stream_config(
 
 
 def encode_groups(
-    groups: Callable[[int], Iterable[Group]],
+    groups: Callable[[int, int], Iterable[Group]],
     out: Path,
     config: dict,
     settings: EncodeSettings,
@@ -107,7 +107,8 @@ def encode_groups(
     fingerprint: dict,
     on_group: Callable[[EncodeReport], None] | None = None,
 ) -> EncodeReport:
-    """Writes `out` from the groups that `groups(first)` yields, `first` being the number already in the file.
+    """Writes `out` from the groups that `groups(done, frames)` yields: those after the `done` groups, `frames` frames,
+    that an earlier run left in the file.
 
     Ctrl-C finishes the file with the groups done and returns with `interrupted` set; the next run goes on.
     """
@@ -116,7 +117,7 @@ def encode_groups(
     clock = time.perf_counter
     try:
         mark = clock()
-        for group in groups(writer.groups):
+        for group in groups(writer.groups, writer.frames):
             report.seconds["input"] += clock() - mark
             mark = clock()
             integers = group_integers(group, settings.quality, keep_all=settings.keep_all)

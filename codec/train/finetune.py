@@ -26,7 +26,7 @@ from gscodec.train.views import Views, compare
 
 # attribute -> (channels, temporal frequencies that may be used)
 RESIDUALS = {"means": (3, 8), "quats": (3, 4), "sh0": (3, 4)}
-RESIDUAL_RATE = {"means": 0.02, "quats": 0.02, "sh0": 0.02}  # in steps of the stream a step of the optimiser
+RESIDUAL_RATE = {"means": 0.05, "quats": 0.05, "sh0": 0.05}  # in steps of the stream a step of the optimiser
 LAPLACE_RATE = 0.02
 MEANS_RATE = 4e-5  # of the canonical means, times the radius
 RATE_EVERY = 4  # the rate term has every coefficient, an image few of them: once in so many steps, so much stronger

@@ -52,8 +52,8 @@ def train_keyframe(
     radius: float,
     densify: bool = True,
     on_step: Callable[[int, float], None] | None = None,
-) -> Model:
-    """Optimises `model` against the views of `frame`.
+) -> float:
+    """Optimises `model` in place against the views of `frame`; returns the loss at the end.
 
     Args:
         steps: optimisation steps, one view each.
@@ -63,11 +63,12 @@ def train_keyframe(
     """
     rng = np.random.default_rng([settings.seed, frame])
     workspace = Workspace()
-    stats = Statistics(len(model))
+    stats, losses = Statistics(len(model)), []
     model.restart()
     for step in range(steps):
         result = compare(model.params, views.draw(frame), settings, rng, workspace)
         stats.add(result)
+        losses.append(result.loss)
         fade = step / max(steps - 1, 1)
         rate = radius * MEANS_RATE[0] * (MEANS_RATE[1] / MEANS_RATE[0]) ** fade
         model.adam(result.grads, {"means": rate, **{n: r * 0.1**fade for n, r in RATES.items()}})
@@ -79,7 +80,7 @@ def train_keyframe(
             stats = Statistics(len(model))
         if on_step:
             on_step(step, result.loss)
-    return model
+    return float(np.mean(losses[-len(views.train_cameras) :]))
 
 
 @torch.no_grad()

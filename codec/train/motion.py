@@ -20,7 +20,9 @@ from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, compare
 
 GRAPH_NEIGHBORS = 6
-MLP_RATE, TABLE_RATE = 4e-3, 2e-2
+FIRST_STEPS = 2  # the first frame after a keyframe has no velocity to start from, and takes so many times the steps
+LOSS_WINDOW = 20  # steps over which a loss is averaged: about every view once
+MLP_RATE, TABLE_RATE, FREE_RATE = 1.2e-2, 4e-2, 5e-3
 TRANSLATION_UNIT = 0.1  # of the subject's radius: what an output of 1 means
 ROTATION_UNIT = 0.3  # radians
 
@@ -100,21 +102,23 @@ def track(
     settings: TrainSettings,
     *,
     radius: float,
+    loss_max: float = float("inf"),
     on_step: Callable[[int, int, float], None] | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Poses of the keyframe's Gaussians in all `frames` (the first one is the keyframe).
+    """Poses of the keyframe's Gaussians in `frames` (the first one is the keyframe).
 
     Args:
+        loss_max: a frame that ends with a larger image loss is where the keyframe no longer serves: tracking stops
+            before it.
         on_step: called with (frame, step, loss).
 
     Returns:
-        means [T, N, 3] and turned [T, N, 4], the rotation of each Gaussian since the keyframe.
+        means [T, N, 3] and turned [T, N, 4], the rotation of each Gaussian since the keyframe; T <= len(frames).
     """
     x0 = key.params["means"]
     low, high = x0.min(0).values, x0.max(0).values
     unit = ((x0 - low) / (high - low).max().clamp(min=1e-9)).clamp(0, 1)
-    identity = torch.tensor([1.0, 0, 0, 0]).repeat(len(x0), 1)
-    means, turned = [x0.clone()], [identity]
+    means, turned = [x0.clone()], [torch.tensor([1.0, 0, 0, 0]).repeat(len(x0), 1)]
     graph = RigidGraph(x0, radius)
     for number, frame in enumerate(frames[1:], 1):
         base, base_turned = means[-1], turned[-1]
@@ -122,37 +126,47 @@ def track(
             base = 2 * means[-1] - means[-2]
             back = turned[-2] * torch.tensor([1.0, -1, -1, -1])
             base_turned = quat_multiply(quat_multiply(turned[-1], back), turned[-1])
-        pose = _fit_frame(key, views, frame, settings, radius, (unit, base, base_turned), graph, on_step)
+        start = (unit, base, base_turned)
+        pose, loss = _fit_frame(key, views, frame, settings, radius, start, graph, on_step, number == 1)
+        if loss > loss_max:
+            break
         means.append(pose[0])
         turned.append(pose[1])
     return torch.stack(means), torch.stack(turned)
 
 
-def _fit_frame(key, views, frame, settings, radius, start, graph, on_step):
+def _fit_frame(key, views, frame, settings, radius, start, graph, on_step, start_is_keyframe):
+    """Pose of one frame (extrapolated + field + what each Gaussian adds on its own) and the loss it ends with."""
     unit, base, base_turned = start
     torch.manual_seed(settings.seed * 1000003 + frame)
     rng = np.random.default_rng([settings.seed, frame, 1])
     field, workspace = MotionField(), Workspace()
-    groups = [(field.mlp.parameters(), MLP_RATE), (field.grid.parameters(), TABLE_RATE)]
+    free = torch.zeros(len(unit), 6, requires_grad=True)
+    groups = [(field.mlp.parameters(), MLP_RATE), (field.grid.parameters(), TABLE_RATE), ([free], FREE_RATE)]
     optimizer = torch.optim.Adam(
         [{"params": list(p), "lr": r, "base": r} for p, r in groups], betas=(0.9, 0.99), fused=True
     )
-    steps = settings.motion_steps
+
+    def pose() -> tuple[torch.Tensor, torch.Tensor]:
+        move, turn = field(unit)
+        turn = rotvec_to_quat(turn + ROTATION_UNIT * free[:, 3:])
+        means = base + radius * (move + TRANSLATION_UNIT * free[:, :3])
+        return means, torch.nn.functional.normalize(quat_multiply(turn, base_turned), dim=1)
+
+    steps, losses = settings.motion_steps * (FIRST_STEPS if start_is_keyframe else 1), []
     for step in range(steps):
         for g in optimizer.param_groups:
             g["lr"] = g["base"] * 0.1 ** (step / steps)
-        move, turn = field(unit)
-        means = base + radius * move
-        turned = torch.nn.functional.normalize(quat_multiply(rotvec_to_quat(turn), base_turned), dim=1)
+        means, turned = pose()
         quats = quat_multiply(turned, key.params["quats"])
-        result = compare({**key.params, "means": means, "quats": quats}, views.draw(frame), settings, rng, workspace)
+        params = {**key.params, "means": means, "quats": quats}
+        result = compare(params, views.draw(frame), settings, rng, workspace)
         rigid = settings.rigidity * graph.loss(means, turned)
         optimizer.zero_grad()
         torch.autograd.backward([means, quats, rigid], [result.grads["means"], result.grads["quats"], torch.ones(())])
         optimizer.step()
+        losses.append(result.loss)
         if on_step:
             on_step(frame, step, result.loss)
     with torch.no_grad():
-        move, turn = field(unit)
-        turned = torch.nn.functional.normalize(quat_multiply(rotvec_to_quat(turn), base_turned), dim=1)
-        return base + radius * move, turned
+        return pose(), float(np.mean(losses[-LOSS_WINDOW:]))

@@ -12,13 +12,14 @@ class TrainSettings:
     """Budgets and weights of one training run.
 
     Attributes:
-        gop: frames in a group.
+        gop: most frames in a group.
         keyframe_steps: optimisation steps for the first keyframe; later ones start warm and take half.
         motion_steps: steps a frame for the hash-grid motion.
         finetune_steps: steps a frame for the joint fine-tuning of the group.
         gaussians_max: bound on the count while densifying.
         ssim_lambda: share of D-SSIM in the image loss (3D Gaussian Splatting: 0.2).
         mask_lambda: weight of the alpha loss where the capture has masks.
+        cut_ratio: a frame whose image loss exceeds the keyframe's by this factor starts a group of its own.
         rigidity: weight of the as-rigid-as-possible term.
         rate_lambda: loss per bit and pixel of the residual trajectories.
         temporal_lambda: weight of frame-to-frame change of the residuals.
@@ -27,16 +28,17 @@ class TrainSettings:
     """
 
     gop: int = 20
-    keyframe_steps: int = 2000
-    motion_steps: int = 120
-    finetune_steps: int = 120
-    gaussians_max: int = 20000
+    keyframe_steps: int = 1500
+    motion_steps: int = 100
+    finetune_steps: int = 80
+    gaussians_max: int = 15000
     initial_points: int = 8000
     ssim_lambda: float = 0.2
     mask_lambda: float = 0.1
-    rigidity: float = 1.0
-    rate_lambda: float = 1.0
-    temporal_lambda: float = 0.05
+    cut_ratio: float = 1.9
+    rigidity: float = 0.3
+    rate_lambda: float = 0.1
+    temporal_lambda: float = 0.01
     quality: float = 50.0
     seed: int = 0
 
@@ -46,9 +48,9 @@ class TrainSettings:
 
 
 PRESETS = {
-    "fast": {"keyframe_steps": 800, "motion_steps": 50, "finetune_steps": 40, "gaussians_max": 10000},
+    "fast": {"keyframe_steps": 700, "motion_steps": 50, "finetune_steps": 40, "gaussians_max": 8000},
     "medium": {},
-    "slow": {"keyframe_steps": 5000, "motion_steps": 250, "finetune_steps": 400, "gaussians_max": 30000},
+    "slow": {"keyframe_steps": 4000, "motion_steps": 250, "finetune_steps": 300, "gaussians_max": 25000},
 }
 
 

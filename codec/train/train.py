@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -44,14 +44,11 @@ class Progress:
         return (time.monotonic() - self.started) * (self.total - self.done) / max(self.done, 1)
 
 
-def group_ranges(frame_count: int, gop: int) -> list[range]:
-    """Frames of each group."""
-    return [range(a, min(a + gop, frame_count)) for a in range(0, frame_count, gop)]
-
-
-def _steps_of(frames: range, first: bool, s: TrainSettings) -> int:
-    key = s.keyframe_steps if first else int(WARM_SHARE * s.keyframe_steps)
-    return key + (len(frames) - 1) * s.motion_steps + (len(frames) * s.finetune_steps if len(frames) > 1 else 0)
+def _steps_left(frames: int, first: bool, s: TrainSettings) -> int:
+    """Estimate of the steps that `frames` frames take, in groups of the full length."""
+    groups = -(-frames // s.gop)
+    keys = groups * int(WARM_SHARE * s.keyframe_steps) + (s.keyframe_steps - int(WARM_SHARE * s.keyframe_steps)) * first
+    return keys + (frames - groups) * s.motion_steps + (frames * s.finetune_steps if s.gop > 1 else 0)
 
 
 def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
@@ -84,42 +81,51 @@ class Checkpoint:
     def __init__(self, folder: Path | None):
         self.folder = folder
 
-    def _path(self, group: int) -> Path:
-        return self.folder / f"group_{group:05d}.npz"
+    def _path(self, next_frame: int) -> Path:
+        return self.folder / f"before_{next_frame:06d}.npz"
 
-    def save(self, group: int, last: Gaussians) -> None:
-        """Writes the last frame of `group`, atomically, and drops the one before."""
-        if self.folder is None:
+    def save(self, next_frame: int, last: Gaussians | None) -> None:
+        """Writes the Gaussians of the frame before `next_frame`, atomically, and drops older ones."""
+        if self.folder is None or last is None:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
-        part = self._path(group).with_suffix(".part.npz")
+        old = list(self.folder.glob("before_*.npz"))
+        part = self.folder / "writing.npz"
         np.savez(part, **{f.name: getattr(last, f.name) for f in fields(last)})
-        os.replace(part, self._path(group))
-        if group > 0:
-            self._path(group - 1).unlink(missing_ok=True)
+        os.replace(part, self._path(next_frame))
+        for path in old[:-1]:  # the newest but one stays: the stream may not have the last group yet
+            path.unlink()
 
-    def load(self, group: int) -> Gaussians | None:
-        """The last frame of `group`, or None."""
-        if self.folder is None or not self._path(group).exists():
+    def load(self, next_frame: int) -> Gaussians | None:
+        """What `save` wrote for `next_frame`, or None."""
+        if self.folder is None or not self._path(next_frame).exists():
             return None
         try:
-            with np.load(self._path(group)) as z:
+            with np.load(self._path(next_frame)) as z:
                 return Gaussians(**dict(z))
         except (OSError, ValueError, KeyError):
             return None
+
+    def clear(self) -> None:
+        """Removes the folder once the run is complete."""
+        if self.folder is not None and self.folder.is_dir():
+            for path in self.folder.glob("*.npz"):
+                path.unlink()
+            self.folder.rmdir()
 
 
 def train_groups(
     capture,
     settings: TrainSettings,
     *,
-    first_group: int = 0,
+    first_frame: int = 0,
     checkpoints: Path | None = None,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> Iterator[Group]:
-    """Trains the groups of `capture` from `first_group` on and yields each when it is done.
+    """Trains `capture` from `first_frame` on and yields each group when it is done.
 
     Args:
+        first_frame: where an earlier run stopped; a group starts there.
         checkpoints: folder for what the next group starts from; None keeps it in memory only.
         on_progress: called after every step.
 
@@ -128,54 +134,57 @@ def train_groups(
     """
     # Torch only handles small tensors here; its threads would spin against those of the native kernels.
     torch.set_num_threads(1)
-    ranges = group_ranges(capture.frame_count, settings.gop)
     store = Checkpoint(checkpoints)
-    last = store.load(first_group - 1) if first_group else None
-    todo = list(enumerate(ranges))[first_group:]
-    total = sum(_steps_of(r, last is None and n == 0, settings) for n, (_, r) in enumerate(todo))
-    progress = Progress(total, started=time.monotonic())
-
-    def report(stage: str):
-        def on_step(*numbers):
-            progress.done += 1
-            progress.stage, progress.loss = stage, float(numbers[-1])
-            if on_progress:
-                on_progress(progress)
-
-        return on_step
-
-    views = Views(capture, settings.seed)
-    for number, frames in todo:
-        group = _train_group(capture, views, frames, last, settings, report)
-        last = group.frames[-1]
-        store.save(number, last)
+    last = store.load(first_frame) if first_frame else None  # absent after a cut, too
+    progress = Progress(
+        _steps_left(capture.frame_count - first_frame, last is None, settings), started=time.monotonic()
+    )
+    run = _Run(capture, settings, progress, on_progress)
+    start = first_frame
+    while start < capture.frame_count:
+        frames = range(start, min(start + settings.gop, capture.frame_count))
+        group = run.group(frames, last)
+        start += len(group)
+        # Where the motion outran the keyframe its Gaussians are no good start for the next one either.
+        last = group.frames[-1] if len(group) == len(frames) else None
+        progress.total = progress.done + _steps_left(capture.frame_count - start, last is None, settings)
+        store.save(start, last)
         yield group
 
 
-def _train_group(capture, views, frames: range, last: Gaussians | None, settings: TrainSettings, report) -> Group:
-    model = initial_model(capture, frames[0], settings) if last is None else from_gaussians(last)
-    radius = subject_radius(model.params["means"].numpy())
-    steps = settings.keyframe_steps if last is None else int(WARM_SHARE * settings.keyframe_steps)
-    key = train_keyframe(
-        model,
-        views,
-        frames[0],
-        settings,
-        steps=steps,
-        radius=radius,
-        on_step=report(f"keyframe {frames[0]}"),
-    )
-    if len(frames) == 1:
-        return Group([key.gaussians()])
-    means, turned = track(
-        key, views, frames, settings, radius=radius, on_step=report(f"motion {frames[0]}-{frames[-1]}")
-    )
-    group = GroupModel(key, means, turned, steps_for(settings.quality, radius))
-    finetune(group, views, frames, settings, radius=radius, on_step=report(f"fine-tune {frames[0]}-{frames[-1]}"))
-    with torch.no_grad():
-        return Group([group.gaussians(t) for t in range(len(frames))])
+class _Run:
+    """What the groups of one run share."""
 
+    def __init__(self, capture, settings: TrainSettings, progress: Progress, on_progress):
+        self.capture, self.settings, self.progress, self.on_progress = capture, settings, progress, on_progress
+        self.views = Views(capture, settings.seed)
 
-def fingerprint(settings: TrainSettings) -> dict:
-    """What must be equal for a resumed run to go on."""
-    return asdict(settings)
+    def _report(self, stage: str) -> Callable:
+        def on_step(*numbers):
+            p = self.progress
+            p.done, p.stage, p.loss = p.done + 1, stage, float(numbers[-1])
+            p.total = max(p.total, p.done)
+            if self.on_progress:
+                self.on_progress(p)
+
+        return on_step
+
+    def group(self, frames: range, last: Gaussians | None) -> Group:
+        """Trains one group; it ends before `frames` does where the motion outruns the keyframe."""
+        s, views = self.settings, self.views
+        model = initial_model(self.capture, frames[0], s) if last is None else from_gaussians(last)
+        radius = subject_radius(model.params["means"].numpy())
+        steps = s.keyframe_steps if last is None else int(WARM_SHARE * s.keyframe_steps)
+        on_step = self._report(f"keyframe {frames[0]}")
+        loss = train_keyframe(model, views, frames[0], s, steps=steps, radius=radius, on_step=on_step)
+        if len(frames) == 1:
+            return Group([model.gaussians()])
+        on_step = self._report(f"motion from {frames[0]}")
+        means, turned = track(model, views, frames, s, radius=radius, loss_max=s.cut_ratio * loss, on_step=on_step)
+        frames = frames[: len(means)]
+        group = GroupModel(model, means, turned, steps_for(s.quality, radius))
+        if len(frames) > 1:
+            on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
+            finetune(group, views, frames, s, radius=radius, on_step=on_step)
+        with torch.no_grad():
+            return Group([group.gaussians(t) for t in range(len(frames))])
