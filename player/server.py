@@ -1,4 +1,4 @@
-"""The server behind `gscodec play`: one stream, the page's own files and nothing else, by default for this machine only.
+"""The server behind `gscodec play`: one stream and the page's own files, by default for this machine only.
 
 Ranges as in RFC 9110 (206, 416, HEAD, If-Range), since the page reads nothing but ranges; a range of several parts is
 answered with the whole file, which the RFC allows. A file that is still being written (OUT.gsv.part) grows under the
