@@ -111,8 +111,10 @@ export class Engine extends EventTarget {
       g.worker?.postMessage({ type: "release", group: k });
       this.groups.delete(k);
     }
-    if (!this.groups.has(i)) this.#decode(i);
-    else if (this.ready(i) && next !== null && !this.groups.has(next)) this.#decode(next);
+    const busy = [...this.groups.values()].filter((g) => g.state !== "ready").length;
+    if (!this.groups.has(i)) {
+      if (busy < GROUP_WORKERS) this.#decode(i); // else later: who scrubs fast must not queue up decoders
+    } else if (this.ready(i) && next !== null && !this.groups.has(next)) this.#decode(next);
     else if (next !== null && this.ready(next)) this.#prefetch(next, loop);
   }
 
@@ -135,7 +137,8 @@ export class Engine extends EventTarget {
     try {
       const payload = await this.source.payload(i, abort.signal);
       if (this.groups.get(i) !== entry) return;
-      const held = (w) => [...this.groups.values()].filter((g) => g.worker === w).length;
+      // the idle worker, else the one that holds less
+      const held = (w) => [...this.groups.values()].reduce((n, g) => n + (g.worker !== w ? 0 : g.state === "ready" ? 1 : 9), 0);
       entry.worker = this.#workers.reduce((a, b) => (held(b) < held(a) ? b : a));
       entry.state = "decoding";
       const level = this.source.level(i);

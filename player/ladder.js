@@ -79,9 +79,13 @@ export class Ladder extends EventTarget {
     return this.#rungs.reduce((n, r) => n + r.source.received, 0);
   }
 
+  get rungs() {
+    return this.#rungs.length;
+  }
+
   // For people.
   get quality() {
-    return `${this.rung + 1} of ${this.#rungs.length}`;
+    return `${this.rung + 1} of ${this.rungs}`;
   }
 
   has(i) {

@@ -325,6 +325,9 @@ export class GsvPlayer extends HTMLElement {
     this.slow = this.paused || drawn > 0.8 * wanted || !this.$(".busy").hidden ? 0 : (this.slow ?? 0) + 1;
     const text = `This device draws ${drawn} of ${Math.round(wanted)} frames a second.`;
     this.#note("slow", this.slow > 20 ? text : null);
+    const { source } = this.engine;
+    const lower = source.quality && source.rung < source.rungs - 1;
+    this.#note("rung", lower ? `Quality ${source.quality}: the link or this device carries no more just now.` : null);
   }
 
   #figures() {
