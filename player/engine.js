@@ -45,10 +45,9 @@ export class Engine extends EventTarget {
 
   // Resolves when the file is known.
   async open() {
-    const module = await load(new URL("native.wasm", this.base));
-    if (this.closed) return;
-    this.#connect(module);
-    await this.source.open(() => Native.create(module));
+    const module = load(new URL("native.wasm", this.base)); // while the first bytes of the file are on their way
+    module.then((m) => this.closed || this.#connect(m), () => {});
+    await this.source.open(async () => Native.create(await module));
   }
 
   #connect(module) {
