@@ -143,7 +143,8 @@ impl Vector for F32x4 {
     }
     #[inline(always)]
     fn select(self, m: Mask4, b: Self) -> Self {
-        F32x4(v128_bitselect(self.0, b.0, m.0))
+        // in this form the compiler sees constants
+        F32x4(v128_or(v128_and(self.0, m.0), v128_andnot(b.0, m.0)))
     }
     #[inline(always)]
     fn any(m: Mask4) -> bool {
