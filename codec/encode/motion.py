@@ -191,7 +191,7 @@ def choose_nodes(grid_positions, x, means, steps: Steps, to_world) -> NodeMotion
     """
     best, best_bits = None, _residual_bits(means - x, steps)
     for count in NODE_COUNTS:
-        if count * 16 > len(x) and count > 1:
+        if count * 8 > len(x) and count > 1:
             break
         motion = fit_nodes(grid_positions, x, means, count, steps, to_world)
         bits = _residual_bits(means - motion.carried, steps) + NODE_BITS * len(motion.positions)

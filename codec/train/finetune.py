@@ -20,7 +20,7 @@ from gscodec.gaussians import Gaussians
 from gscodec.render.workspace import Workspace
 from gscodec.train.keyframe import RATES
 from gscodec.train.model import Model
-from gscodec.train.motion import quat_multiply
+from gscodec.train.motion import quat_multiply, quat_to_matrix
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, compare
 
@@ -28,6 +28,7 @@ from gscodec.train.views import Views, compare
 RESIDUALS = {"means": (3, 8), "quats": (3, 4), "sh0": (3, 4)}
 RESIDUAL_RATE = {"means": 0.05, "quats": 0.05, "sh0": 0.05}  # in steps of the stream a step of the optimiser
 LAPLACE_RATE = 0.02
+CARRIERS = 12  # neighbours whose motions are averaged
 MEANS_RATE = 4e-5  # of the canonical means, times the radius
 RATE_EVERY = 4  # the rate term has every coefficient, an image few of them: once in so many steps, so much stronger
 
@@ -47,6 +48,29 @@ def laplace_bits(x: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
     return torch.where(p > 1e-9, -torch.log2(p.clamp(min=1e-9)), far)
 
 
+def carry(x: torch.Tensor, means: torch.Tensor, turned: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """What of a tracked motion neighbours agree on: each Gaussian as its neighbours' rigid motions would carry it.
+
+    That much the stream's nodes will carry too; the rest is residual, and has to pay for its bits.
+
+    Args:
+        x: [N, 3] keyframe positions; means: [T, N, 3]; turned: [T, N, 4] unit.
+    """
+    from scipy.spatial import cKDTree
+
+    k = min(CARRIERS, len(x))
+    j = torch.from_numpy(cKDTree(x.numpy()).query(x.numpy(), k)[1].astype(np.int64).reshape(len(x), k))
+    out_means, out_turned = torch.empty_like(means), torch.empty_like(turned)
+    offset = x[:, None] - x[j]  # [N, k, 3]
+    for t in range(len(means)):
+        R = quat_to_matrix(turned[t])
+        out_means[t] = (torch.einsum("nkij,nkj->nki", R[j], offset) + means[t][j]).mean(1)
+        q = turned[t][j]
+        q = q * torch.where((q * q[:, :1]).sum(2, keepdim=True) < 0, -1.0, 1.0)
+        out_turned[t] = torch.nn.functional.normalize(q.sum(1), dim=1)
+    return out_means, out_turned
+
+
 class GroupModel:
     """Canonical model, fixed carrying motion, and the coefficients of what is left.
 
@@ -57,14 +81,19 @@ class GroupModel:
     """
 
     def __init__(self, key: Model, means: torch.Tensor, turned: torch.Tensor, steps: Steps):
-        self.key, self.turned = key, turned
-        self.moved = means - key.params["means"]  # [T, N, 3]
+        self.key = key
+        carried, self.turned = carry(key.params["means"], means, turned)
+        self.moved = carried - key.params["means"]  # [T, N, 3]
         self.basis = torch.from_numpy(dct_basis(len(means))).float()  # [T, T]
         self.unit = {name: trajectory_step(getattr(steps, name), len(means)) for name in RESIDUALS}
         n = len(key)
         self.coefficients = {}  # in units of the quantization step
         for name, (channels, most) in RESIDUALS.items():
-            self.coefficients[name] = torch.zeros(min(most, len(means)), n, channels, requires_grad=True)
+            self.coefficients[name] = torch.zeros(min(most, len(means)), n, channels)
+        left = torch.einsum("kt,tnc->knc", self.basis, means - carried) / self.unit["means"]
+        self.coefficients["means"] += left[: len(self.coefficients["means"])]
+        for c in self.coefficients.values():
+            c.requires_grad_()
         self.log_scales = {
             n: torch.full((len(c), 1, 1), -1.0, requires_grad=True) for n, c in self.coefficients.items()
         }

@@ -31,13 +31,13 @@ class TrainSettings:
     keyframe_steps: int = 1500
     motion_steps: int = 100
     finetune_steps: int = 80
-    gaussians_max: int = 15000
+    gaussians_max: int = 13000
     initial_points: int = 8000
     ssim_lambda: float = 0.2
     mask_lambda: float = 0.1
-    cut_ratio: float = 1.9
+    cut_ratio: float = 2.2
     rigidity: float = 0.3
-    rate_lambda: float = 0.1
+    rate_lambda: float = 0.3
     temporal_lambda: float = 0.01
     quality: float = 50.0
     seed: int = 0
