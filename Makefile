@@ -6,7 +6,7 @@ NATIVE := $(shell find codec/native -name '*.rs' -not -path '*/target/*') codec/
 CARGO := cd codec/native && cargo
 DEMO := demo
 
-.PHONY: venv demo test lint format bench clean
+.PHONY: venv demo test lint format bench player browser clean
 venv: $(VENV)/.done
 
 # Once: the environment. Again: only when dependencies or the native code change.
@@ -24,11 +24,15 @@ demo: venv
 	$(BIN)/gscodec render $(DEMO)/lumberjack.gsv $(DEMO)/preview.mp4
 	@echo
 	@echo "The stream is $(DEMO)/lumberjack.gsv; watch $(DEMO)/preview.mp4. To go on:"
+	@echo "  $(BIN)/gscodec play $(DEMO)/lumberjack.gsv                           in the browser, from any side"
 	@echo "  $(BIN)/gscodec info $(DEMO)/lumberjack.gsv                           what is in it"
 	@echo "  $(BIN)/gscodec render $(DEMO)/lumberjack.gsv out.mp4 --camera cam20  another view of it"
 	@echo "  $(BIN)/gscodec decode $(DEMO)/lumberjack.gsv plys/                   .ply frames for any splat viewer"
 
-test: venv lint
+test: venv lint browser
+ifdef CI
+	$(BIN)/python player/build.py --committed
+endif
 	$(CARGO) test --release --quiet --workspace
 	$(BIN)/python -m pytest
 
@@ -36,12 +40,23 @@ lint: venv
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(CARGO) fmt --all --check
-	$(CARGO) clippy --release --quiet --workspace --all-targets -- -D warnings
+	$(CARGO) clippy --release --quiet --workspace --all-targets --features bindings/wasm -- -D warnings
 
 format: venv
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 	$(CARGO) fmt --all
+
+# The web player's decoder: codec/native -> player/native.wasm, which is committed.
+player:
+	$(PYTHON) player/build.py
+
+# A Chromium for the tests of the player, which say that they are skipped where there is none (and fail if CI is set).
+browser:
+	@command -v chromium >/dev/null || command -v google-chrome >/dev/null || [ -n "$$CHROMIUM" ] \
+		|| { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq >/dev/null \
+			&& DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends chromium >/dev/null; } \
+		|| echo "note: no Chromium, the player's browser tests will be skipped"
 
 bench: venv
 	$(BIN)/python bench/run.py

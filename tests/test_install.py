@@ -59,6 +59,22 @@ def test_it_decodes_renders_and_tells(player):
     assert len(list((player / "png").glob("*.png"))) == 3
 
 
+def test_it_plays(player):
+    code = """
+import http.client, pathlib, threading
+from gscodec.player.server import FILES, Server
+server = Server(pathlib.Path("a.gsv"))
+threading.Thread(target=server.serve_forever, daemon=True).start()
+for name in (*FILES, "stream.gsv"):
+    c = http.client.HTTPConnection(*server.server_address)
+    c.request("GET", "/" + name)
+    r = c.getresponse()
+    assert r.status == 200 and r.read(), name
+"""
+    done = subprocess.run([player / "env/bin/python", "-c", code], cwd=player, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_the_studios_commands_name_the_extra(player):
     (player / "capture").mkdir(exist_ok=True)
     (player / "capture" / "transforms.json").write_text("{}")

@@ -1,8 +1,10 @@
-//! The one door between Rust and its hosts: `python` builds `gscodec._native`. Arrays in, arrays out, no algorithms.
+//! The one door between Rust and its hosts: `python` builds `gscodec._native`, `wasm` the decoder of the web player. Arrays in, arrays out, no algorithms.
 #[cfg(feature = "python")]
 mod gsv_py;
 #[cfg(feature = "python")]
 mod raster_py;
+#[cfg(feature = "wasm")]
+mod wasm;
 
 #[cfg(feature = "python")]
 #[pyo3::pymodule]

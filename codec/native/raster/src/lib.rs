@@ -7,6 +7,7 @@
 #![allow(clippy::needless_range_loop)]
 
 mod backward;
+mod bands;
 mod bin;
 mod clock;
 pub mod constants;
@@ -27,6 +28,7 @@ mod ssim;
 mod step;
 mod tile;
 
+pub use bands::{Band, Bands};
 pub use hashgrid::HashGrid;
 pub use loss::{ImageLoss, LossValue, Pair};
 pub use project::Projected;

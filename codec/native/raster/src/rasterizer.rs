@@ -15,7 +15,7 @@ use crate::forward::{Canvas, forward};
 use crate::picture::{Pixels, finish, finish_empty};
 use crate::project::{Lens, Projected, TILE, project};
 use crate::project_backward::{GradientRows, gather, project_backward};
-use crate::scene::{Gradients, RasterError, Region, Splats, View, check_length};
+use crate::scene::{Gradients, RasterError, Region, Splats, View, check_length, check_size};
 use crate::simd::Level;
 use crate::soa::CHUNK;
 use crate::sort::DepthSort;
@@ -118,6 +118,42 @@ impl Rasterizer {
         &self.projected
     }
 
+    /// The first half of `forward` alone: the ellipses of `view`, to be drawn elsewhere (see `Bands`).
+    ///
+    /// # Errors
+    /// As `forward`.
+    pub fn project(&mut self, splats: &Splats, view: &View) -> Result<&[Projected], RasterError> {
+        splats.check()?;
+        view.check()?;
+        let lens = Lens::new(view);
+        self.drawn = None;
+        self.run(|s| s.project_here(splats, &lens));
+        Ok(&self.projected)
+    }
+
+    /// The second half of `forward` alone: `fill` gets those of the last call and sets the ellipses to draw on a picture of
+    /// width x height, which must be what `project` made for one of that size.
+    ///
+    /// # Errors
+    /// As `forward`.
+    pub fn draw(
+        &mut self,
+        [width, height]: [usize; 2],
+        shade: Shade,
+        fill: impl FnOnce(&mut Vec<Projected>),
+    ) -> Result<(), RasterError> {
+        fill(&mut self.projected);
+        let region = Region {
+            x: 0,
+            y: 0,
+            width,
+            height,
+        };
+        check_size(region, width, height)?;
+        self.drawn = None;
+        self.run(|s| s.draw_here(region, shade, false))
+    }
+
     /// Runs `f` with this workspace in its own threads.
     pub(crate) fn run<R: Send>(&mut self, f: impl FnOnce(&mut Self) -> R + Send) -> R {
         match self.pool.take() {
@@ -147,26 +183,36 @@ impl Rasterizer {
         shade: Shade,
         training: bool,
     ) -> Result<(), RasterError> {
-        let (level, lens, start) = (self.level, Lens::new(view), Clock::start());
+        let lens = Lens::new(view);
         self.drawn = None;
-        self.projected.resize(splats.len(), Projected::default());
-        self.projected.par_chunks_mut(SHARE).enumerate().for_each(|(i, out)| {
-            project(level, splats, &lens, i * SHARE, out);
-        });
-        self.timings.project = start.ms();
-        let start = Clock::start();
-        let sorted = self.sort.sort(&self.projected);
-        self.bins.build(&self.projected, sorted, view.region)?;
-        self.timings.bin = start.ms();
-        let start = Clock::start();
-        self.masks.resize(if training { self.bins.pairs.len() } else { 0 }, 0);
-        self.image.resize(3 * view.region.pixels(), 0.0);
-        self.alpha.resize(view.region.pixels(), 0.0);
-        self.blend(view.region, shade);
-        self.timings.blend = start.ms();
+        self.project_here(splats, &lens);
+        self.draw_here(view.region, shade, training)?;
         if training {
             self.drawn = Some((lens, view.region, shade));
         }
+        Ok(())
+    }
+
+    fn project_here(&mut self, splats: &Splats, lens: &Lens) {
+        let (level, start) = (self.level, Clock::start());
+        self.projected.resize(splats.len(), Projected::default());
+        self.projected.par_chunks_mut(SHARE).enumerate().for_each(|(i, out)| {
+            project(level, splats, lens, i * SHARE, out);
+        });
+        self.timings.project = start.ms();
+    }
+
+    fn draw_here(&mut self, region: Region, shade: Shade, training: bool) -> Result<(), RasterError> {
+        let start = Clock::start();
+        let sorted = self.sort.sort(&self.projected);
+        self.bins.build(&self.projected, sorted, region)?;
+        self.timings.bin = start.ms();
+        let start = Clock::start();
+        self.masks.resize(if training { self.bins.pairs.len() } else { 0 }, 0);
+        self.image.resize(3 * region.pixels(), 0.0);
+        self.alpha.resize(region.pixels(), 0.0);
+        self.blend(region, shade);
+        self.timings.blend = start.ms();
         Ok(())
     }
 

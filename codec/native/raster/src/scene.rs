@@ -163,22 +163,7 @@ impl View {
     /// # Errors
     /// An empty or too large image, or a region that is not inside of it.
     pub fn check(&self) -> Result<(), RasterError> {
-        let r = self.region;
-        let inside = r.x.saturating_add(r.width) <= self.width && r.y.saturating_add(r.height) <= self.height;
-        if !inside || r.width == 0 || r.height == 0 {
-            return Err(RasterError::Region {
-                region: r,
-                width: self.width,
-                height: self.height,
-            });
-        }
-        if self.width > MAX_SIDE || self.height > MAX_SIDE {
-            return Err(RasterError::TooMany {
-                what: "pixels on a side",
-                limit: MAX_SIDE,
-            });
-        }
-        Ok(())
+        check_size(self.region, self.width, self.height)
     }
 
     /// Position of the camera in the world.
@@ -234,6 +219,25 @@ impl fmt::Display for RasterError {
 }
 
 impl std::error::Error for RasterError {}
+
+/// See `View::check`.
+pub(crate) fn check_size(r: Region, width: usize, height: usize) -> Result<(), RasterError> {
+    let inside = r.x.saturating_add(r.width) <= width && r.y.saturating_add(r.height) <= height;
+    if !inside || r.width == 0 || r.height == 0 {
+        return Err(RasterError::Region {
+            region: r,
+            width,
+            height,
+        });
+    }
+    if width > MAX_SIDE || height > MAX_SIDE {
+        return Err(RasterError::TooMany {
+            what: "pixels on a side",
+            limit: MAX_SIDE,
+        });
+    }
+    Ok(())
+}
 
 pub(crate) fn check_length(name: &'static str, got: usize, expected: usize) -> Result<(), RasterError> {
     if got == expected {

@@ -45,6 +45,7 @@ pub struct Demuxer {
     groups: Vec<Entry>,
     /// Where the fragments end according to sidx.
     end: Option<u64>,
+    index: Vec<Entry>,
 }
 
 impl Default for Demuxer {
@@ -58,6 +59,7 @@ impl Default for Demuxer {
             pending: None,
             groups: Vec::new(),
             end: None,
+            index: Vec::new(),
         }
     }
 }
@@ -113,6 +115,21 @@ impl Demuxer {
         if let Some(group) = self.pending.take_if(whole) {
             self.groups.push(group);
         }
+    }
+
+    /// What sidx announces, for players that fetch only what they show: `offset` and `size` are those of the fragments, moof
+    /// and mdat. A promise, which the fragments need not keep (spec 2.5).
+    pub fn index(&self) -> &[Entry] {
+        &self.index
+    }
+
+    /// Goes on at the fragment that starts at `position`: what is pushed next is taken to come from there.
+    pub fn seek(&mut self, position: u64) {
+        self.state = State::Head;
+        self.buffer.clear();
+        self.pending = None;
+        self.first = false;
+        self.position = position;
     }
 
     /// Takes the next bytes of the file.
@@ -224,11 +241,33 @@ impl Demuxer {
                 Ok(())
             }
             b"sidx" => {
-                self.end = movie::index(body).and_then(|size| self.position.checked_add(size));
+                self.announced(body);
                 Ok(())
             }
             _ => self.fragment(start, body),
         }
+    }
+
+    /// Spec 2.5.
+    fn announced(&mut self, sidx: &[u8]) {
+        let (Some((first, references)), Some(track)) = (movie::index(sidx), &self.track) else {
+            return;
+        };
+        let frame = u64::from(track.config.frame_duration);
+        let (mut offset, mut time) = (self.position.saturating_add(first), 0u64);
+        self.index.clear();
+        for (size, duration, sync) in references {
+            self.index.push(Entry {
+                offset,
+                size: u64::from(size),
+                start_frame: time / frame,
+                frames: duration / track.config.frame_duration,
+                sync,
+            });
+            offset = offset.saturating_add(u64::from(size));
+            time += u64::from(duration);
+        }
+        self.end = Some(offset);
     }
 
     fn fragment(&mut self, start: u64, body: &[u8]) -> Result<()> {

@@ -158,8 +158,11 @@ fn extends(moov: &[u8], id: u32) -> Result<Defaults> {
     Ok(Defaults::default())
 }
 
-/// Bytes of fragments that sidx announces; None if it is malformed.
-pub fn index(body: &[u8]) -> Option<u64> {
+/// A reference of sidx: bytes, units of the timescale, and whether it starts with a sync sample.
+pub type Reference = (u32, u32, bool);
+
+/// Spec 2.5: first_offset and the references of sidx; None if it is malformed.
+pub fn index(body: &[u8]) -> Option<(u64, Vec<Reference>)> {
     let head = if body.first()? == &0 { 20 } else { 28 };
     let first_offset = match head {
         20 => u64::from(u32::from_be_bytes(body.get(16..20)?.try_into().ok()?)),
@@ -167,10 +170,12 @@ pub fn index(body: &[u8]) -> Option<u64> {
     };
     let count = u16::from_be_bytes(body.get(head + 2..head + 4)?.try_into().ok()?);
     let (references, _) = body.get(head + 4..)?.as_chunks::<12>();
-    let sizes = references
-        .iter()
-        .map(|r| u64::from(u32::from_be_bytes([r[0] & 0x7F, r[1], r[2], r[3]])));
-    (references.len() == usize::from(count)).then(|| sizes.sum::<u64>().saturating_add(first_offset))
+    let words = |r: &[u8; 12]| {
+        let (w, _) = r.as_chunks::<4>();
+        let [size, duration, sap] = [0, 1, 2].map(|i| w.get(i).map_or(0, |w| u32::from_be_bytes(*w)));
+        (size & 0x7FFF_FFFF, duration, sap >> 31 != 0)
+    };
+    (references.len() == usize::from(count)).then(|| (first_offset, references.iter().map(words).collect()))
 }
 
 /// Spec 2.4: the group that a moof announces, None if it has none of the track. `moof`: where the moof box starts.

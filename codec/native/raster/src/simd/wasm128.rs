@@ -56,6 +56,10 @@ fn sum4(a: v128, b: v128, c: v128, d: v128) -> v128 {
     f32x4_add(i32x4_shuffle::<0, 1, 4, 5>(ab, cd), i32x4_shuffle::<2, 3, 6, 7>(ab, cd))
 }
 
+/// 1.5 * 2^23: adding it rounds to whole numbers, which then stand in the low bits. Engines convert to integers slowly, since
+/// they must saturate.
+const ROUND: f32 = 12_582_912.0;
+
 impl Vector for F32x4 {
     const LANES: usize = 4;
     type Mask = Mask4;
@@ -117,10 +121,10 @@ impl Vector for F32x4 {
         // pmin and pmax return their first operand where the second is NaN or not beyond it
         let x = f32x4_pmax(self.0, f32x4_splat(-127.0));
         let x = f32x4_pmin(x, f32x4_splat(128.0));
-        let n = f32x4_nearest(x);
-        let p = exp2_poly(F32x4(f32x4_sub(x, n)));
+        let z = f32x4_add(x, f32x4_splat(ROUND));
+        let p = exp2_poly(F32x4(f32x4_sub(x, f32x4_sub(z, f32x4_splat(ROUND)))));
         // 2^n from the exponent field: 0 for n = -127, infinity for n = 128
-        let e = i32x4_shl(i32x4_add(i32x4_trunc_sat_f32x4(n), i32x4_splat(127)), 23);
+        let e = i32x4_shl(i32x4_add(z, i32x4_splat(127)), 23);
         F32x4(f32x4_mul(p.0, e))
     }
     #[inline(always)]
@@ -139,7 +143,8 @@ impl Vector for F32x4 {
     }
     #[inline(always)]
     fn select(self, m: Mask4, b: Self) -> Self {
-        F32x4(v128_bitselect(self.0, b.0, m.0))
+        // in this form the compiler sees constants
+        F32x4(v128_or(v128_and(self.0, m.0), v128_andnot(b.0, m.0)))
     }
     #[inline(always)]
     fn any(m: Mask4) -> bool {

@@ -1,0 +1,216 @@
+//! What an instance holds, and what its exports do.
+
+use super::text;
+use gsv::attributes::sh_coefficients;
+use gsv::container::demux::Demuxer;
+use gsv::decode::decode_group;
+use gsv::evaluate::{Evaluator, Frame};
+use gsv::levels::Level as Caps;
+use raster::{Band, Bands, Level, Projected, Rasterizer, Region, Shade, Splats, View};
+use std::fmt::Display;
+
+/// Groups that an instance can hold.
+const SLOTS: usize = 8;
+
+pub struct Player {
+    pub demuxer: Demuxer,
+    pub input: Vec<u8>,
+    pub output: Vec<u8>,
+    groups: [Option<Evaluator>; SLOTS],
+    frame: Frame,
+    sh_k: usize,
+    raster: Rasterizer,
+    bands: Bands,
+    splats: Vec<Projected>,
+    pub pixels: Vec<[u8; 4]>,
+}
+
+impl Default for Player {
+    fn default() -> Self {
+        Player {
+            demuxer: Demuxer::default(),
+            input: Vec::new(),
+            output: Vec::new(),
+            groups: Default::default(),
+            frame: Frame::default(),
+            sh_k: 0,
+            raster: Rasterizer::new(Level::best(), 0),
+            bands: Bands::default(),
+            splats: Vec::new(),
+            pixels: Vec::new(),
+        }
+    }
+}
+
+impl Player {
+    /// True, or false with the message in `output`.
+    fn done<T>(&mut self, result: Result<T, impl Display>) -> bool {
+        if let Err(e) = &result {
+            self.output = e.to_string().into_bytes();
+        }
+        result.is_ok()
+    }
+
+    pub fn push(&mut self) -> bool {
+        let result = self.demuxer.push(&self.input);
+        self.done(result)
+    }
+
+    pub fn describe(&mut self, first: usize) {
+        self.output = text::describe(&self.demuxer, first).into_bytes();
+    }
+
+    pub fn decode(&mut self, slot: usize, level: u8) -> bool {
+        self.release(slot);
+        let group = Caps::get(level).and_then(|caps| decode_group(&self.input, &caps));
+        self.input = Vec::new();
+        let Some(place) = self.groups.get_mut(slot) else {
+            return self.done(Err::<(), _>(format!("expected a slot below {SLOTS}")));
+        };
+        match group {
+            Err(e) => self.done(Err::<(), _>(e)),
+            Ok(group) => {
+                self.output = text::header(&group.header).into_bytes();
+                *place = Some(Evaluator::new(group));
+                true
+            }
+        }
+    }
+
+    pub fn release(&mut self, slot: usize) {
+        if let Some(place) = self.groups.get_mut(slot) {
+            *place = None;
+        }
+    }
+
+    pub fn frame(&mut self, slot: usize, t: u16) -> bool {
+        let Some(Some(group)) = self.groups.get(slot) else {
+            self.output = b"no group in this slot".to_vec();
+            return false;
+        };
+        group.frame(t, &mut self.frame);
+        self.sh_k = sh_coefficients(group.group().header.sh_degree);
+        for (logit, shown) in self
+            .frame
+            .logit_opacities
+            .iter_mut()
+            .zip(group.visible(t).into_iter().flatten())
+        {
+            if !shown {
+                *logit = f32::NEG_INFINITY; // the projection leaves it out
+            }
+        }
+        true
+    }
+
+    pub fn bounds(&mut self) {
+        let mut out = [0.0f32; 6];
+        for axis in 0..3 {
+            let mut values: Vec<f32> = self.frame.means.iter().map(|m| m[axis]).collect();
+            if values.is_empty() {
+                values.extend([0.0, 1.0]);
+            }
+            let last = values.len() - 1;
+            for (i, share) in [0.01, 0.99].into_iter().enumerate() {
+                let at = (last as f64 * share).round() as usize;
+                out[3 * i + axis] = *values.select_nth_unstable_by(at, f32::total_cmp).1;
+            }
+        }
+        self.output = floats(&out);
+    }
+
+    pub fn attribute(&mut self, which: usize) {
+        let f = &self.frame;
+        self.output = floats(match which {
+            0 => f.means.as_flattened(),
+            1 => f.quats.as_flattened(),
+            2 => &f.log_scales,
+            3 => &f.logit_opacities,
+            4 => &f.sh0,
+            _ => &f.sh_n,
+        });
+    }
+
+    pub fn project(&mut self, bands: usize) -> usize {
+        let f = &self.frame;
+        let splats = Splats {
+            means: f.means.as_flattened(),
+            quats: f.quats.as_flattened(),
+            log_scales: &f.log_scales,
+            logit_opacities: &f.logit_opacities,
+            sh0: &f.sh0,
+            sh_n: &f.sh_n,
+            sh_k: self.sh_k,
+        };
+        let view = view(&self.input);
+        let drawn = match self.raster.project(&splats, &view) {
+            Ok(projected) => Ok(self.bands.split(projected, [view.width, view.height], bands).len()),
+            Err(e) => Err(e),
+        };
+        let count = *drawn.as_ref().unwrap_or(&0);
+        self.done(drawn);
+        count
+    }
+
+    pub fn band(&self, i: usize) -> Option<&Band> {
+        self.bands.bands.get(i)
+    }
+
+    pub fn splats(&mut self, count: usize) -> *mut u8 {
+        self.splats.resize(count, Projected::default());
+        self.splats.as_mut_ptr().cast()
+    }
+
+    pub fn draw(&mut self, size: [usize; 2], background: [f32; 3]) -> bool {
+        let (shade, splats) = (Shade::over(background), &mut self.splats);
+        let drawn = self.raster.draw(size, shade, |p| std::mem::swap(p, splats));
+        let colours = self.raster.image().as_chunks::<3>().0;
+        self.pixels.resize(colours.len(), [255; 4]);
+        for (p, c) in self.pixels.iter_mut().zip(colours) {
+            *p = [byte(c[0]), byte(c[1]), byte(c[2]), 255];
+        }
+        self.done(drawn)
+    }
+
+    pub fn use_level(&mut self, i: usize) -> bool {
+        let level = Level::available().get(i).copied();
+        if let Some(level) = level {
+            self.raster = Rasterizer::new(level, 0);
+        }
+        level.is_some()
+    }
+}
+
+/// 0 to 1 -> 0 to 255, rounded. The sum with 2^23 leaves the integer in the low bits, which engines do faster than to convert.
+#[inline(always)]
+fn byte(v: f32) -> u8 {
+    (v.clamp(0.0, 1.0) * 255.0 + 8_388_608.0).to_bits() as u8
+}
+
+fn floats(values: &[f32]) -> Vec<u8> {
+    values.iter().flat_map(|v| v.to_le_bytes()).collect()
+}
+
+/// 18 f32; what is missing is 0, which the rasterizer refuses.
+fn view(bytes: &[u8]) -> View {
+    let mut v = [0.0f32; 18];
+    for (v, b) in v.iter_mut().zip(bytes.as_chunks::<4>().0) {
+        *v = f32::from_le_bytes(*b);
+    }
+    let (width, height) = (v[0] as usize, v[1] as usize);
+    let m = |i: usize, j: usize| v[6 + 4 * i + j];
+    View {
+        width,
+        height,
+        focal: [v[2], v[3]],
+        center: [v[4], v[5]],
+        rotation: std::array::from_fn(|i| std::array::from_fn(|j| m(i, j))),
+        translation: std::array::from_fn(|i| m(i, 3)),
+        region: Region {
+            x: 0,
+            y: 0,
+            width,
+            height,
+        },
+    }
+}

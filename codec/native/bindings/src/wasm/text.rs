@@ -1,0 +1,76 @@
+//! What the host wants to know, as JSON.
+
+use gsv::container::config::{COLOR_SPACES, Camera, Config, SH_FRAMES, UP_AXES};
+use gsv::container::demux::{Demuxer, Entry};
+use gsv::header::Header;
+use std::fmt::Write;
+
+/// {config, groups, index, complete}; config is null before moov has passed.
+pub fn describe(d: &Demuxer, first: usize) -> String {
+    let groups = list(d.groups().iter().skip(first), entry);
+    let index = list(d.index().iter(), entry);
+    let config = d.config().map_or("null".into(), config);
+    format!(
+        r#"{{"config":{config},"groups":{groups},"index":{index},"complete":{}}}"#,
+        d.complete()
+    )
+}
+
+pub fn header(h: &Header) -> String {
+    format!(
+        r#"{{"frames":{},"gaussians":{},"sh_degree":{}}}"#,
+        h.frames, h.count, h.sh_degree
+    )
+}
+
+fn config(c: &Config) -> String {
+    let name = |names: &[&str], i: u8| string(names.get(usize::from(i)).copied().unwrap_or_default());
+    format!(
+        r#"{{"fps":[{},{}],"level":{},"metres_per_unit":{},"up":{},"color_space":{},"background":{},"sh_degree":{},"sh_frame":{},"cameras":{}}}"#,
+        c.timescale,
+        c.frame_duration,
+        c.level,
+        c.metres_per_unit,
+        name(&UP_AXES, c.up_axis),
+        name(&COLOR_SPACES, c.color_space),
+        list(c.background.iter(), f32::to_string),
+        c.sh_degree,
+        name(&SH_FRAMES, c.sh_frame),
+        list(c.cameras.iter(), camera),
+    )
+}
+
+fn camera(c: &Camera) -> String {
+    format!(
+        r#"{{"name":{},"width":{},"height":{},"k":{},"viewmat":{}}}"#,
+        string(&c.name),
+        c.width,
+        c.height,
+        list(c.k.iter(), f32::to_string),
+        list(c.viewmat.iter(), f32::to_string),
+    )
+}
+
+fn entry(e: &Entry) -> String {
+    format!(
+        r#"{{"offset":{},"size":{},"start_frame":{},"frames":{},"sync":{}}}"#,
+        e.offset, e.size, e.start_frame, e.frames, e.sync
+    )
+}
+
+fn list<'a, T: 'a>(items: impl Iterator<Item = &'a T>, one: impl Fn(&T) -> String) -> String {
+    format!("[{}]", items.map(one).collect::<Vec<_>>().join(","))
+}
+
+fn string(s: &str) -> String {
+    let mut out = String::from('"');
+    for c in s.chars() {
+        match c {
+            '"' | '\\' => out.extend(['\\', c]),
+            c if c < ' ' => _ = write!(out, "\\u{:04x}", u32::from(c)),
+            c => out.push(c),
+        }
+    }
+    out.push('"');
+    out
+}

@@ -1,0 +1,157 @@
+//! Ellipses of a picture -> those of each of k bands of rows, for workers that share no memory: each draws its band with
+//! `Rasterizer::draw`. Bands start at multiples of TILE rows, so that the picture is the same as in one piece.
+
+use crate::project::{Projected, TILE};
+
+/// Rows of the picture and what is to be seen in them; y and tiles are relative to the first row.
+#[derive(Default)]
+pub struct Band {
+    pub first: usize,
+    pub rows: usize,
+    pub splats: Vec<Projected>,
+}
+
+/// Buffers are kept from picture to picture.
+#[derive(Default)]
+pub struct Bands {
+    pub bands: Vec<Band>,
+    load: Vec<f32>, // of each row of tiles
+}
+
+/// What a tile costs besides its Gaussians, in Gaussians.
+const TILE_COST: f32 = 8.0;
+
+impl Bands {
+    /// At most `count` bands of about the same number of Gaussian-tile pairs.
+    pub fn split(&mut self, projected: &[Projected], [width, height]: [usize; 2], count: usize) -> &[Band] {
+        self.measure(projected, width, height);
+        let (tiles, count) = (self.load.len(), count.clamp(1, self.load.len().max(1)));
+        let total: f32 = self.load.iter().sum();
+        self.bands.resize_with(count, Band::default);
+        let (mut row, mut sum) = (0, 0.0);
+        for (i, band) in self.bands.iter_mut().enumerate() {
+            let (first, left) = (row, count - 1 - i);
+            let goal = total * (i + 1) as f32 / count as f32;
+            // one row of tiles at least; a row more where that is nearer to the equal share
+            while row < tiles - left && (row == first || left == 0 || sum + 0.5 * self.load[row] < goal) {
+                sum += self.load[row];
+                row += 1;
+            }
+            band.first = first * TILE;
+            band.rows = (row * TILE).min(height) - band.first;
+            band.take(projected);
+        }
+        &self.bands
+    }
+
+    /// Gaussian-tile pairs of each row of tiles, by the boxes of the ellipses.
+    fn measure(&mut self, projected: &[Projected], width: usize, height: usize) {
+        let (columns, rows) = (width.div_ceil(TILE), height.div_ceil(TILE));
+        self.load.clear();
+        self.load.resize(rows, TILE_COST * columns as f32);
+        for p in projected.iter().filter(|p| p.visible()) {
+            let [x0, x1, y0, y1] = p.tiles.map(usize::from);
+            for load in self.load.iter_mut().take(y1 + 1).skip(y0) {
+                *load += (x1 + 1 - x0) as f32;
+            }
+        }
+    }
+}
+
+impl Band {
+    fn take(&mut self, projected: &[Projected]) {
+        let top = (self.first / TILE) as u16;
+        let bottom = top + (self.rows.div_ceil(TILE) - 1) as u16;
+        self.splats.clear();
+        for p in projected {
+            let [x0, x1, y0, y1] = p.tiles;
+            if p.visible() && y0 <= bottom && y1 >= top {
+                let tiles = [x0, x1, y0.max(top) - top, y1.min(bottom) - top];
+                let y = p.y - self.first as f32;
+                self.splats.push(Projected { y, tiles, ..*p });
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Level, Rasterizer, Region, Shade, Splats, View};
+
+    /// A spiral of Gaussians, denser at the top.
+    fn scene(n: usize) -> [Vec<f32>; 5] {
+        let t = |i: usize| i as f32 / n as f32;
+        let flat = |f: &dyn Fn(usize) -> Vec<f32>| (0..n).flat_map(f).collect::<Vec<f32>>();
+        [
+            flat(&|i| {
+                let a = 60.0 * t(i);
+                vec![t(i) * a.cos(), 1.6 * t(i) * t(i) - 0.9, 4.0 + 0.3 * a.sin()]
+            }),
+            flat(&|i| vec![1.0, t(i), 0.5, -t(i)]),
+            flat(&|i| vec![-3.0 - t(i), -2.5, -4.0]),
+            flat(&|i| vec![2.0 * t(i)]),
+            flat(&|i| vec![t(i), 0.2, 1.0 - t(i)]),
+        ]
+    }
+
+    fn view(width: usize, height: usize) -> View {
+        View {
+            width,
+            height,
+            focal: [150.0, 150.0],
+            center: [width as f32 / 2.0, height as f32 / 2.0],
+            rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            translation: [0.0; 3],
+            region: Region {
+                x: 0,
+                y: 0,
+                width,
+                height,
+            },
+        }
+    }
+
+    #[test]
+    fn bands_together_are_the_picture() {
+        let [means, quats, log_scales, logit_opacities, sh0] = scene(3000);
+        let splats = Splats {
+            means: &means,
+            quats: &quats,
+            log_scales: &log_scales,
+            logit_opacities: &logit_opacities,
+            sh0: &sh0,
+            sh_n: &[],
+            sh_k: 0,
+        };
+        let (view, shade) = (view(150, 141), Shade::over([0.2, 0.4, 0.6]));
+        let mut whole = Rasterizer::new(Level::best(), 0);
+        whole.forward(&splats, &view, shade, false).unwrap();
+        for count in [1, 2, 3, 9, 40] {
+            let (mut project, mut draw) = (Rasterizer::new(Level::best(), 0), Rasterizer::new(Level::best(), 0));
+            let (mut bands, mut row) = (Bands::default(), 0);
+            for band in bands.split(project.project(&splats, &view).unwrap(), [150, 141], count) {
+                assert_eq!(band.first, row);
+                assert!(band.rows > 0);
+                let (from, to) = (3 * 150 * row, 3 * 150 * (row + band.rows));
+                draw.draw([150, band.rows], shade, |p| p.clone_from(&band.splats))
+                    .unwrap();
+                for (a, b) in draw.image().iter().zip(&whole.image()[from..to]) {
+                    assert!((a - b).abs() < 1e-4, "{count} bands: {a} {b}");
+                }
+                row += band.rows;
+            }
+            assert_eq!(row, 141);
+        }
+    }
+
+    #[test]
+    fn no_gaussians_is_background() {
+        let mut bands = Bands::default();
+        let split = bands.split(&[], [20, 40], 2);
+        assert_eq!(split.iter().map(|b| b.rows).sum::<usize>(), 40);
+        let mut draw = Rasterizer::new(Level::best(), 0);
+        draw.draw([20, 40], Shade::over([1.0, 0.5, 0.0]), Vec::clear).unwrap();
+        assert!(draw.image().chunks(3).all(|c| c == [1.0, 0.5, 0.0]));
+    }
+}

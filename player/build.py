@@ -1,0 +1,84 @@
+"""`make player`: codec/native -> player/native.wasm, and the hash of what it was built from (native.sha256).
+
+Both are committed, so that a checkout and the wheel play without a wasm toolchain; a test fails when the hash is stale.
+Needs the wasm32-unknown-unknown target (rustup fetches it), or the sources of the standard library: where rustup cannot
+be used, Debian's rustc-web, cargo-web and rust-web-src will do.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+PLAYER = Path(__file__).resolve().parent
+NATIVE = PLAYER.parent / "codec" / "native"
+TARGET = "wasm32-unknown-unknown"
+WASM, HASH = PLAYER / "native.wasm", PLAYER / "native.sha256"
+
+
+def source_hash() -> str:
+    """SHA-256 over everything that native.wasm is made of."""
+    files = [NATIVE / "Cargo.toml", NATIVE / "Cargo.lock", NATIVE / "bindings" / "src" / "lib.rs"]
+    files += [NATIVE / crate / "Cargo.toml" for crate in ("gsv", "raster", "bindings")]
+    for folder in ("gsv/src", "raster/src", "bindings/src/wasm"):
+        files += (NATIVE / folder).rglob("*.rs")
+    files.append(NATIVE / "bindings" / "src" / "wasm.rs")
+    digest = hashlib.sha256()
+    for f in sorted(files):
+        data = f.read_bytes()
+        digest.update(f"{f.relative_to(NATIVE).as_posix()} {len(data)}\n".encode() + data)
+    return digest.hexdigest()
+
+
+def build() -> None:
+    """Builds native.wasm.
+
+    Raises:
+        SystemExit: the toolchain is missing or the build fails.
+    """
+    command = ["cargo", "build", "--quiet", "--profile", "wasm", "--target", TARGET, "-p", "bindings"]
+    command += ["--no-default-features", "--features", "wasm"]
+    env = dict(os.environ, RUSTFLAGS=" ".join(["-C target-feature=+simd128", *_remaps()]))
+    if not _has_target():
+        command += ["-Z", "build-std=std,panic_abort"]
+        env |= {"RUSTC_BOOTSTRAP": "1", "CARGO_TARGET_WASM32_UNKNOWN_UNKNOWN_LINKER": "rust-lld"}
+    if subprocess.run(command, cwd=NATIVE, env=env).returncode:
+        sys.exit(f"error: the wasm build failed; it needs the Rust target {TARGET} (rustup target add {TARGET})")
+    folder = Path(os.environ.get("CARGO_TARGET_DIR", NATIVE / "target"))
+    built = folder / TARGET / "wasm" / "gscodec_native.wasm"
+    shutil.copyfile(built, WASM)
+    HASH.write_text(source_hash() + "\n")
+    print(f"{WASM.name}: {WASM.stat().st_size / 1000:.0f} kB")
+
+
+def _has_target() -> bool:
+    """Whether the target is installed, after asking rustup for it."""
+    sysroot = subprocess.run(["rustc", "--print", "sysroot"], capture_output=True, text=True, check=True).stdout.strip()
+    if (Path(sysroot) / "lib" / "rustlib" / TARGET / "lib").is_dir():
+        return True
+    if not shutil.which("rustup"):
+        return False
+    return subprocess.run(["rustup", "target", "add", TARGET]).returncode == 0
+
+
+def _remaps() -> list[str]:
+    """Keeps the builder's folders out of the messages in the module."""
+    home = Path(os.environ.get("CARGO_HOME", Path.home() / ".cargo"))
+    folders = [*(home / "registry" / "src").glob("*"), NATIVE]
+    return [f"--remap-path-prefix={f}={'crates' if f != NATIVE else 'native'}" for f in folders]
+
+
+def check_committed() -> None:
+    """Raises SystemExit if the files in the repository are not those of its sources."""
+    if not HASH.exists() or HASH.read_text().strip() != source_hash():
+        sys.exit("error: player/native.wasm was built from other sources; run `make player` and commit player/native.*")
+
+
+if __name__ == "__main__":
+    if "--committed" in sys.argv[1:]:  # CI: the committed files must be current, and the tests run on rebuilt ones
+        check_committed()
+    build()

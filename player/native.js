@@ -1,0 +1,98 @@
+// The wasm decoder and rasterizer: one instance per worker, and one on the page for the container. The exports are those of
+// codec/native/bindings/src/wasm.rs; addresses hold until the next call, so everything is copied here.
+
+// A module whose only function uses i8x16.splat: does this browser have simd128?
+const SIMD = [0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 10, 10, 1, 8, 0, 65, 0, 253, 15, 253, 98, 11];
+
+export async function load(url) {
+  if (typeof WebAssembly !== "object" || !WebAssembly.validate(new Uint8Array(SIMD))) {
+    throw new Error("This browser has no WebAssembly SIMD, which the player needs. Any browser of 2023 or later has it.");
+  }
+  const response = await fetch(url);
+  if (!response.ok) throw new Error(`The decoder could not be loaded: ${url} answered ${response.status}.`);
+  return WebAssembly.compile(await response.arrayBuffer());
+}
+
+export class Native {
+  constructor(instance) {
+    this.x = instance.exports;
+  }
+
+  static async create(module) {
+    return new Native(await WebAssembly.instantiate(module, {}));
+  }
+
+  bytes(address, length) {
+    return new Uint8Array(this.x.memory.buffer, address, length);
+  }
+
+  put(data) {
+    this.bytes(this.x.input(data.length), data.length).set(data);
+  }
+
+  output() {
+    return this.bytes(this.x.output(), this.x.output_length()).slice();
+  }
+
+  text() {
+    return new TextDecoder().decode(this.output());
+  }
+
+  check(good) {
+    if (!good) throw new Error(this.text());
+  }
+
+  // Container
+
+  push(data) {
+    this.put(data);
+    this.check(this.x.push());
+  }
+
+  describe(first = 0) {
+    this.x.describe(first);
+    return JSON.parse(this.text());
+  }
+
+  // Groups
+
+  decode(slot, payload, level) {
+    this.put(payload);
+    this.check(this.x.decode(slot, level));
+    return JSON.parse(this.text());
+  }
+
+  frame(slot, t) {
+    this.check(this.x.frame(slot, t));
+  }
+
+  floats() {
+    return new Float32Array(this.output().buffer);
+  }
+
+  bounds() {
+    this.x.bounds();
+    return Array.from(this.floats());
+  }
+
+  // Picture
+
+  // view: 18 floats, see wasm.rs. Calls take(band) for each band; `splats` is a view into the memory of the instance.
+  project(view, count, take) {
+    this.put(new Uint8Array(view.buffer, view.byteOffset, view.byteLength));
+    const bands = this.x.project(count);
+    if (!bands) throw new Error(this.text());
+    for (let i = 0; i < bands; i++) {
+      const size = this.x.band_splats(i) * this.x.splat_size();
+      take({ i, bands, first: this.x.band_first(i), rows: this.x.band_rows(i), splats: this.bytes(this.x.band(i), size) });
+    }
+    return bands;
+  }
+
+  // Returns [rows, width, 4], a view into the memory of the instance.
+  draw(splats, width, rows, background) {
+    this.bytes(this.x.splats(splats.length / this.x.splat_size()), splats.length).set(splats);
+    this.check(this.x.draw(width, rows, ...background));
+    return this.bytes(this.x.pixels(), width * rows * 4);
+  }
+}

@@ -1,0 +1,38 @@
+"""`gscodec play`: checks the file, serves it, opens the browser."""
+
+from __future__ import annotations
+
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+
+from gscodec.decode import open_stream
+from gscodec.player.server import Server
+
+
+def play_stream(path: Path, *, host: str, port: int, browser: bool, say: Callable[[str], object]) -> None:
+    """Serves `path` and the player until Ctrl-C. A file that is still being written (OUT.gsv.part) plays as it grows.
+
+    Args:
+        browser: open the page.
+        say: prints the address.
+
+    Raises:
+        OSError, BitstreamError: it is not there or not a .gsv file.
+        UsageError: the address cannot be used.
+    """
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    if not path.exists() and part.exists():
+        path = part
+    open_stream(path)  # what is wrong with the file is better said here than in the page
+    server = Server(path, host=host, port=port)
+    say(f"{path} plays at {server.url} (Ctrl-C ends it)")
+    if browser:
+        webbrowser.open(server.url)
+    try:
+        server.serve_forever()
+    except KeyboardInterrupt:
+        pass  # the way to end it
+    finally:
+        server.server_close()

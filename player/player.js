@@ -1,0 +1,421 @@
+// <gsv-player src="URL"> plays a .gsv file: the clock, the size of the picture, and what the viewer is told.
+//
+// Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the picture fills the element); quality="auto" or 0.1 to 1.
+// Properties: paused, frame, frameCount, fps, camera, stats. Methods: play(), pause(), show(frame). Events: ready, picture,
+// ended, error.
+
+import { Camera } from "./camera.js";
+import { MARKUP, clock, onDrag, onKeys, setIcon } from "./controls.js";
+import { Engine } from "./engine.js";
+
+const BASE = new URL(".", import.meta.url);
+const PIXELS_MAX = 4e6; // of a still picture
+const PIXELS_START = 420_000; // of a moving one, before anything has been measured
+const PIXELS_MIN = 180_000; // below that, fewer pixels save little: the Gaussians stay
+const STILL = 250; // ms without a movement after which the picture is drawn sharp
+const STALL = 300; // ms without a picture after which the viewer is told to wait
+
+export class GsvPlayer extends HTMLElement {
+  static observedAttributes = ["src", "loop", "speed", "quality", "size"];
+  paused = true;
+  speed = 1;
+  quality = "auto";
+  #position = 0; // frames, with a fraction
+  #last = 0; // time of the last tick
+  #moved = 0; // of the last change of the camera
+  #drawn = ""; // what was asked for last
+  #scale = null; // of a moving picture, found by measuring
+  #adapted = 0;
+  #times = []; // of the pictures of the last second
+  #busySince = 0;
+
+  constructor() {
+    super();
+    const root = this.attachShadow({ mode: "open" });
+    root.innerHTML = `<link rel="stylesheet" href="${new URL("player.css", BASE)}">${MARKUP}`;
+    this.$ = (selector) => root.querySelector(selector);
+    root.addEventListener("click", (e) => {
+      const name = e.target.closest?.("[data-do]")?.dataset.do;
+      if (name) this.#do(name, e);
+    });
+    root.addEventListener("change", (e) => this.#set(e.target));
+    this.$(".seek input").addEventListener("input", (e) => this.#seek(Number(e.target.value)));
+    onKeys(this, (name, e) => this.#do(name, e));
+    const move = (f) => (...a) => {
+      if (!this.camera) return;
+      f(...a);
+      this.#moved = performance.now();
+      this.$("[data-set=view]").value = this.camera.reference ? String(this.camera.references.indexOf(this.camera.reference)) : "orbit";
+    };
+    onDrag(this.$("canvas"), {
+      orbit: move((x, y) => this.camera.orbit(x, y)),
+      pan: move((x, y) => this.camera.pan(x, y)),
+      zoom: move((f) => this.camera.zoom(f)),
+    });
+    this.$("[data-do=full]").hidden = !document.fullscreenEnabled;
+    this.$("[data-set=speed]").value = "1";
+  }
+
+  connectedCallback() {
+    this.hasAttribute("tabindex") || this.setAttribute("tabindex", "-1");
+    this.engine = null;
+    if (this.getAttribute("src")) this.#open();
+  }
+
+  disconnectedCallback() {
+    this.#close();
+  }
+
+  attributeChangedCallback(name, before, value) {
+    if (name === "src" && this.engine !== undefined && this.isConnected && value !== before) this.#open();
+    if (name === "loop") this.$("[data-do=loop]").setAttribute("aria-pressed", value !== null);
+    if (name === "speed" && Number(value) > 0) this.speed = Number(value);
+    if (name === "quality" && value) this.quality = value === "auto" ? value : Math.min(Math.max(Number(value) || 1, 0.1), 1);
+    for (const set of ["speed", "quality"]) this.$(`[data-set=${set}]`).value = String(this[set]);
+  }
+
+  get loop() {
+    return this.hasAttribute("loop");
+  }
+
+  // Live, the end is where one waits.
+  get #loops() {
+    const { source } = this.engine;
+    return this.loop && (source.complete || source.settled);
+  }
+
+  get frame() {
+    return Math.floor(this.#position);
+  }
+
+  get frameCount() {
+    return this.engine?.source?.frameCount ?? 0;
+  }
+
+  get fps() {
+    return this.engine.fps;
+  }
+
+  get stats() {
+    const e = this.engine;
+    return { ...e?.stats, fps: this.#times.length, received: e?.source?.received ?? 0 };
+  }
+
+  play() {
+    if (!this.loop && this.frame >= this.frameCount - 1 && this.engine?.source?.complete) this.#position = 0;
+    this.paused = false;
+  }
+
+  pause() {
+    this.paused = true;
+  }
+
+  // Stops at frame t and resolves with {t, view} when its sharp picture is on the canvas.
+  show(t) {
+    this.pause();
+    this.#seek(t);
+    this.#drawn = "";
+    this.#moved = -STILL;
+    return new Promise((resolve, reject) => {
+      const seen = ({ detail }) => {
+        if (detail.t !== t || detail.view.join() !== this.#view(true).join()) return;
+        this.removeEventListener("picture", seen);
+        resolve(detail);
+      };
+      this.addEventListener("picture", seen);
+      this.addEventListener("error", (e) => reject(new Error(e.detail)), { once: true });
+    });
+  }
+
+  // Opening and closing
+
+  async #open() {
+    this.#close();
+    this.$(".error").hidden = true;
+    this.$(".notes").replaceChildren();
+    this.$(".busy").hidden = false;
+    Object.assign(this, { camera: null, paused: true });
+    [this.#position, this.#scale, this.#drawn] = [0, null, ""];
+    const engine = (this.engine = new Engine(this.$("canvas"), BASE, this.getAttribute("src")));
+    const { source } = engine;
+    const on = (target, type, f) => target.addEventListener(type, (e) => this.engine === engine && f(e.detail));
+    on(engine, "damaged", (d) => this.#damaged(d));
+    on(engine, "fatal", (message) => this.#fail("The player has stopped", `${message}.`));
+    on(engine, "decoded", () => this.#begin(engine));
+    on(engine, "picture", (detail) => this.#pictured(detail));
+    on(source, "retry", (why) => this.#note("link", `Connection lost (${why}). Trying again…`, true));
+    on(source, "connected", () => this.#note("link", null));
+    on(source, "error", (e) => this.#fail("The file cannot be read on", sentence(e.message)));
+    on(source, "groups", () => this.#grown());
+    try {
+      this.#request = requestAnimationFrame((now) => this.#tick(now));
+      await engine.open();
+      if (this.engine !== engine) return;
+      if (source.missing) {
+        const all = this.frameCount + source.missing;
+        this.#note("cut", `The file is cut short: ${this.frameCount} of ${all} frames are there.`, true);
+      }
+      this.#grown();
+      if (!this.frameCount) this.#fail("Nothing to play", "The file has no whole group of frames.");
+    } catch (e) {
+      if (this.engine === engine) this.#fail("This file cannot be played", sentence(e.message));
+    }
+  }
+
+  #request = 0;
+
+  #close() {
+    cancelAnimationFrame(this.#request);
+    this.engine?.close();
+    this.engine = null;
+  }
+
+  #grown() {
+    const { source } = this.engine;
+    this.$(".seek input").max = Math.max(this.frameCount - 1, 0);
+    const unfinished = source.settled ? "The file is unfinished: these are the frames it has." : "Live: the file is still being written.";
+    this.#note("live", source.complete ? null : unfinished);
+  }
+
+  // The first group is decoded: there is something to look at.
+  #begin(engine) {
+    if (this.camera) return;
+    const { config } = engine.source;
+    this.camera = new Camera(engine.bounds, config.up, config.cameras);
+    const select = this.$("[data-set=view]");
+    select.replaceChildren(new Option("Free view", "orbit"), ...config.cameras.map((c, i) => new Option(c.name, i)));
+    select.hidden = !config.cameras.length;
+    if (this.hasAttribute("autoplay")) this.play();
+    this.dispatchEvent(new CustomEvent("ready"));
+  }
+
+  // The clock
+
+  #tick(now) {
+    this.#request = requestAnimationFrame((t) => this.#tick(t));
+    const { engine } = this;
+    const passed = Math.min(now - this.#last, 250) / 1000;
+    this.#last = now;
+    if (!engine?.source?.groups.length || !this.$(".error").hidden) return;
+    let group = engine.groupOf(this.frame);
+    if (engine.failed.has(group)) group = this.#passOver(group);
+    if (group === null) return;
+    engine.want(group, this.#loops);
+    const ready = engine.ready(group) && this.camera;
+    if (ready && !this.paused) this.#advance(passed);
+    const shown = engine.groupOf(this.frame);
+    if (ready && engine.ready(shown) && engine.free) this.#draw(now);
+    this.#wait(now, ready && engine.ready(shown));
+    this.#follow(now);
+  }
+
+  #advance(passed) {
+    const count = this.frameCount;
+    const next = this.#position + passed * this.fps * this.speed;
+    if (next < count) this.#position = next;
+    else if (this.#loops) this.#position = next % count;
+    else if (!this.engine.source.complete) this.#position = count - 1e-3; // live: wait for more
+    else {
+      this.#position = count - 1;
+      this.pause();
+      this.dispatchEvent(new CustomEvent("ended"));
+    }
+  }
+
+  // Past a damaged group; null if there is no other.
+  #passOver(group) {
+    const { engine } = this;
+    const { groups } = engine.source;
+    for (let k = 1; k < groups.length; k++) {
+      const i = (group + k) % groups.length;
+      if (engine.failed.has(i)) continue;
+      this.#position = groups[i].start_frame;
+      return i;
+    }
+    if (engine.source.complete) this.#fail("This file is damaged", `None of its groups can be decoded (group ${group}: ${engine.failed.get(group)}).`);
+    return null;
+  }
+
+  #seek(t) {
+    this.#position = Math.min(Math.max(t, 0), Math.max(this.frameCount - 1, 0));
+  }
+
+  // The picture
+
+  // View of a picture that fills the element; a moving one may be coarser.
+  #view(sharp) {
+    const fixed = /^(\d+)x(\d+)$/.exec(this.getAttribute("size") ?? "");
+    if (fixed) return this.camera.view(Number(fixed[1]), Number(fixed[2]));
+    const stage = this.$(".stage");
+    const ratio = Math.min(devicePixelRatio || 1, 2);
+    const [w, h] = [stage.clientWidth * ratio, stage.clientHeight * ratio].map((v) => Math.max(v, 16));
+    const most = Math.min(1, Math.sqrt(PIXELS_MAX / (w * h)));
+    this.#scale ??= Math.min(1, Math.sqrt(PIXELS_START / (w * h)));
+    const scale = this.quality === "auto" ? (sharp ? most : Math.min(this.#scale, most)) : this.quality * most;
+    return this.camera.view(Math.round(w * scale), Math.round(h * scale));
+  }
+
+  #draw(now) {
+    const view = this.#view(this.paused && now - this.#moved > STILL);
+    const what = `${this.frame} ${view}`;
+    if (what === this.#drawn) return;
+    this.#drawn = what;
+    this.engine.draw(this.frame, view);
+  }
+
+  #pictured(detail) {
+    const now = performance.now();
+    this.#times.push(now);
+    this.#busySince = 0;
+    this.dispatchEvent(new CustomEvent("picture", { detail }));
+    if (!this.paused) this.#adapt(now);
+  }
+
+  // Finds the size at which this device keeps up, from how long the slowest stage of a picture takes.
+  #adapt(now) {
+    if (now - this.#adapted < 500) return;
+    this.#adapted = now;
+    const { blend, project } = this.engine.stats;
+    const share = (Math.max(blend, project) * Math.min(this.fps * this.speed, 60)) / 1000;
+    const { clientWidth, clientHeight } = this.$(".stage");
+    const least = Math.min(1, Math.sqrt(PIXELS_MIN / Math.max(clientWidth * clientHeight, 1)));
+    if (share > 0.95) this.#scale = Math.max(least, this.#scale * 0.85);
+    else if (share < 0.5) this.#scale = Math.min(1, this.#scale * 1.08);
+  }
+
+  // What the viewer is told
+
+  #wait(now, ready) {
+    if (ready) this.#busySince = 0;
+    else this.#busySince ||= now;
+    this.$(".busy").hidden = !this.#busySince || now - this.#busySince < STALL;
+  }
+
+  #follow(now) {
+    while (this.#times.length && this.#times[0] < now - 1000) this.#times.shift();
+    const bar = this.$(".seek input");
+    if (!bar.matches(":active")) bar.value = this.frame;
+    setIcon(this.$("[data-do=play]"), this.paused ? "play" : "pause");
+    if (now - (this.toldAt ?? 0) < 100) return;
+    this.toldAt = now;
+    const seconds = (n) => clock(n / this.fps);
+    this.$(".time").innerHTML = `${seconds(this.frame)} <small>/ ${seconds(this.frameCount)}</small>`;
+    bar.setAttribute("aria-valuetext", `frame ${this.frame} of ${this.frameCount}`);
+    this.#track();
+    this.#slow();
+    if (!this.$(".stats").hidden) this.$(".stats").textContent = this.#figures();
+  }
+
+  // Lights up what has been fetched.
+  #track() {
+    const { source, failed } = this.engine;
+    const at = (t) => `${((100 * t) / Math.max(this.frameCount, 1)).toFixed(2)}%`;
+    const parts = source.groups.map((g, i) => {
+      const color = failed.has(i) ? "#a4503f" : source.has(i) ? "#8a909c" : "#4a4d55";
+      return `${color} ${at(g.start_frame)} ${at(g.start_frame + g.frames)}`;
+    });
+    const track = parts.length ? `linear-gradient(90deg, ${parts.join()})` : "";
+    if (track !== this.track) this.$(".seek").style.setProperty("--track", track);
+    this.track = track;
+  }
+
+  #slow() {
+    const wanted = Math.min(this.fps * this.speed, 60);
+    const drawn = this.#times.length;
+    this.slow = this.paused || drawn > 0.8 * wanted || !this.$(".busy").hidden ? 0 : (this.slow ?? 0) + 1;
+    const text = `This device draws ${drawn} of ${Math.round(wanted)} frames a second.`;
+    this.#note("slow", this.slow > 20 ? text : null);
+    const { source } = this.engine;
+    const lower = source.quality && source.rung < source.rungs - 1;
+    this.#note("rung", lower ? `Quality ${source.quality}: the link or this device carries no more just now.` : null);
+  }
+
+  #figures() {
+    const { source } = this.engine;
+    const [s, { width, height }] = [this.stats, this.$("canvas")];
+    const group = source.groups[this.engine.groupOf(this.frame)];
+    const rate = group ? (8e-6 * group.size * this.fps) / group.frames : 0;
+    return [
+      ["fps", `${s.fps} of ${this.fps.toFixed(1)}`],
+      ["frame", `${this.frame} of ${this.frameCount}`],
+      ["picture", `${width} x ${height}`],
+      ["Gaussians", s.gaussians.toLocaleString("en")],
+      ["decode", `${s.decode.toFixed(1)} ms/frame`],
+      ["project", `${s.project.toFixed(1)} ms`],
+      ["blend", `${s.blend.toFixed(1)} ms`],
+      ["stream", `${rate.toFixed(2)} Mbit/s`],
+      ["link", s.link ? `${s.link.toFixed(1)} Mbit/s` : "–"],
+      ...(source.quality ? [["quality", source.quality]] : []),
+      ["received", `${(s.received / 1e6).toFixed(2)} MB`],
+    ].map(([name, value]) => `${name.padEnd(10)}${value}`).join("\n");
+  }
+
+  // A line in the corner; null takes it away.
+  #note(id, text, warn = false) {
+    const notes = this.$(".notes");
+    let note = notes.querySelector(`[data-id="${id}"]`);
+    if (!text) return note?.remove();
+    if (!note) {
+      note = document.createElement("div");
+      note.dataset.id = id;
+      notes.append(note);
+    }
+    note.className = warn ? "note warn" : "note";
+    if (note.textContent !== text) note.textContent = text;
+  }
+
+  #damaged({ group, frames, message }) {
+    this.#note("damage", `Frames ${frames} are damaged and left out (group ${group}: ${message}).`, true);
+  }
+
+  #fail(title, message) {
+    if (!this.$(".error").hidden) return;
+    this.pause();
+    this.$(".busy").hidden = true;
+    this.$(".notes").replaceChildren();
+    this.$(".error h2").textContent = title;
+    this.$(".error p").textContent = message;
+    this.$(".error").hidden = false;
+    this.dispatchEvent(new CustomEvent("error", { detail: `${title}: ${message}` }));
+  }
+
+  // What the viewer does
+
+  #set({ dataset, value }) {
+    if (dataset.set === "view") {
+      if (value === "orbit") this.camera.reset();
+      else this.camera.use(Number(value));
+      this.#moved = performance.now();
+    } else if (dataset.set) this.setAttribute(dataset.set, value);
+  }
+
+  #do(name, event) {
+    const step = event.shiftKey ? 10 : 1;
+    const actions = {
+      play: () => (this.paused ? this.play() : this.pause()),
+      back: () => (this.pause(), this.#seek(this.frame - step)),
+      next: () => (this.pause(), this.#seek(this.frame + step)),
+      first: () => this.#seek(0),
+      last: () => this.#seek(this.frameCount - 1),
+      closer: () => this.camera?.zoom(1.1),
+      farther: () => this.camera?.zoom(1 / 1.1),
+      loop: () => this.toggleAttribute("loop"),
+      reset: () => (this.camera?.reset(), (this.$("[data-set=view]").value = "orbit")),
+      stats: () => {
+        const { hidden } = this.$(".stats");
+        this.$(".stats").hidden = !hidden;
+        this.$("[data-do=stats]").setAttribute("aria-pressed", hidden);
+      },
+      full: () => (document.fullscreenElement ? document.exitFullscreen() : this.requestFullscreen()),
+      retry: () => this.#open(),
+    };
+    actions[name]?.();
+  }
+}
+
+function sentence(text) {
+  const s = text.charAt(0).toUpperCase() + text.slice(1);
+  return /[.!?]$/.test(s) ? s : `${s}.`;
+}
+
+customElements.define("gsv-player", GsvPlayer);

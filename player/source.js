@@ -1,0 +1,283 @@
+// A .gsv file behind a URL: where its groups are, and their bytes, by HTTP Range.
+//
+// A finished file has an index (sidx), so one small request tells everything; without it the headers of the fragments are
+// walked, and a file that still grows is asked for more. A server that ignores Range sends the whole file, which is then kept.
+// Only headers that need no CORS preflight are sent, so any static host will do. A connection that breaks is taken up again
+// where it broke.
+
+const HEAD = 1 << 16; // first request
+const STEP = 1 << 12; // a moof and the header of its mdat
+const CACHE = 48 << 20; // bytes of payloads that are kept
+const SILENCE = 15_000; // ms without a byte after which a connection counts as broken
+const PATIENCE = 60_000; // ms of trying before the viewer is told that it is over
+const SETTLE = 8000; // ms without growth after which a file counts as all there is
+const POLL = [500, 5000]; // ms between looks at a growing file: first, longest
+
+const sleep = (ms, signal) =>
+  new Promise((resolve, reject) => {
+    const timer = setTimeout(resolve, ms);
+    signal?.addEventListener("abort", () => (clearTimeout(timer), reject(signal.reason)), { once: true });
+  });
+
+export class StreamError extends Error {}
+
+export class Source extends EventTarget {
+  groups = []; // {start_frame, frames, offset, size, indexed}: of the payload, or of the fragment if `indexed`
+  config = null;
+  total = null; // bytes of the file, null if unknown
+  complete = false; // nothing will be added
+  settled = false; // not complete, and nothing has been added for a while
+  received = 0;
+  #cache = new Map();
+  #whole = null; // all bytes so far, from a server without Range
+  #closing = new AbortController();
+
+  constructor(url) {
+    super();
+    this.url = new URL(url, document.baseURI).href;
+  }
+
+  get frameCount() {
+    const last = this.groups.at(-1);
+    return last ? last.start_frame + last.frames : 0;
+  }
+
+  // Frames that the index promises and the file does not have.
+  missing = 0;
+
+  // Resolves when the first group is known.
+  async open(create) {
+    const [native, head] = await Promise.all([create(), this.#read(0, HEAD)]);
+    this.native = native; // whose demuxer is used
+    if (!head.length) throw new StreamError("The file is empty.");
+    this.total ??= await this.#size();
+    this.native.push(head);
+    let d = this.native.describe();
+    while (!d.config && (await this.#more())) d = this.native.describe();
+    if (!d.config) throw new StreamError("The file ends before its header does.");
+    this.config = d.config;
+    if (d.index.length && !this.#whole) {
+      this.#useIndex(d.index);
+    } else {
+      this.#list();
+      this.#walk().catch((e) => this.#say("error", e));
+      while (!this.groups.length && !this.complete) await new Promise((done) => this.addEventListener("groups", done, { once: true }));
+    }
+  }
+
+  level() {
+    return this.config.level;
+  }
+
+  has(i) {
+    return this.#cache.has(i);
+  }
+
+  close() {
+    this.#closing.abort(new StreamError("closed"));
+  }
+
+  // Bytes of group i.
+  async payload(i, signal) {
+    const kept = this.#cache.get(i);
+    if (kept) {
+      this.#cache.delete(i);
+      this.#cache.set(i, kept); // the one that was used last is dropped last
+      return kept;
+    }
+    const g = this.groups[i];
+    let bytes = await this.#read(g.offset, g.offset + g.size, signal);
+    if (bytes.length < g.size) throw new StreamError("the file ends within them");
+    if (g.indexed) bytes = this.#unwrap(g, bytes);
+    this.#keep(i, bytes);
+    return bytes;
+  }
+
+  #say(type, detail) {
+    this.dispatchEvent(new CustomEvent(type, { detail }));
+  }
+
+  #keep(i, bytes) {
+    this.#cache.set(i, bytes);
+    let size = 0;
+    for (const b of this.#cache.values()) size += b.length;
+    for (const [k, b] of this.#cache) {
+      if (size <= CACHE || k === i) break;
+      this.#cache.delete(k);
+      size -= b.length;
+    }
+  }
+
+  #useIndex(index) {
+    const end = this.total ?? Infinity;
+    const whole = index.filter((g) => g.offset + g.size <= end);
+    this.missing = index.slice(whole.length).reduce((n, g) => n + g.frames, 0);
+    this.groups = whole.map((g) => ({ ...g, indexed: true }));
+    this.complete = true;
+    this.#say("groups");
+  }
+
+  // The payload within a fragment that the index named.
+  #unwrap(g, fragment) {
+    const known = this.native.describe().groups.length;
+    this.native.x.seek(g.offset);
+    this.native.push(fragment);
+    const [found, more] = this.native.describe(known).groups;
+    if (!found || more || found.start_frame !== g.start_frame || found.frames !== g.frames) {
+      throw new StreamError("the index of the file disagrees with its fragments");
+    }
+    return fragment.slice(found.offset - g.offset, found.offset - g.offset + found.size);
+  }
+
+  // Groups that the demuxer has passed.
+  #list() {
+    const d = this.native.describe(this.groups.length);
+    for (const g of d.groups) this.groups.push(g);
+    this.complete = d.complete;
+    if (d.groups.length || d.complete) this.#say("groups");
+  }
+
+  // One step along the file; false at its end.
+  async #more() {
+    const { x } = this.native;
+    const left = x.skippable();
+    if (left > 0 && x.position() + left <= (this.total ?? 0)) {
+      x.skip(left);
+      return true;
+    }
+    const at = x.position() + left;
+    const bytes = await this.#read(left > 0 ? at - 1 : at, at + STEP); // past a body of unknown presence: its last byte too
+    if (left > 0 && bytes.length) x.skip(left);
+    const rest = left > 0 ? bytes.subarray(1) : bytes;
+    if (rest.length) this.native.push(rest);
+    return bytes.length > 0;
+  }
+
+  // Along a file without index, and after it while it grows.
+  async #walk() {
+    let [wait, since] = [POLL[0], performance.now()];
+    for (let seen = -1; !this.complete; ) {
+      const moved = await this.#more();
+      this.#list();
+      const { x } = this.native;
+      if (moved && x.position() !== seen) {
+        [seen, wait, since] = [x.position(), POLL[0], performance.now()];
+        this.settled = false;
+        continue;
+      }
+      if (this.#whole) {
+        this.complete = true; // it was sent to its end
+        this.#say("groups");
+        return;
+      }
+      if (!this.settled && performance.now() - since > SETTLE) {
+        this.settled = true;
+        this.#say("groups");
+      }
+      await sleep(wait, this.#closing.signal);
+      wait = Math.min(wait * 1.5, POLL[1]);
+    }
+  }
+
+  // Bytes start .. end of the file, fewer where it ends.
+  async #read(start, end, signal) {
+    if (this.#whole) return this.#whole.subarray(start, end);
+    const parts = [];
+    let [at, since, wait] = [start, performance.now(), 250];
+    while (at < end && (this.total === null || at < this.total || start >= this.total)) {
+      const before = at;
+      try {
+        const done = await this.#request(at, end, (part) => {
+          parts.push(part);
+          at += part.length;
+        }, signal);
+        if (this.#whole) return this.#whole.subarray(start, end);
+        if (done) break;
+      } catch (e) {
+        if (signal?.aborted || this.#closing.signal.aborted) throw e;
+        if (e instanceof StreamError) throw e;
+        if (at > before) [since, wait] = [performance.now(), 250];
+        if (performance.now() - since > PATIENCE) throw new StreamError(`The connection is lost: ${e.message}.`);
+        this.#say("retry", e.message);
+        await sleep(wait, signal);
+        wait = Math.min(2 * wait, 4000);
+      }
+    }
+    this.#say("connected");
+    const out = new Uint8Array(at - start);
+    parts.reduce((to, part) => (out.set(part, to), to + part.length), 0);
+    return out;
+  }
+
+  // Asked where no answer to a range has told it; null if this does not either.
+  async #size() {
+    const response = await fetch(this.url, { method: "HEAD", signal: this.#closing.signal, cache: "no-store" }).catch(() => null);
+    return (response?.ok && Number(response.headers.get("content-length"))) || null;
+  }
+
+  // One request; `take` gets the bytes as they come. True if the file has no more.
+  async #request(start, end, take, signal) {
+    const watch = new AbortController();
+    const stop = (e) => watch.abort(e.target.reason);
+    for (const s of [signal, this.#closing.signal]) {
+      if (s?.aborted) throw s.reason;
+      s?.addEventListener("abort", stop, { once: true });
+    }
+    let timer;
+    const alive = () => {
+      clearTimeout(timer);
+      timer = setTimeout(() => watch.abort(new Error("no answer")), SILENCE);
+    };
+    try {
+      alive();
+      const began = performance.now();
+      const response = await fetch(this.url, {
+        headers: { Range: `bytes=${start}-${end - 1}` },
+        signal: watch.signal,
+        cache: "no-store",
+      });
+      return await this.#body(response, { start, end, began, alive, take });
+    } finally {
+      clearTimeout(timer);
+      for (const s of [signal, this.#closing.signal]) s?.removeEventListener("abort", stop);
+    }
+  }
+
+  async #body(response, { start, end, began, alive, take }) {
+    const { status } = response;
+    if (status === 416) {
+      const size = /\/(\d+)$/.exec(response.headers.get("content-range") ?? "");
+      if (size) this.total = Number(size[1]);
+      return true;
+    }
+    if (status >= 500 || status === 408 || status === 429) throw new Error(`the server answered ${status}`);
+    if (status !== 200 && status !== 206) {
+      throw new StreamError(status === 404 ? "The file was not found on the server." : `The server answered ${status} ${response.statusText}.`);
+    }
+    const range = /bytes (\d+)-(\d+)\/(\d+|\*)/.exec(response.headers.get("content-range") ?? "");
+    if (range && range[3] !== "*") this.total = Number(range[3]);
+    const chunks = [];
+    const reader = response.body.getReader();
+    for (;;) {
+      const { done, value } = await reader.read();
+      if (done) break;
+      alive();
+      this.received += value.length;
+      if (status === 206) take(value);
+      else chunks.push(value);
+    }
+    const bytes = Number(response.headers.get("content-length") ?? 0);
+    this.#say("received", { bytes, ms: performance.now() - began });
+    // another origin hides Content-Range, but not the length of what it sent
+    if (status === 206 && !range && bytes && bytes < end - start) {
+      this.total = start + bytes;
+      return true;
+    }
+    if (status === 200) {
+      this.#whole = new Uint8Array(await new Blob(chunks).arrayBuffer());
+      this.total = this.#whole.length;
+      return true;
+    }
+    return range !== null && Number(range[2]) + 1 < end; // less than was asked for: the file ends there
+  }
+}

@@ -1,0 +1,93 @@
+// A worker of the player, in one of two roles.
+//
+// group:  payloads in, decoded groups held; frame t + view -> ellipses of each band of rows, straight to the band's worker.
+// raster: ellipses of a band -> its pixels, to the page.
+//
+// Two group workers take turns: one shows its group while the other decodes the next, so nothing decoded ever has to travel.
+
+import { Native } from "./native.js";
+
+const roles = { group: groupWorker, raster: rasterWorker };
+
+self.onmessage = async ({ data }) => {
+  const native = await Native.create(data.module);
+  roles[data.role](native, data);
+};
+
+function groupWorker(native, { ports }) {
+  const slots = new Map(); // group -> slot
+  const spare = ports.map(() => []); // buffers that came back
+  ports.forEach((port, i) => (port.onmessage = ({ data }) => spare[i].length < 3 && spare[i].push(data)));
+  let shown = "";
+
+  function decode({ group, payload, level, bounds }) {
+    const start = performance.now();
+    let slot = 0;
+    while ([...slots.values()].includes(slot)) slot++;
+    const header = native.decode(slot, payload, level);
+    slots.set(group, slot);
+    shown = "";
+    if (bounds) {
+      native.frame(slot, 0);
+      header.bounds = native.bounds();
+      shown = `${group} 0`;
+    }
+    return { type: "decoded", group, header, ms: performance.now() - start };
+  }
+
+  function draw({ id, group, t, view, background }) {
+    const start = performance.now();
+    if (shown !== `${group} ${t}`) {
+      native.frame(slots.get(group), t);
+      shown = `${group} ${t}`;
+    }
+    const bands = native.project(view, ports.length, ({ i, bands, first, rows, splats }) => {
+      let buffer = spare[i].pop();
+      if (!buffer || buffer.byteLength < splats.length) buffer = new ArrayBuffer(Math.ceil(splats.length * 1.2));
+      new Uint8Array(buffer, 0, splats.length).set(splats);
+      ports[i].postMessage({ id, bands, first, rows, width: view[0], length: splats.length, background, buffer }, [buffer]);
+    });
+    return { type: "projected", id, bands, ms: performance.now() - start };
+  }
+
+  self.onmessage = ({ data }) => {
+    try {
+      if (data.type === "decode") self.postMessage(decode(data));
+      else if (data.type === "draw") self.postMessage(draw(data));
+      else if (data.type === "release" && slots.has(data.group)) {
+        native.x.release(slots.get(data.group));
+        slots.delete(data.group);
+        shown = "";
+      }
+    } catch (e) {
+      // a trap leaves the instance in no known state: the page starts another worker
+      const fatal = e instanceof WebAssembly.RuntimeError || e instanceof RangeError;
+      self.postMessage({ type: "failed", group: data.group, id: data.id, message: e.message, fatal });
+    }
+  };
+  self.postMessage({ type: "ready" });
+}
+
+function rasterWorker(native, { ports }) {
+  const spare = [];
+  const draw = (port, { id, bands, first, rows, width, length, background, buffer }) => {
+    const start = performance.now();
+    const drawn = native.draw(new Uint8Array(buffer, 0, length), width, rows, background);
+    port.postMessage(buffer, [buffer]);
+    let pixels = spare.pop();
+    if (pixels?.byteLength !== drawn.length) pixels = new ArrayBuffer(drawn.length);
+    new Uint8Array(pixels).set(drawn);
+    self.postMessage({ type: "band", id, bands, first, rows, width, pixels, ms: performance.now() - start }, [pixels]);
+  };
+  for (const port of ports) {
+    port.onmessage = ({ data }) => {
+      try {
+        draw(port, data);
+      } catch (e) {
+        self.postMessage({ type: "failed", id: data.id, message: e.message, fatal: true });
+      }
+    };
+  }
+  self.onmessage = ({ data }) => spare.length < 3 && spare.push(data);
+  self.postMessage({ type: "ready" });
+}

@@ -1,0 +1,68 @@
+"""Fixtures of more than one file: a stream, its server, a browser."""
+
+import http.server
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def gsv(tmp_path_factory) -> Path:
+    """A stream of 5 groups of 6 frames."""
+    from playing import FPS, LENGTH, cameras, sequence
+
+    from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
+
+    path = tmp_path_factory.mktemp("player") / "a.gsv"
+    s = sequence(sh_count=3)
+    config = stream_config(
+        fps=FPS, sh_degree=1, gaussians=400, frames=LENGTH, cameras=cameras(), background=(0.2, 0.3, 0.5)
+    )
+    encode_groups(lambda done, frames: iter(s.groups[done:]), path, config, EncodeSettings(quality=80), fingerprint={})
+    return path
+
+
+@pytest.fixture(scope="session")
+def server(gsv):
+    from playing import serving
+
+    from gscodec.player.server import Server
+
+    s = serving(Server(gsv))
+    yield s
+    s.shutdown()
+    s.server_close()
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory):
+    from browser import Browser, find_chromium
+
+    if find_chromium() is None:
+        if os.environ.get("CI"):
+            pytest.fail("no Chromium: set CHROMIUM or install it")
+        pytest.skip("no Chromium here (Debian: apt-get install chromium)")
+    b = Browser(tmp_path_factory.mktemp("profile"))
+    yield b
+    b.close()
+
+
+@pytest.fixture
+def other(gsv):
+    """Starts servers of another origin: other(data, **what goes wrong) -> URL, handler."""
+    from playing import Trouble, serving
+
+    started = []
+
+    def start(data, **attributes):
+        path = attributes.pop("path", "/some/where.gsv")
+        handler = type("T", (Trouble,), {"data": data, "log": [], **attributes})
+        s = serving(http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler))
+        started.append(s)
+        return f"http://127.0.0.1:{s.server_address[1]}{path}", handler
+
+    yield start
+    for s in started:
+        s.shutdown()
+        s.server_close()

@@ -1,0 +1,175 @@
+"""What the tests of the player share: a stream, servers with faults, and what is asked of a page."""
+
+import base64
+import http.client
+import http.server
+import json
+import socket
+import threading
+import time
+
+import numpy as np
+from synthetic import blob, moved
+
+from gscodec.camera import Camera, look_at
+from gscodec.gaussians import GaussianSequence, Group
+from gscodec.player.server import parse_range
+
+FPS, GROUPS, LENGTH = 30, 5, 6
+
+
+def sequence(n=400, sh_count=0) -> GaussianSequence:
+    """A blob that turns, in groups; every second group has lifetimes."""
+    still, groups = blob(n, sh_count=sh_count), []
+    for k in range(GROUPS):
+        frames = [moved(still, [0, 0.05 * t, 0], [0.01 * t, 0, 0]) for t in range(k * LENGTH, (k + 1) * LENGTH)]
+        life = np.tile(np.array([0, LENGTH], np.int32), (n, 1))
+        life[: n // 4, 1] = LENGTH // 2
+        groups.append(Group(frames, life if k % 2 else None))
+    return GaussianSequence(FPS, groups)
+
+
+def cameras() -> list[Camera]:
+    """Two reference cameras with off-centre axes."""
+    K = np.array([[300.0, 0, 130], [0, 290, 90], [0, 0, 1]])
+    eyes = ([3.0, 0.5, -2], [-2.5, 1, 2.5])
+    return [
+        Camera(f"cam{i}", K, look_at(np.array(e), np.zeros(3), np.array([0, 1.0, 0])), 256, 192)
+        for i, e in enumerate(eyes)
+    ]
+
+
+def serving(server: http.server.HTTPServer):
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    return server
+
+
+def ask(server, path="/stream.gsv", method="GET", **headers):
+    """(status, headers, body) of a request."""
+    c = http.client.HTTPConnection(*server.server_address[:2], timeout=10)
+    c.request(method, path, headers={k.replace("_", "-"): v for k, v in headers.items()})
+    r = c.getresponse()
+    body = r.read()
+    c.close()
+    return r.status, dict(r.getheaders()), body
+
+
+class Trouble(http.server.BaseHTTPRequestHandler):
+    """A plain server with Range and CORS, and what may go wrong with one."""
+
+    protocol_version = "HTTP/1.1"
+    data = b""
+    log: list
+    drop_after: int | None = None  # bytes of a body after which the connection is cut
+    fail_first = 0
+    ranges = True
+    kind = "video/mp4"
+    rate: int | None = None  # bytes a second
+
+    def do_HEAD(self):
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(self.data)))
+        self.cors()
+
+    def do_GET(self):
+        value = self.headers.get("Range")
+        self.log.append(value)
+        cls = type(self)
+        if cls.fail_first > 0:
+            cls.fail_first -= 1
+            self.send_error(503)
+            return
+        size = len(self.data)
+        try:
+            found = parse_range(value, size) if self.ranges else None
+        except ValueError:
+            self.send_response(416)
+            self.send_header("Content-Range", f"bytes */{size}")
+            self.send_header("Content-Length", "0")
+            self.cors()
+            return
+        start, end = found or (0, size)
+        self.send_response(206 if found else 200)
+        if found:
+            self.send_header("Content-Range", f"bytes {start}-{end - 1}/{size}")
+        self.send_header("Content-Length", str(end - start))
+        self.cors()
+        if self.drop_after is not None and end - start > self.drop_after:
+            self.wfile.write(self.data[start : start + self.drop_after])
+            self.wfile.flush()
+            time.sleep(0.2)  # what was sent arrives before the news that it is all
+            self.connection.shutdown(socket.SHUT_RDWR)
+            self.close_connection = True
+            return
+        for at in range(start, end, 2000):
+            self.wfile.write(self.data[at : min(at + 2000, end)])
+            if self.rate:
+                time.sleep(2000 / self.rate)
+
+    def cors(self):
+        self.send_header("Content-Type", self.kind)
+        self.send_header("Access-Control-Allow-Origin", "*")
+        self.end_headers()
+
+    def log_message(self, *args):
+        pass
+
+
+class Static(http.server.SimpleHTTPRequestHandler):
+    """What a static host with CORS does; it ignores ranges."""
+
+    def end_headers(self):
+        self.send_header("Access-Control-Allow-Origin", "*")
+        super().end_headers()
+
+    def log_message(self, *args):
+        pass
+
+
+PLAYER = "document.querySelector('gsv-player')"
+
+
+def part(selector: str) -> str:
+    return f"{PLAYER}.shadowRoot.querySelector({json.dumps(selector)})"
+
+
+def load(browser, url, **options) -> None:
+    """Opens the page and waits for the first picture."""
+    query = "&".join(f"{k}={v}" for k, v in options.items())
+    browser.goto(f"{url}?{query}" if query else url)
+    browser.wait(f"{PLAYER}.camera && {PLAYER}.stats.gaussians > 0")
+
+
+def canvas(browser) -> np.ndarray:
+    """[H, W, 3] u8: what is on the canvas."""
+    script = f"""(() => {{
+        const c = {part("canvas")};
+        const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+        let s = ""; for (let i = 0; i < d.length; i += 8192) s += String.fromCharCode(...d.subarray(i, i + 8192));
+        return [c.width, c.height, btoa(s)];
+    }})()"""
+    w, h, data = browser.eval(script)
+    return np.frombuffer(base64.b64decode(data), np.uint8).reshape(h, w, 4)[..., :3]
+
+
+def camera_of(view: list[float]) -> Camera:
+    w, h, fx, fy, cx, cy, *m = view
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return Camera("view", K, np.array([*m, 0, 0, 0, 1.0]).reshape(4, 4), int(w), int(h))
+
+
+def show(browser, t: int) -> Camera:
+    """Stops at frame `t`; the camera it is seen with."""
+    return camera_of(browser.eval(f"{PLAYER}.show({t}).then((d) => Array.from(d.view))"))
+
+
+def psnr(a, b) -> float:
+    return 10 * np.log10(255**2 / max(np.mean((a.astype(float) - b) ** 2), 1e-9))
+
+
+def notes(browser) -> str:
+    return browser.eval(f"{part('.notes')}.innerText")
+
+
+def error_text(browser) -> str:
+    return browser.wait(f"!{part('.error')}.hidden && {part('.error')}.innerText")

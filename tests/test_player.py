@@ -1,0 +1,206 @@
+"""The player's page in a real Chromium: its picture, its controls, its decoder against the native one."""
+
+import base64
+import json
+from pathlib import Path
+
+import numpy as np
+from playing import GROUPS, LENGTH, PLAYER, canvas, load, part, psnr, show
+
+from gscodec.decode import open_stream
+from gscodec.render.image import render_image
+
+VECTORS = Path(__file__).parent.parent / "spec" / "vectors" / "valid"
+
+
+def test_the_picture_is_that_of_the_renderer(browser, server, gsv):
+    load(browser, server.url, size="320x200", autoplay="off")
+    stream = open_stream(gsv)
+    background = tuple(stream.config["background"])
+    for t in (0, LENGTH + 5, 3 * LENGTH + 1):  # with lifetimes and without
+        camera = show(browser, t)
+        assert (camera.width, camera.height) == (320, 200)
+        want = render_image(stream.frame(t), camera, background)
+        got = canvas(browser)
+        assert want.std() > 10
+        assert psnr(got, want) >= 35
+        assert np.abs(got.astype(int) - want).max() <= 2
+    assert browser.errors == []
+
+
+def test_reference_cameras(browser, server, gsv):
+    load(browser, server.url, size="256x192", autoplay="off")
+    options = browser.eval(f"[...{part('[data-set=view]')}.options].map((o) => o.text)")
+    assert options == ["Free view", "cam0", "cam1"]
+    browser.eval(f"{PLAYER}.camera.use(1)")
+    show(browser, 2)
+    stream = open_stream(gsv)
+    want = render_image(stream.frame(2), stream.cameras[1], tuple(stream.config["background"]))
+    assert psnr(canvas(browser), want) >= 35
+    before = browser.eval(f"Array.from({PLAYER}.camera.view(256, 192))")
+    browser.eval(f"{PLAYER}.camera.orbit(0, 0)")  # a drag goes on from there
+    after = browser.eval(f"Array.from({PLAYER}.camera.view(256, 192))")
+    np.testing.assert_allclose(np.array(after)[6:], np.array(before)[6:], atol=2e-3)
+
+
+def test_it_plays_loops_and_ends(browser, server):
+    load(browser, server.url, size="160x120")
+    browser.wait(f"{PLAYER}.frame > {LENGTH + 2}")
+    browser.wait(f"{PLAYER}.frame < {LENGTH}")  # around
+    assert not browser.eval(f"{PLAYER}.paused")
+    browser.eval(f"{PLAYER}.removeAttribute('loop')")
+    browser.wait(f"{PLAYER}.paused")
+    assert browser.eval(f"{PLAYER}.frame") == GROUPS * LENGTH - 1
+    browser.eval(f"{PLAYER}.play()")
+    browser.wait(f"{PLAYER}.frame < 5")
+    assert browser.errors == []
+
+
+def test_keys_and_buttons(browser, server):
+    load(browser, server.url, size="160x120", autoplay="off")
+    browser.eval(f"{part('.stage')}.focus()")
+    frame = lambda: browser.eval(f"{PLAYER}.frame")  # noqa: E731
+    show(browser, 7)
+    browser.key("ArrowRight")
+    assert frame() == 8
+    browser.key("ArrowLeft")
+    browser.key("ArrowLeft")
+    assert frame() == 6
+    browser.key("End")
+    assert frame() == GROUPS * LENGTH - 1
+    browser.key("Home")
+    assert frame() == 0
+    browser.key(" ")
+    assert not browser.eval(f"{PLAYER}.paused")
+    browser.key(" ")
+    assert browser.eval(f"{PLAYER}.paused")
+    looping = browser.eval(f"{PLAYER}.loop")
+    browser.key("l")
+    assert browser.eval(f"{PLAYER}.loop") != looping
+    browser.key("s")
+    assert "Gaussians" in browser.wait(f"{part('.stats')}.textContent")
+    browser.eval(f"{part('[data-do=play]')}.click()")
+    assert not browser.eval(f"{PLAYER}.paused")
+    speed = part("[data-set=speed]")
+    browser.eval(f"{speed}.value = '2'; {speed}.dispatchEvent(new Event('change', {{bubbles: true}}))")
+    assert browser.eval(f"{PLAYER}.speed") == 2
+
+
+def test_drags_turn_move_and_zoom(browser, server):
+    load(browser, server.url, autoplay="off")
+    view = lambda: browser.eval(f"Array.from({PLAYER}.camera.view(100, 100)).slice(6)")  # noqa: E731
+    start = view()
+    browser.drag((600, 300), (700, 340))
+    turned = view()
+    assert np.abs(np.subtract(turned, start)).max() > 0.1
+    browser.drag((600, 300), (700, 340), "right")
+    panned = np.array(view()).reshape(3, 4)
+    np.testing.assert_allclose(panned[:, :3], np.array(turned).reshape(3, 4)[:, :3], atol=1e-6)
+    assert abs(panned[0, 3] - turned[3]) > 0.1
+    depth = panned[2, 3]
+    browser.wheel(600, 300, -300)
+    browser.wait(f"{PLAYER}.camera.view(9, 9)[17] < {depth - 0.1}")
+    browser.eval(f"{part('[data-do=reset]')}.click()")
+    np.testing.assert_allclose(view(), start, atol=1e-6)
+
+
+def test_scrubbing_shows_the_frame(browser, server, gsv):
+    load(browser, server.url, size="160x120", autoplay="off")
+    stream = open_stream(gsv)
+    r = np.random.default_rng(1)
+    for t in r.integers(0, GROUPS * LENGTH, 8).tolist():
+        want = render_image(stream.frame(t), show(browser, t), tuple(stream.config["background"]))
+        assert psnr(canvas(browser), want) >= 35, t
+    bar = part(".seek input")
+    browser.eval(f"{bar}.value = 20; {bar}.dispatchEvent(new Event('input', {{bubbles: true}}))")
+    assert browser.eval(f"{PLAYER}.frame") == 20
+
+
+def test_a_phone(browser, server, tmp_path):
+    try:
+        browser.resize(390, 844, mobile=True, scale=2)
+        load(browser, server.url)
+        assert browser.eval("document.documentElement.scrollWidth") <= 390
+        for name in ("play", "loop", "reset", "stats"):
+            box = f"{part(f'[data-do={name}]')}.getBoundingClientRect()"
+            x, y, w, h = browser.eval(f"(({{x, y, width, height}}) => [x, y, width, height])({box})")
+            assert x >= 0
+            assert x + w <= 390
+            assert y + h <= 844
+            assert min(w, h) >= 36
+        browser.screenshot(tmp_path / "phone.png")
+    finally:
+        browser.resize(1280, 800)
+
+
+# The module itself, without the page
+
+INSTANCE = """
+const { Native, load } = await import("/native.js");
+const native = await Native.create(await load(new URL("/native.wasm", location.href)));
+const file = new Uint8Array(await (await fetch(SRC)).arrayBuffer());
+native.push(file);
+const { config, groups } = native.describe();
+const payload = (g) => file.slice(g.offset, g.offset + g.size);
+const base64 = (bytes) => {
+    let s = "";
+    for (let i = 0; i < bytes.length; i += 8192) s += String.fromCharCode(...bytes.subarray(i, i + 8192));
+    return btoa(s);
+};
+"""
+
+
+def run_wasm(browser, src: str, body: str):
+    """Value that `body` returns, with `native`, `config`, `groups` and `payload` of the file at `src`."""
+    return browser.eval(f"(async () => {{ {INSTANCE.replace('SRC', json.dumps(src))} {body} }})()")
+
+
+def test_every_vector_decodes_to_the_frames_of_the_native_decoder(browser, server, other):
+    browser.goto(server.url + "?src=none.gsv")
+    body = """
+        const out = [];
+        for (const g of groups) {
+            native.decode(0, payload(g), config.level);
+            native.frame(0, g.frames >> 1);
+            for (let a = 0; a < 6; a++) { native.x.attribute(a); out.push(base64(native.output())); }
+        }
+        return [out, native.describe()];
+    """
+    paths = sorted(VECTORS.glob("*.gsv"))
+    assert len(paths) > 20
+    for path in paths:
+        url, _ = other(path.read_bytes())
+        values, described = run_wasm(browser, url, body)
+        stream = open_stream(path)
+        assert [g["size"] for g in described["groups"]] == [g["size"] for g in stream.groups], path.name
+        assert described["config"]["level"] == stream.config["level"]
+        assert described["complete"] == stream.complete, path.name
+        values = iter(values)
+        for i, g in enumerate(stream.groups):
+            t = g["frames"] // 2
+            frame, shown = stream.group(i).frame(t), stream.group(i).visible(t)
+            for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN"):
+                got = np.frombuffer(base64.b64decode(next(values)), np.float32).reshape(frame[name].shape)
+                if name == "logit_opacities" and shown is not None:
+                    assert (np.isneginf(got) == ~shown).all()
+                    got = np.where(shown, got, frame[name])
+                np.testing.assert_allclose(got, frame[name], rtol=1e-5, atol=1e-5, err_msg=f"{path.name} {name}")
+
+
+def test_simd_draws_what_scalar_draws(browser, server):
+    browser.goto(server.url + "?src=none.gsv")
+    body = """
+        native.decode(0, payload(groups[1]), config.level);
+        native.frame(0, 1);
+        const view = new Float32Array([200, 150, 240, 240, 100, 75, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 3]);
+        const pictures = [];
+        for (let level = 0; native.x.use_level(level); level++) {
+            let splats;
+            native.project(view, 1, (band) => (splats = band.splats.slice()));
+            pictures.push(base64(native.draw(splats, 200, 150, [0.1, 0.2, 0.3])));
+        }
+        return pictures;
+    """
+    simd, scalar = (np.frombuffer(base64.b64decode(p), np.uint8) for p in run_wasm(browser, "/stream.gsv", body))
+    assert scalar.std() > 10
+    assert np.abs(simd.astype(int) - scalar).max() <= 1
