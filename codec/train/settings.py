@@ -31,11 +31,11 @@ class TrainSettings:
     keyframe_steps: int = 1500
     motion_steps: int = 100
     finetune_steps: int = 80
-    gaussians_max: int = 13000
+    gaussians_max: int = 14000
     initial_points: int = 8000
     ssim_lambda: float = 0.2
     mask_lambda: float = 0.1
-    cut_ratio: float = 2.2
+    cut_ratio: float = 2.0
     rigidity: float = 0.3
     rate_lambda: float = 0.3
     temporal_lambda: float = 0.01
