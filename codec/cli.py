@@ -211,7 +211,7 @@ def evaluate(
 def _warn_if_cut(stream) -> None:
     if not stream.complete:
         print(
-            f"warning: {stream.name} ends inside a group; its {stream.frame_count} whole frames are used",
+            f"warning: {stream.name} is unfinished or cut short; its {stream.frame_count} whole frames are used",
             file=sys.stderr,
         )
 

@@ -40,6 +40,8 @@ def encode_input(
     from gscodec.splats import detect_input
 
     settings = EncodeSettings(quality=quality, keep_all=keep_all)
+    if gop < 1:
+        raise UsageError(f"--gop {gop} is out of range, expected at least 1 frame in a group")
     out = Path(out)
     if out.suffix != ".gsv":
         raise UsageError(f"{out}: the output must be named *.gsv")

@@ -80,7 +80,6 @@ def test_the_studios_commands_name_the_extra(player):
     (player / "capture" / "transforms.json").write_text("{}")
     for args in (
         ("render", "a.gsv", "a.mp4"),
-        ("eval", "a.gsv", "plys"),
         ("encode", "capture", "b.gsv"),
         ("train", "capture", "trained"),
     ):

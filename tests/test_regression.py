@@ -46,5 +46,5 @@ def test_bundled_capture_from_end_to_end(tmp_path):
     assert measured["vmaf"] >= recorded["vmaf"] - 6
     assert measured["haze"] <= recorded["haze"] + 0.5
     worst = min(r["psnr_fg"] for r in measured["per_frame"])
-    assert worst >= measured["psnr_fg"] - 2, "no frame falls behind"
+    assert worst >= recorded["worst_psnr_fg"] - 1.2, "no frame falls behind"
     assert np.isfinite(measured["flicker"])
