@@ -13,7 +13,7 @@ import numpy as np
 
 from gscodec.camera import Camera
 from gscodec.encode.encode import EncodeReport, EncodeSettings, encode_groups, stream_config
-from gscodec.errors import UsageError
+from gscodec.errors import UsageError, require
 from gscodec.frames import frame_range
 from gscodec.gaussians import GaussianSequence, Group
 from gscodec.progress import Bar
@@ -52,6 +52,7 @@ def encode_input(
 
 
 def _encode_splats(source, out, settings, frames, gop, bar) -> EncodeReport:
+    require("scipy", "encoding")
     sequence = _restrict(_open_splats(source, gop, bar), frames)
     total = sequence.frame_count
     cameras = sequence.cameras
@@ -107,6 +108,7 @@ def _restrict(sequence: GaussianSequence, frames: str | None) -> GaussianSequenc
 
 
 def _encode_capture(source, out, settings, preset, frames, gop, bar) -> EncodeReport:
+    require("torch", "training a capture")
     from gscodec.train.settings import train_settings
     from gscodec.train.train import Checkpoint, train_groups
 
@@ -160,6 +162,7 @@ def train_to_folder(
     source: Path, folder: Path, *, preset: str, frames: str | None, gop: int, quality: float, bar: Bar
 ) -> int:
     """Trains a capture and writes one .ply per frame and sequence.json; returns the number of frames."""
+    require("torch", "training a capture")
     from gscodec.splats import write_sequence
     from gscodec.train.settings import train_settings
     from gscodec.train.train import train_groups

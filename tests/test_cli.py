@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -141,3 +142,12 @@ def test_untracked_frames_are_said_to_be(tmp_path):
     assert "independent" in result.stderr
     groups = json.loads(run("info", tmp_path / "o.gsv", "--json").stdout)["per_group"]
     np.testing.assert_array_equal([g["gaussians"] for g in groups], [40, 47, 54])
+
+
+def test_train_writes_what_encode_takes(tmp_path):
+    """The first half of encode on its own: two frames of the bundled capture, with the smallest budget."""
+    capture = Path(__file__).parent.parent / "examples" / "lumberjack"
+    done = run("train", capture, tmp_path / "plys", "--preset", "fast", "--frames", "0:1")
+    assert done.returncode == 0, done.stderr
+    assert len(list((tmp_path / "plys").glob("*.ply"))) == 1
+    assert run("encode", tmp_path / "plys", tmp_path / "a.gsv").returncode == 0

@@ -81,6 +81,7 @@ def test_the_studios_commands_name_the_extra(player):
     for args in (
         ("render", "a.gsv", "a.mp4"),
         ("encode", "capture", "b.gsv"),
+        ("encode", "plys", "b.gsv"),
         ("train", "capture", "trained"),
     ):
         result = run(player, *args)

@@ -116,8 +116,8 @@ def render_stream(stream, dest: Path, *, camera: str, size: str | None, frames: 
 
 
 def _write_images(pictures, folder: Path, fps: float, frames: range) -> Iterator[int]:
-    folder.mkdir(parents=True, exist_ok=True)
     for done, (t, picture) in enumerate(zip(frames, pictures, strict=True), 1):
+        folder.mkdir(parents=True, exist_ok=True)  # not before there is something to put in it
         write_png(folder / f"{t:06d}.png", picture)
         yield done
 
