@@ -23,7 +23,8 @@ demo: venv
 	$(BIN)/gscodec eval $(DEMO)/lumberjack.gsv examples/lumberjack
 	$(BIN)/gscodec render $(DEMO)/lumberjack.gsv $(DEMO)/preview.mp4
 	@echo
-	@echo "The stream is $(DEMO)/lumberjack.gsv; watch $(DEMO)/preview.mp4. To go on:"
+	@echo "The stream is $(DEMO)/lumberjack.gsv, a preview $(DEMO)/preview.mp4. To play and to go on:"
+	@echo "  $(BIN)/gscodec play $(DEMO)/lumberjack.gsv                           in the browser"
 	@echo "  $(BIN)/gscodec play $(DEMO)/lumberjack.gsv                           in the browser, from any side"
 	@echo "  $(BIN)/gscodec info $(DEMO)/lumberjack.gsv                           what is in it"
 	@echo "  $(BIN)/gscodec render $(DEMO)/lumberjack.gsv out.mp4 --camera cam20  another view of it"
