@@ -1,5 +1,6 @@
 """The server of `gscodec play` and its ranges; the files that `make player` builds."""
 
+import contextlib
 import http.client
 import importlib.util
 import signal
@@ -151,10 +152,22 @@ def test_a_viewer_that_leaves_does_no_harm(server, gsv):
     assert ask(server)[0] == 200
 
 
+@contextlib.contextmanager
+def started(command):
+    """A process that takes Ctrl-C also where the tests run in the background, and that never outlives them."""
+    listen = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731
+    p = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=listen)
+    try:
+        yield p
+    finally:
+        p.kill()
+        p.communicate()
+
+
 def test_the_command_prints_the_address_and_ends_with_ctrl_c(gsv):
     code = "from gscodec.cli import main; main()"
     command = [sys.executable, "-c", code, "play", str(gsv), "--no-browser"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as p:
+    with started(command) as p:
         line = p.stdout.readline()
         address = line.split("http://")[1].split("/")[0]
         c = http.client.HTTPConnection(address, timeout=10)
