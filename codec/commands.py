@@ -45,8 +45,9 @@ def encode_input(
     out = Path(out)
     if out.suffix != ".gsv":
         raise UsageError(f"{out}: the output must be named *.gsv")
+    kind = detect_input(source)
     out.parent.mkdir(parents=True, exist_ok=True)
-    if detect_input(source) == "splats":
+    if kind == "splats":
         return _encode_splats(source, out, settings, frames, gop, bar)
     return _encode_capture(source, out, settings, preset, frames, gop, bar)
 
@@ -102,7 +103,7 @@ def _restrict(sequence: GaussianSequence, frames: str | None) -> GaussianSequenc
             life = g.lifetimes
             if life is not None:
                 life = np.clip(life - a, 0, b - a)
-            groups.append(Group([g.frames[t] for t in range(a, b)], life))
+            groups.append(Group(g.frames[a:b], life))
         start += len(g)
     return sequence.with_groups(groups)
 
@@ -163,16 +164,16 @@ def train_to_folder(
 ) -> int:
     """Trains a capture and writes one .ply per frame and sequence.json; returns the number of frames."""
     require("torch", "training a capture")
-    from gscodec.splats import write_sequence
+    from gscodec.splats import SequenceWriter
     from gscodec.train.settings import train_settings
     from gscodec.train.train import train_groups
 
     capture = _open_capture(source, frames)
     recipe = train_settings(preset, gop=gop, quality=quality)
-    groups = train_groups(capture, recipe, on_progress=lambda p: bar.update(p.stage, p.done, p.total))
-    sequence = GaussianSequence(capture.fps, list(groups), capture.cameras)
-    write_sequence(sequence, folder)
-    return sequence.frame_count
+    writer = SequenceWriter(folder, capture.fps, capture.cameras)
+    for group in train_groups(capture, recipe, on_progress=lambda p: bar.update(p.stage, p.done, p.total)):
+        writer.add(group)
+    return writer.frame_count
 
 
 def evaluate_stream(stream_path: Path, source: Path, *, split: str, frames: str | None, bar: Bar) -> dict:
