@@ -14,7 +14,7 @@ $(VENV)/.done: pyproject.toml $(NATIVE)
 	@command -v cargo >/dev/null || { echo "error: cargo was not found; install a Rust toolchain (rustup.rs) and run make again"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable '.[encode,charts,dev]'
+	$(BIN)/python -m pip install --quiet --editable '.[encode,charts,bench,dev]'
 	@touch $@
 
 demo: venv

@@ -238,6 +238,35 @@ def bench_raster(
         print(json.dumps(entries, indent=1))
 
 
+@bench.command("rd")
+def bench_rd(
+    codec: Annotated[str | None, typer.Option(help="Comma-separated codecs, gscodec is ours.")] = None,
+    sequence: Annotated[str | None, typer.Option(help="Comma-separated sequences.")] = None,
+    data: Annotated[Path | None, typer.Option(envvar="GSCODEC_DATA", help="Folder with captures and splats.")] = None,
+    work: Annotated[Path, typer.Option(help="Where sequences are made and kept.")] = Path("build/bench"),
+    out: Annotated[Path, typer.Option(help="The result file; its other entries stay.")] = Path("bench/results/rd.json"),
+    as_json: Json = False,
+) -> None:
+    """Size against quality of gscodec and its peers, with BD-rates."""
+    from gscodec.commands import bench_rd as measure
+
+    entries = []
+    for e in measure(codec, sequence, data=data, work=work, out=out):
+        entries.append(e)
+        if not as_json:
+            _out.print(
+                f"{e['sequence']:<11}{e['codec']:<12}{e['setting']:<12}{e['kb_per_frame']:9.2f} kB/frame  "
+                f"{e['codec_psnr']:6.2f} dB  encode {e['encode_s_per_frame']:7.3f} s  "
+                f"decode {e['decode_ms_per_frame']:7.1f} ms a frame"
+            )
+    if as_json:
+        print(json.dumps(entries, indent=1))
+        return
+    for r in json.loads(out.read_text())["bd_rate"] if out.exists() else []:
+        span = "{:.1f} to {:.1f} dB".format(*r["psnr"])
+        _out.print(f"{r['sequence']:<11}BD-rate against {r['anchor']:<12}{r['percent']:7.1f} %, {span}")
+
+
 @app.command()
 def chart(
     results: Annotated[Path, typer.Argument(help="Folder of results.")] = Path("bench/results"),

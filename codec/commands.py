@@ -233,6 +233,25 @@ def bench_raster(
         write_result(out, {"settings": settings, "entries": entries})
 
 
+def bench_rd(codecs: str | None, sequences: str | None, *, data: Path | None, work: Path, out: Path) -> Iterator[dict]:
+    """Yields what bench.rd measures (the lists are comma-separated, None: all), and puts it into `out` as it comes.
+
+    Raises:
+        UsageError: an unknown codec or sequence, or no data folder.
+    """
+    from gscodec.bench.rd import CODECS, measure, update
+    from gscodec.bench.sequences import SEQUENCES
+
+    if data is None:
+        raise UsageError("bench rd needs the data folder, set --data or GSCODEC_DATA")
+    for sequence in _names("--sequence", sequences, SEQUENCES) or SEQUENCES:
+        for codec in _names("--codec", codecs, CODECS) or CODECS:
+            try:
+                yield from update(out, measure(sequence, codec, data, work))
+            except UsageError as e:
+                print(f"{sequence}, {codec}: left out, {e}", file=sys.stderr)
+
+
 def _names(option: str, text: str | None, known) -> list[str] | None:
     """ "a,b" -> ["a", "b"], all of them known; None stays None."""
     names = text.split(",") if text else None

@@ -23,6 +23,7 @@ from gscodec.metrics import (
     haze,
     psnr,
     psnr_fg,
+    rising,
     ssim,
 )
 from gscodec.metrics import vmaf as vmaf_module
@@ -172,6 +173,18 @@ def test_vmaf_refuses(monkeypatch):
 
 def curve(factor=1.0, shift=0.0):
     return [(factor * 100 * 2**i, 30 + 3 * i + shift) for i in range(5)]
+
+
+def test_bd_rate_of_a_part():
+    test = [(1, 30), *curve(0.5)[1:]]  # far below at first, then half
+    assert bd_rate(curve(), test) < -60
+    assert bd_rate(curve(), test, within=(39, 60)) == pytest.approx(-50)
+    with pytest.raises(UsageError, match="share no range"):
+        bd_rate(curve(), test, within=(43, 45))
+
+
+def test_points_that_others_beat_are_left_out():
+    assert rising([(3, 40), (1, 30), (2, 41), (2, 35), (4, 41)]) == [(1, 30), (2, 41)]
 
 
 def test_bd_rate_of_known_curves():

@@ -1,6 +1,6 @@
 """Quality and rate: images in, figures out, and the evaluations that `gscodec eval` prints."""
 
-from gscodec.metrics.bd_rate import bd_rate
+from gscodec.metrics.bd_rate import bd_rate, rising
 from gscodec.metrics.codec_cameras import codec_cameras
 from gscodec.metrics.evaluate import evaluate_capture, evaluate_splats
 from gscodec.metrics.image import foreground, haze, psnr, psnr_fg, ssim
@@ -18,5 +18,6 @@ __all__ = [
     "haze",
     "psnr",
     "psnr_fg",
+    "rising",
     "ssim",
 ]

@@ -14,11 +14,17 @@ from gscodec.errors import UsageError, require
 POINTS_MIN = 4
 
 
-def bd_rate(anchor: Sequence[tuple[float, float]], test: Sequence[tuple[float, float]]) -> float:
+def bd_rate(
+    anchor: Sequence[tuple[float, float]],
+    test: Sequence[tuple[float, float]],
+    *,
+    within: tuple[float, float] = (-np.inf, np.inf),
+) -> float:
     """Mean difference of rate at equal PSNR.
 
     Args:
         anchor, test: (rate, PSNR) points, any unit of rate, in any order.
+        within: the PSNR that matters; the mean is over what of it both curves reach.
 
     Returns:
         Per cent; negative where `test` needs fewer bits than `anchor`.
@@ -27,13 +33,30 @@ def bd_rate(anchor: Sequence[tuple[float, float]], test: Sequence[tuple[float, f
         UsageError: a curve has fewer than 4 points, is not rising, or the curves share no range of PSNR.
     """
     curves = [_curve("anchor", anchor), _curve("test", test)]
-    low, high = max(c[0][0] for c in curves), min(c[0][-1] for c in curves)
+    low, high = shared_psnr(anchor, test, within)
     if high <= low:
         spans = " and ".join(f"{c[0][0]:.2f} to {c[0][-1]:.2f} dB" for c in curves)
         raise UsageError(f"the curves share no range of PSNR ({spans}); measure points that overlap")
     pchip = require("scipy.interpolate", "BD-rate").PchipInterpolator
     areas = [float(pchip(quality, log_rate).integrate(low, high)) for quality, log_rate in curves]
     return float(np.expm1((areas[1] - areas[0]) / (high - low)) * 100)
+
+
+def shared_psnr(
+    anchor: Sequence[tuple[float, float]], test: Sequence[tuple[float, float]], within: tuple[float, float]
+) -> tuple[float, float]:
+    """Lowest and highest PSNR that two curves both reach, inside `within`."""
+    spans = [within, *((min(q), max(q)) for q in ([p[1] for p in points] for points in (anchor, test)))]
+    return max(s[0] for s in spans), min(s[1] for s in spans)
+
+
+def rising(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The (rate, PSNR) points that no other one beats at its rate or below, in rising order: what `bd_rate` takes."""
+    best: list[tuple[float, float]] = []
+    for rate, quality in sorted(points, key=lambda p: (p[0], -p[1])):
+        if not best or quality > best[-1][1]:
+            best.append((rate, quality))
+    return best
 
 
 def _curve(name: str, points: Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:

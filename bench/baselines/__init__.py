@@ -1,0 +1,53 @@
+"""Peers of gscodec, each in a short file after its public description, with the settings that its users choose.
+
+A baseline turns the frames of one group into named files, everything that decoding needs, and back. Each module has
+SETTINGS (name -> arguments of encode), encode(frames, ...) -> files and decode(files) -> frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+
+from gscodec.bench.baselines import draco, gsav, sog, spz, svt_av1, videogs, x265_anchor, zstd
+from gscodec.bench.baselines.maps import order_of
+from gscodec.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """One codec beside ours.
+
+    Attributes:
+        module: has encode and decode.
+        settings: name of a point of the curve -> arguments of encode.
+        prepare: makes and keeps what does not depend on the setting, from the first frame of a group.
+        per_frame: codes each frame alone, so that it is enough to code the frames that are measured.
+    """
+
+    module: ModuleType
+    settings: dict[str, dict]
+    prepare: Callable[[Gaussians], object] = lambda g: None
+    per_frame: bool = False
+
+    @property
+    def encode(self) -> Callable[..., dict[str, bytes]]:
+        return self.module.encode
+
+    @property
+    def decode(self) -> Callable[[dict[str, bytes]], Sequence[Gaussians]]:
+        return self.module.decode
+
+
+BASELINES = {
+    "videogs": Baseline(videogs, videogs.SETTINGS),
+    "videogs-raw": Baseline(videogs, videogs.RAW_SETTINGS),
+    "x265": Baseline(x265_anchor, x265_anchor.SETTINGS, order_of),
+    "svt-av1": Baseline(svt_av1, svt_av1.SETTINGS, order_of),
+    "gsav": Baseline(gsav, gsav.SETTINGS),
+    "zstd": Baseline(zstd, zstd.SETTINGS),
+    "draco": Baseline(draco, draco.SETTINGS, per_frame=True),
+    "sog": Baseline(sog, sog.SETTINGS, per_frame=True),
+    "spz": Baseline(spz, spz.SETTINGS, per_frame=True),
+}

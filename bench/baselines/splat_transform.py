@@ -1,0 +1,47 @@
+"""PlayCanvas' splat-transform, the reference writer of .sog and .spz: frames in, one file for each out.
+
+Found on the PATH or where the environment variable SPLAT_TRANSFORM says: `npm i -g @playcanvas/splat-transform`. Its
+times contain the start of node and the reading of a .ply.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from gscodec.errors import UsageError
+from gscodec.gaussians import Gaussians
+from gscodec.splats import write_splat
+
+
+def splat_transform() -> str:
+    """The command.
+
+    Raises:
+        UsageError: it is not installed.
+    """
+    found = shutil.which(os.environ.get("SPLAT_TRANSFORM", "splat-transform"))
+    if not found:
+        raise UsageError(
+            "the SOG and SPZ baselines need splat-transform; npm i -g @playcanvas/splat-transform, "
+            "or name it in SPLAT_TRANSFORM"
+        )
+    return found
+
+
+def convert(frames: Sequence[Gaussians], ending: str, *options: str) -> dict[str, bytes]:
+    """Each frame as a file of the format that `ending` names."""
+    command, files = splat_transform(), {}
+    with tempfile.TemporaryDirectory() as folder:
+        for t, frame in enumerate(frames):
+            write_splat(ply := Path(folder, f"{t}.ply"), frame)
+            out = Path(folder, f"{t}{ending}")
+            done = subprocess.run([command, "-q", *options, ply, out], capture_output=True, text=True)
+            if done.returncode:
+                raise UsageError(f"splat-transform failed: {(done.stderr or done.stdout).strip()[-500:]}")
+            files[out.name] = out.read_bytes()
+    return files

@@ -1,0 +1,140 @@
+"""Size, quality and time of gscodec and its peers on the same sequences: bench/results/rd.json, entry by entry.
+
+The size is all that decoding needs, side information and container included; the quality is the codec PSNR of
+`gscodec eval` on every fifth frame; times are of one run on frames in memory, encoding without training and decoding
+to float attributes. A peer's order of Gaussians is made once for its whole curve and not timed, in its favour.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+
+from gscodec.bench.baselines import BASELINES
+from gscodec.bench.machine import commit, write_result
+from gscodec.bench.sequences import SINGLE, open_case
+from gscodec.decode import open_stream
+from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
+from gscodec.errors import UsageError
+from gscodec.gaussians import Gaussians, GaussianSequence, Group
+from gscodec.metrics import bd_rate, evaluate_splats, rising
+from gscodec.metrics.bd_rate import shared_psnr
+
+OURS = "gscodec"
+QUALITIES = (20, 30, 40, 50, 60, 70, 80, 90)
+CODECS = (OURS, *BASELINES)
+EVERY = 5  # frames between those whose PSNR is measured
+ANCHORS = {"videogs": (39, 45), "videogs-raw": (39, 45), "x265": (39, 52)}  # and the PSNR over which BD-rate is taken
+VIDEO = ("videogs", "videogs-raw", "x265", "svt-av1", "gsav")  # these pack SH degree 0 and want more than one frame
+
+Groups = list[list[Gaussians]]
+
+
+def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[dict]:
+    """Yields the entries of a codec's curve on one sequence.
+
+    Raises:
+        UsageError: data or a tool is missing.
+    """
+    if sequence_name in SINGLE and codec in VIDEO:
+        return
+    sequence = open_case(sequence_name, data, work)
+    groups = [[group.visible(t) for t in range(len(group))] for group in sequence.groups]
+    picked = list(range(0, sequence.frame_count, EVERY))
+    settings = {f"quality {q}": {"quality": q} for q in QUALITIES} if codec == OURS else BASELINES[codec].settings
+    for name, setting in settings.items():
+        run = _ours if codec == OURS else _baseline(codec)
+        size, frames, encode_s, decode_s, decoded = run(sequence, groups, picked, setting)
+        quality = evaluate_splats(decoded, sequence, picked)["codec_psnr"]
+        yield {
+            "sequence": sequence_name,
+            "codec": codec,
+            "setting": name,
+            "kb_per_frame": round(size / 1000 / frames, 3),
+            "codec_psnr": round(quality, 3),
+            "encode_s_per_frame": round(encode_s / frames, 4),
+            "decode_ms_per_frame": round(1000 * decode_s / frames, 2),
+            "gaussians": len(groups[0][0]),
+            "commit": commit(),
+        }
+
+
+def _ours(sequence: GaussianSequence, groups: Groups, picked: list[int], setting: dict):
+    """(bytes, frames, seconds of encoding, of decoding, frame -> Gaussians)."""
+    first, longest = groups[0][0], max(map(len, groups))
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder, "rd.gsv")
+        config = stream_config(
+            fps=sequence.fps, sh_degree=first.sh_degree, gaussians=max(len(g[0]) for g in groups), frames=longest
+        )
+        start = time.perf_counter()
+        inputs = lambda done, _: iter([Group(g) for g in groups[done:]])  # noqa: E731
+        report = encode_groups(inputs, out, config, EncodeSettings(**setting), fingerprint={})
+        middle = time.perf_counter()
+        stream = open_stream(out)
+        decoded = [stream.frame(t) for t in range(stream.frame_count)]
+        end = time.perf_counter()
+    return report.bytes, len(decoded), middle - start, end - middle, decoded.__getitem__
+
+
+def _baseline(codec: str) -> Callable:
+    baseline = BASELINES[codec]
+
+    def run(_: GaussianSequence, groups: Groups, picked: list[int], setting: dict):
+        frames = [frame for group in groups for frame in group]
+        if baseline.per_frame:
+            groups = [[frames[t]] for t in picked]
+        for group in groups:
+            baseline.prepare(group[0])
+        start = time.perf_counter()
+        coded = [baseline.encode(group, **setting) for group in groups]
+        middle = time.perf_counter()
+        decoded = [frame for files in coded for frame in baseline.decode(files)]
+        end = time.perf_counter()
+        numbers = picked if baseline.per_frame else range(len(frames))
+        by_number = dict(zip(numbers, decoded, strict=True))
+        size = sum(len(data) for files in coded for data in files.values())
+        return size, len(decoded), middle - start, end - middle, by_number.__getitem__
+
+    return run
+
+
+def update(path: Path, entries: Iterable[dict]) -> Iterator[dict]:
+    """Puts entries into a result file as they come, each in the place of an older one of the same setting.
+
+    Yields the entries; the BD-rates are those of the whole file.
+    """
+    stored: list[dict] = json.loads(path.read_text())["entries"] if path.exists() else []
+    for entry in entries:
+        key = lambda e: (e["sequence"], e["codec"], e["setting"])  # noqa: E731
+        stored = sorted([*(e for e in stored if key(e) != key(entry)), entry], key=_place)
+        write_result(path, {"settings": {"psnr_every": EVERY}, "entries": stored, "bd_rate": bd_rates(stored)})
+        yield entry
+
+
+def _place(e: dict) -> tuple:
+    codec = CODECS.index(e["codec"]) if e["codec"] in CODECS else len(CODECS)
+    return e["sequence"], codec, e["kb_per_frame"]
+
+
+def bd_rates(entries: Sequence[dict]) -> list[dict]:
+    """gscodec against each anchor on each sequence, over the PSNR that both reach; those that cannot be had are out."""
+    found = []
+    for name in dict.fromkeys(e["sequence"] for e in entries):
+        curves = {c: rising(_points(entries, name, c)) for c in (OURS, *ANCHORS)}
+        for anchor, within in ANCHORS.items():
+            try:
+                percent = bd_rate(curves[anchor], curves[OURS], within=within)
+            except UsageError:
+                continue
+            span = shared_psnr(curves[anchor], curves[OURS], within)
+            found.append({"sequence": name, "anchor": anchor, "percent": round(percent, 2), "psnr": span})
+    return found
+
+
+def _points(entries: Sequence[dict], sequence: str, codec: str) -> list[tuple[float, float]]:
+    of = [e for e in entries if (e["sequence"], e["codec"]) == (sequence, codec)]
+    return [(e["kb_per_frame"], e["codec_psnr"]) for e in of]

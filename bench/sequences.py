@@ -1,0 +1,64 @@
+"""The sequences and frames that codecs are measured on; made once, then kept in a work folder.
+
+statue: a scanned statue that moves (20 frames, 101,275 Gaussians), by the data folder's tools/animate_splat.py.
+lumberjack: 20 frames of the captured character, trained with the preset fast. statue-0, playbot and fruit are single
+frames of SH degree 0, 2 and 3.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from gscodec.errors import UsageError
+from gscodec.gaussians import GaussianSequence
+from gscodec.splats import open_sequence
+
+FRAMES = 20
+SINGLE = {"statue-0": "statue.ply", "playbot": "playbot.ply", "fruit": "fruit.ply"}
+SEQUENCES = ("statue", "lumberjack", *SINGLE)
+
+
+def open_case(name: str, data: Path, work: Path) -> GaussianSequence:
+    """The sequence `name` of the data folder.
+
+    Raises:
+        UsageError: the name is unknown or its files are missing.
+    """
+    if name in SINGLE:
+        return open_sequence(_there(data / "splats" / SINGLE[name]))
+    makers: dict[str, Callable[[Path, Path], None]] = {"statue": _statue, "lumberjack": _lumberjack}
+    if name not in makers:
+        raise UsageError(f"no sequence {name}, expected one of {', '.join(SEQUENCES)}")
+    folder = work / name
+    if not (done := folder / ".done").exists():
+        makers[name](data, folder)
+        done.touch()
+    return open_sequence(folder)
+
+
+def _there(path: Path) -> Path:
+    if not path.exists():
+        raise UsageError(f"{path} is not there; the data folder (GSCODEC_DATA) must have it")
+    return path
+
+
+def _statue(data: Path, folder: Path) -> None:
+    tool = _there(data.parent / "tools" / "animate_splat.py")
+    source = _there(data / "splats" / "statue.ply")
+    command = [sys.executable, tool, source, folder, "--frames", str(FRAMES)]
+    subprocess.run(command, check=True, stdout=sys.stderr)
+
+
+def _lumberjack(data: Path, folder: Path) -> None:
+    from gscodec.capture import open_capture
+    from gscodec.splats import SequenceWriter
+    from gscodec.train.settings import train_settings
+    from gscodec.train.train import train_groups
+
+    capture = open_capture(_there(data / "lumberjack")).frames(0, FRAMES)
+    writer = SequenceWriter(folder, capture.fps, capture.cameras)
+    for group in train_groups(capture, train_settings("fast")):
+        writer.add(group)
