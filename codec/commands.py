@@ -103,7 +103,7 @@ def _restrict(sequence: GaussianSequence, frames: str | None) -> GaussianSequenc
             life = g.lifetimes
             if life is not None:
                 life = np.clip(life - a, 0, b - a)
-            groups.append(Group(g.frames[a:b], life))
+            groups.append(Group(g.frames[a:b], life, parents=g.parents if groups else None))
         start += len(g)
     return sequence.with_groups(groups)
 

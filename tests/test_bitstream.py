@@ -280,7 +280,7 @@ def test_what_is_not_damaged_decodes():
     decoded = _native.DecodedGroup(bad, 1, strict=False)
     [damage] = decoded.damage()
     assert damage.pop("message").endswith("the unit is damaged")
-    assert damage == {"unit": unit, "type": "trajectories", "attribute": "sh0"}
+    assert damage == {"unit": unit, "type": "trajectories", "layer": 0, "attribute": "sh0"}
     for t in (0, 5):
         frame, want = decoded.frame(t), sound.frame(t)
         np.testing.assert_array_equal(frame["means"], want["means"])

@@ -54,8 +54,8 @@ impl Evaluator {
                 .iter()
                 .map(|v| unit(*v))
                 .collect(),
-            log_scales: dequantized(&group, Attribute::LogScales),
-            logit_opacities: dequantized(&group, Attribute::LogitOpacities),
+            log_scales: shifted(dequantized(&group, Attribute::LogScales), group.correction()[0]),
+            logit_opacities: shifted(dequantized(&group, Attribute::LogitOpacities), group.correction()[1]),
             sh0: colours(dequantized(&group, Attribute::Sh0)),
             sh_n: colours(dequantized(&group, Attribute::ShN)),
         };
@@ -217,6 +217,14 @@ fn dequantized(group: &Group, a: Attribute) -> Vec<f32> {
             .map(|(v, (step, offset))| offset + step * *v as f32)
     })
     .collect()
+}
+
+/// Spec 10.2: makes up for the layers behind that are not there.
+fn shifted(mut values: Vec<f32>, by: f32) -> Vec<f32> {
+    if by != 0.0 {
+        values.iter_mut().for_each(|v| *v += by);
+    }
+    values
 }
 
 fn colours(mut values: Vec<f32>) -> Vec<f32> {

@@ -16,10 +16,12 @@ pub fn describe(d: &Demuxer, first: usize) -> String {
     )
 }
 
-pub fn header(h: &Header) -> String {
+pub fn header(h: &Header, gaussians: usize) -> String {
     format!(
-        r#"{{"frames":{},"gaussians":{},"sh_degree":{}}}"#,
-        h.frames, h.count, h.sh_degree
+        r#"{{"frames":{},"gaussians":{gaussians},"sh_degree":{},"layers":{}}}"#,
+        h.frames,
+        h.sh_degree,
+        h.layers.len()
     )
 }
 
