@@ -67,7 +67,7 @@ def test_nodes_carry_a_rigid_motion():
     positions, means = positions[order], means[:, order]
     to_world = lambda p: p * steps.means - 3.0  # noqa: E731
     motion = choose_nodes(positions, to_world(positions), means, steps, to_world)
-    assert len(motion.positions) == 1, "a rigid body needs one node"
+    assert len(motion.nodes.positions) == 1, "a rigid body needs one node"
     moved = np.abs(means - means[4]).max()
     left = np.abs(means - motion.carried).max()
     assert left < 3 * steps.means < 0.1 * moved

@@ -16,7 +16,7 @@ from gscodec.bitstream.color import STEP_WEIGHTS, decorrelate
 from gscodec.bitstream.quantization import Steps, steps_for, subject_radius, trajectory_step
 from gscodec.bitstream.transform import dct_basis
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply
-from gscodec.encode.motion import NodeMotion, choose_nodes, quantize_trajectory, trim
+from gscodec.encode.motion import NEIGHBORS, NodeMotion, choose_nodes, quantize_trajectory, trim
 from gscodec.gaussians import Group
 
 GRID_BITS_MAX = 21
@@ -57,9 +57,9 @@ def stack_group(group: Group) -> Stack:
 
 def visible_enough(s: Stack) -> np.ndarray:
     """[N] bool: false for Gaussians that are never drawn, and for the least that together hold `PRUNE_SHARE`."""
-    opacity = 1 / (1 + np.exp(-s.logit_opacities.astype(np.float64)))
-    scales = np.sort(s.log_scales, axis=2).astype(np.float64)
-    importance = (opacity * np.exp(scales[..., 1] + scales[..., 2])).max(0)
+    opacity = 1 / (1 + np.exp(-s.logit_opacities))
+    largest_two = s.log_scales.sum(2) - s.log_scales.min(2)
+    importance = (opacity * np.exp(largest_two)).max(0).astype(np.float64)
     order = importance.argsort()
     spent = np.cumsum(importance[order])
     keep = np.empty(len(order), bool)
@@ -70,11 +70,11 @@ def visible_enough(s: Stack) -> np.ndarray:
 def align_axes(s: Stack, middle: int) -> Stack:
     """Every Gaussian in the form of `canonical_axes`, the same choice in all frames, quaternions continuous in time."""
     turn, order = canonical_axes(s.quats[middle], s.log_scales[middle])
-    quats = quat_multiply(s.quats.astype(np.float64), turn[None])
+    quats = quat_multiply(s.quats, turn[None].astype(np.float32))
     quats[middle] *= np.where(quats[middle, :, :1] < 0, -1, 1)
     for t in [*range(middle + 1, len(quats)), *range(middle - 1, -1, -1)]:
         before = quats[t - 1] if t > middle else quats[t + 1]
-        quats[t] *= np.where((quats[t] * before).sum(1, keepdims=True) < 0, -1, 1)
+        quats[t] *= np.where(np.einsum("nc,nc->n", quats[t], before) < 0, -1, 1).astype(np.float32)[:, None]
     scales = np.take_along_axis(s.log_scales, order[None], 2)
     return Stack(s.means, quats, scales, s.logit_opacities, s.sh0, s.shN, s.lifetimes)
 
@@ -123,11 +123,11 @@ class Grid:
 
 
 def _appearance(s: Stack) -> dict[str, np.ndarray]:
-    """[T, N, C] of each attribute that only adds up over time."""
+    """[T, N, C] f32 of each attribute that only adds up over time."""
     frames, n, k, _ = s.shN.shape
     arrays = {
-        "log_scales": s.log_scales.astype(np.float64),
-        "logit_opacities": s.logit_opacities.astype(np.float64)[..., None],
+        "log_scales": s.log_scales,
+        "logit_opacities": s.logit_opacities[..., None],
         "sh0": decorrelate(s.sh0),
     }
     if k:
@@ -136,10 +136,11 @@ def _appearance(s: Stack) -> dict[str, np.ndarray]:
 
 
 def _rotation_residual(quats: np.ndarray, canonical: np.ndarray, motion: NodeMotion | None) -> np.ndarray:
-    """[T, N, 3] vector part of what is left after nodes and canonical: dq = q(t) (q_blend(t) q_canonical)^-1."""
-    carried = canonical[None] if motion is None else quat_multiply(motion.turned, canonical[None])
-    dq = quat_multiply(quats, quat_conjugate(np.broadcast_to(carried, quats.shape)))
-    return dq[..., 1:] * np.where(dq[..., :1] < 0, -1, 1)
+    """[T, N, 3] f32, vector part of what is left after nodes and canonical: dq = q(t) (q_blend(t) q_canonical)^-1."""
+    dq = quat_multiply(quats, quat_conjugate(canonical[None].astype(np.float32)))
+    if motion is not None:
+        dq = quat_multiply(dq, quat_conjugate(motion.turned))
+    return np.copysign(1, dq[..., :1]) * dq[..., 1:]
 
 
 def _trajectories(s: Stack, channels: dict, steps: Steps, x: np.ndarray, motion: NodeMotion | None) -> dict:
@@ -148,11 +149,11 @@ def _trajectories(s: Stack, channels: dict, steps: Steps, x: np.ndarray, motion:
     w = np.sqrt(np.maximum(0, 1 - (canonical_v**2).sum(1, keepdims=True)))
     canonical = np.concatenate([w, canonical_v], 1)
     residual = {
-        "means": s.means - (x[None] if motion is None else motion.carried),
+        "means": s.means - (x[None].astype(np.float32) if motion is None else motion.carried),
         "quats": _rotation_residual(s.quats, canonical, motion),
     }
     for name, values in _appearance(s).items():
-        residual[name] = values - dequantize_channels(channels[name])[None]
+        residual[name] = values - dequantize_channels(channels[name])[None].astype(np.float32)
     out = {}
     for name, values in residual.items():
         size = trajectory_step(channel_steps(name, steps, values.shape[2])[0], len(basis))
@@ -180,7 +181,7 @@ def group_integers(group: Group, quality: float, *, keep_all: bool = False, step
     positions = grid.to_integers(s.means[middle])
     order = _native.morton_order(positions)
     positions, s = positions[order], align_axes(s.take(order), middle)
-    values = {n: v.mean(0) for n, v in _appearance(s).items()}
+    values = {n: v.mean(0, dtype=np.float64) for n, v in _appearance(s).items()}
     values["quats"] = s.quats[middle, :, 1:]
     channels = {n: quantize_channels(v, channel_steps(n, steps, v.shape[1])) for n, v in values.items()}
     channels["quats"] = _inside_unit_ball(channels["quats"])
@@ -198,14 +199,14 @@ def group_integers(group: Group, quality: float, *, keep_all: bool = False, step
     if frames == 1 or len(positions) == 0:
         return out
     x = grid.to_world(positions)
-    motion = choose_nodes(positions, x, s.means.astype(np.float64), steps, grid.to_world)
+    motion = choose_nodes(positions, x, s.means, steps, grid.to_world)
     if motion is not None:
         out["nodes"] = {
-            "positions": motion.positions,
-            "coefficients": motion.coefficients,
-            "rotation_step": motion.rotation_step,
-            "translation_step": steps.node_translation,
-            "neighbors": min(4, len(motion.positions)),
+            "positions": motion.nodes.positions,
+            "coefficients": motion.nodes.coefficients,
+            "rotation_step": motion.nodes.rotation_step,
+            "translation_step": motion.nodes.translation_step,
+            "neighbors": min(NEIGHBORS, len(motion.nodes.positions)),
         }
     out["trajectories"] = _trajectories(s, channels, steps, x, motion)
     return out
