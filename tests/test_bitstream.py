@@ -390,7 +390,7 @@ def make_file(frames=(20, 1, 7)):
     parts, index, start = [], [], 0
     for number, n in enumerate(frames, 1):
         parts.append(_native.fragment(payload, number, start, n, number != 2, CONFIG))
-        index.append((len(parts[-1]), n, number != 2))
+        index.append((len(parts[-1]), n, number != 2, []))
         start += n
     return _native.finish(init, index) + b"".join(parts), payload
 

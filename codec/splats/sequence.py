@@ -155,14 +155,14 @@ def open_sequence(
     frames = Frames(paths, orders)
     groups = []
     for start, stop in pairwise([*cuts, len(paths)]):
-        same = np.arange(sizes[start], dtype=np.int32) if stop - start > gop else None
+        same = np.arange(sizes[start][0], dtype=np.int32) if stop - start > gop else None
         spans = [frames[a : min(a + gop, stop)] for a in range(start, stop, gop)]
         groups += [Group(f, parents=same if k else None) for k, f in enumerate(spans)]
     return SplatSequence(fps or FPS, groups, mode=mode, names=[p.name for p in paths])
 
 
 def _tracks(
-    paths: list[Path], sizes: list[int], progress: Callable | None
+    paths: list[Path], sizes: list[tuple], progress: Callable | None
 ) -> tuple[dict[int, np.ndarray], list[int], str]:
     """Order of each frame that needs one, the frames at which tracks begin, and the mode."""
     orders: dict[int, np.ndarray] = {}

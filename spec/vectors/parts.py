@@ -208,7 +208,8 @@ def make_file(payloads, *, finish=True, **config):
         fragments.append(bytes(_native.fragment(payload, number, start, frames, sync, config)))
         start += frames
     if finish:
-        init = bytes(_native.finish(init, [(len(f), n, s) for f, (_, n, s) in zip(fragments, payloads, strict=True)]))
+        index = [(len(f), n, s, []) for f, (_, n, s) in zip(fragments, payloads, strict=True)]
+        init = bytes(_native.finish(init, index))
     return init + b"".join(fragments)
 
 

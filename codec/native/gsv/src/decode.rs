@@ -62,10 +62,11 @@ pub fn decode_group(payload: &[u8], how: &Decoding) -> Result<Group> {
 }
 
 /// Decodes what is not damaged: damaged trajectories are none, damaged channels 0, damaged node units no nodes or no motion
-/// of theirs, damaged lifetimes leave all Gaussians shown, and layers whose points are damaged have no Gaussians.
+/// of theirs, damaged lifetimes leave all Gaussians shown, damaged deaths all alive, and damaged positions leave a layer without
+/// the Gaussians that it codes.
 ///
 /// # Errors
-/// As `decode_group`, for damage only if it is in the header or in the points of the first layer.
+/// As `decode_group`, for damage only if it is in the header, or in an independent group in the positions of the first layer.
 pub fn decode_damaged(payload: &[u8], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
     how.level.cap("group", "bytes", payload.len() as u64, how.level.bytes)?;
     decode(&unit::scan(payload, how.layers)?, how)
@@ -140,6 +141,8 @@ fn decode(units: &[Unit], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
 /// Points of a layer, before anything else of it is decoded.
 struct LayerPoints {
     header: LayerHeader,
+    /// As many as the header tells: the layer, and that of the reference, are not damaged.
+    whole: bool,
     /// Indices in the reference.
     survivors: Vec<u32>,
     positions: Vec<[u32; 3]>,
@@ -254,21 +257,21 @@ impl GroupDecoder<'_> {
         Ok(codes.into_iter().map(morton::decode).collect())
     }
 
-    /// Survivors, then births. No Gaussians where deaths or positions of births are damaged, in the reference too.
+    /// Survivors, then births. Where their positions are damaged there are no births, where deaths are nobody dies.
     fn points_of_layer(&self, k: usize) -> Result<LayerPoints> {
-        let header = self.header.layers.get(k).copied().unwrap_or_default();
-        let births = self.points(UnitType::Positions, k as u8, header.births)?;
+        let told = self.header.layers.get(k).copied().unwrap_or_default();
+        let births = self.points(UnitType::Positions, k as u8, told.births)?;
         let survivors = self.survivors(k)?;
-        let whole = births.len() == header.births as usize && survivors.len() == header.survivors() as usize;
-        let (header, births, survivors) = if whole {
-            (header, births, survivors)
-        } else {
-            Default::default()
-        };
         let known = |i: &u32| self.reference.and_then(|r| r.positions.get(*i as usize)).copied();
         let mut positions: Vec<_> = survivors.iter().filter_map(known).collect();
+        let births_count = births.len() as u32;
         append(&mut positions, births);
+        let header = LayerHeader {
+            count: positions.len() as u32,
+            births: births_count,
+        };
         Ok(LayerPoints {
+            whole: header == told,
             header,
             contexts: Contexts::new(&positions, survivors.len()),
             survivors,
@@ -283,14 +286,10 @@ impl GroupDecoder<'_> {
         };
         let range = r.range(k..k + 1);
         let all = range.start as u32..range.end as u32;
-        if self.header.candidates(k, Some(&r.header)) == 0 {
+        let unit = inventory::find(self.units, (UnitType::Deaths, k as u8, None)).filter(|_| !range.is_empty());
+        let Some((i, unit)) = unit.and_then(|i| Some((i, self.units.get(i)?))) else {
             return Ok(all.collect());
-        }
-        let Some(i) = inventory::find(self.units, (UnitType::Deaths, k as u8, None)).filter(|_| !range.is_empty())
-        else {
-            return Ok(Vec::new());
         };
-        let unit = &self.units[i];
         let mut c = Decoder::new(unit.payload);
         let mut dead = vec![false; range.len()];
         let sound = deaths::code(&mut c, &neighbors::nearest(&r.positions[range]), &mut dead);
@@ -311,12 +310,13 @@ impl GroupDecoder<'_> {
         };
         let mut c = Decoder::new(unit.payload);
         let (part, sound) = match (unit.kind, unit.attribute) {
-            (Some(UnitType::Channels), Some(a)) if layer.header.births > 0 || h.reference == 0 => {
+            (Some(UnitType::Channels), Some(a)) => {
                 let (channels, near) = (a.channels(h.sh_degree), layer.contexts.births());
                 let mut values = vec![0; near.len() * channels];
                 let sound = channels::code(&mut c, a, channels, near, &mut values);
                 (Part::Channels(values), sound)
             }
+            (Some(UnitType::Lifetimes | UnitType::Trajectories), _) if !layer.whole => return Ok(None),
             (Some(UnitType::Lifetimes), _) => {
                 let mut l = vec![[0; 2]; layer.positions.len()];
                 let sound = lifetimes::code(&mut c, h.frames, &layer.contexts.all, &mut l);

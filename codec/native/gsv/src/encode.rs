@@ -3,7 +3,7 @@
 use crate::attributes::Attribute;
 use crate::channels;
 use crate::deaths;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::fields::Writer;
 use crate::group::Group;
 use crate::lifetimes;
@@ -33,6 +33,9 @@ struct Pending<'a> {
 pub fn encode_group(group: &Group, reference: Option<&Group>) -> Result<Vec<u8>> {
     group.validate(reference)?;
     let h = &group.header;
+    if group.layers != h.layers {
+        return Err(Error::Input("expected the layers that the header announces".into()));
+    }
     let contexts: Vec<Contexts> = (0..group.layers.len())
         .into_par_iter()
         .map(|k| {

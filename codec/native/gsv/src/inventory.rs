@@ -31,7 +31,7 @@ pub fn find(units: &[Unit], (kind, layer, attribute): Key) -> Option<usize> {
 ///
 /// # Errors
 /// A sound unit that the header does not announce, or without its dependencies; one that is missing although nothing is
-/// damaged; no sound points of the first layer.
+/// damaged; no sound positions of the first layer of an independent group.
 pub fn check(units: &[Unit], header: &Header, reference: Option<&Header>, layers: usize) -> Result<Vec<Damage>> {
     let mut damage: Vec<Damage> = units.iter().enumerate().filter_map(claimed).collect();
     let (mut announced, optional) = announced(header, reference, layers);
@@ -39,7 +39,7 @@ pub fn check(units: &[Unit], header: &Header, reference: Option<&Header>, layers
     let any = !damage.is_empty();
     for &key in announced.iter().filter(|key| find(units, **key).is_none()) {
         let (kind, layer, attribute) = key;
-        let vital = layer == 0 && matches!(kind, UnitType::Positions | UnitType::Deaths);
+        let vital = layer == 0 && kind == UnitType::Positions && header.reference == 0;
         if !any || vital {
             let own = units
                 .iter()

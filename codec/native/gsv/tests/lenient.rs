@@ -8,9 +8,12 @@ use gsv::decode::{Decoding, decode_damaged, decode_group};
 use gsv::encode::encode_group;
 use gsv::error::Error;
 use gsv::evaluate::{Evaluator, Frame};
+use gsv::group::Group;
 use gsv::inventory::Damage;
 use gsv::levels::LEVELS;
-use gsv::unit::{self, ALL_LAYERS, UnitType};
+use gsv::trajectories::Trajectories;
+use gsv::unit::{self, ALL_LAYERS, Unit, UnitType};
+use std::ops::Range;
 
 fn how() -> Decoding<'static> {
     Decoding::at(&LEVELS[0])
@@ -159,6 +162,97 @@ fn broken_rules_stay_errors() {
     unit::write(&mut payload, [7, 0, 2], &[1], b"").unwrap();
     let message = decode_damaged(&payload, &how()).unwrap_err().to_string();
     assert!(message.contains("not yet supported"), "{message}");
+}
+
+/// What a unit holds, as it is in a group; None where the layer is not the same.
+fn content(g: &Group, sound: &Group, u: &Unit) -> Option<Vec<i32>> {
+    let k = usize::from(u.layer);
+    if g.layers.get(k) != sound.layers.get(k) && u.kind != Some(UnitType::Channels) {
+        return None;
+    }
+    let range = g.range(k..k + 1);
+    let births = range.end - g.layers[k].births as usize..range.end;
+    let moving = |t: &Trajectories, range: Range<usize>| range.flat_map(|i| [&[-7], t.get(i)].concat()).collect();
+    Some(match (u.kind?, u.attribute) {
+        (UnitType::Positions, _) => g.positions[births].as_flattened().iter().map(|v| *v as i32).collect(),
+        (UnitType::Channels, Some(a)) => {
+            let c = a.channels(g.header.sh_degree);
+            g.channels_of(a)?[births.start * c..births.end * c].to_vec()
+        }
+        (UnitType::Trajectories, Some(a)) => {
+            let at = g.header.trajectories.iter().position(|t| t.attribute == a)?;
+            moving(&g.trajectories[at], range)
+        }
+        (UnitType::NodeTrajectories, _) => moving(&g.node_trajectories, 0..g.node_positions.len()),
+        (UnitType::NodePositions, _) => g.node_positions.as_flattened().iter().map(|v| *v as i32).collect(),
+        (UnitType::Lifetimes, _) => {
+            let l = g.lifetimes.as_ref()?;
+            l[range].as_flattened().iter().map(|v| i32::from(*v)).collect()
+        }
+        _ => vec![],
+    })
+}
+
+/// Damaged byte by byte: everything stays but the unit and those that name it, and it is said.
+#[test]
+fn a_damaged_byte_costs_its_unit_and_those_that_name_it() {
+    let reference = common::group(&common::layered());
+    let later = common::predicted(&reference, &common::layered());
+    for (sound, before) in [(&small(), None), (&reference, None), (&later, Some(&reference))] {
+        let how = Decoding {
+            reference: before,
+            ..how()
+        };
+        let payload = encode_group(sound, before).unwrap();
+        let units = unit::split(&payload, ALL_LAYERS).unwrap();
+        let mut lost = 0;
+        for at in 0..payload.len() {
+            let mut bad = payload.clone();
+            bad[at] ^= 0x41;
+            let hit = units.iter().rposition(|u| u.offset <= at).unwrap();
+            let Ok((group, damage)) = decode_damaged(&bad, &how) else {
+                lost += 1;
+                let vital = hit == 0 || (units[hit].kind == Some(UnitType::Positions) && units[hit].layer == 0);
+                assert!(vital, "byte {at} of unit {hit}");
+                continue;
+            };
+            group.validate(before).unwrap();
+            assert_eq!(damage[0].unit, Some(hit), "byte {at}");
+            let names = |u: &Unit| u.dependencies.contains(&(hit as u8));
+            for (i, u) in units.iter().enumerate().filter(|(i, u)| *i != hit && !names(u)) {
+                assert_eq!(
+                    content(&group, sound, u),
+                    content(sound, sound, u),
+                    "byte {at} of unit {hit}, unit {i}"
+                );
+            }
+        }
+        assert!(lost < payload.len() / 3);
+    }
+}
+
+/// What a reference has lost is lost in the groups that refer to it, which decode all the same.
+#[test]
+fn damage_of_the_reference_is_that_of_its_followers() {
+    let reference = common::group(&common::layered());
+    let later = common::predicted(&reference, &common::layered());
+    let payload = encode_group(&later, Some(&reference)).unwrap();
+    let sound = encode_group(&reference, None).unwrap();
+    for u in unit::split(&sound, ALL_LAYERS).unwrap().iter().skip(1) {
+        let mut bad = sound.clone();
+        bad[u.payload_offset] ^= 8;
+        if let Ok((reference, damage)) = decode_damaged(&bad, &how()) {
+            assert_eq!(damage[0].kind, u.kind);
+            let how = Decoding {
+                reference: Some(&reference),
+                ..how()
+            };
+            let (group, own) = decode_damaged(&payload, &how).unwrap();
+            assert!(own.is_empty());
+            group.validate(Some(&reference)).unwrap();
+            Evaluator::new(group).frame(1, &mut Frame::default());
+        }
+    }
 }
 
 /// Whatever comes out is a group.
