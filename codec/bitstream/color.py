@@ -11,8 +11,8 @@ STEP_WEIGHTS = 1 / np.linalg.norm(TO_RGB, axis=0)  # [3]
 
 
 def decorrelate(rgb: np.ndarray) -> np.ndarray:
-    """[..., 3] RGB coefficients -> [..., 3] Y, Co, Cg (f64)."""
-    return rgb.astype(np.float64) @ TO_YCOCG.T
+    """[..., 3] RGB coefficients -> [..., 3] Y, Co, Cg, of the same float type."""
+    return (rgb.reshape(-1, 3) @ TO_YCOCG.T.astype(rgb.dtype)).reshape(rgb.shape)
 
 
 def correlate(channels: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from gscodec.bitstream.color import STEP_WEIGHTS, decorrelate
 from gscodec.bitstream.quantization import Steps, steps_for, subject_radius, trajectory_step
 from gscodec.bitstream.transform import dct_basis
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply
-from gscodec.encode.motion import NodeMotion, choose_nodes, quantize_trajectory, trim
+from gscodec.encode.motion import NEIGHBORS, NodeMotion, choose_nodes, quantize_trajectory, trim
 from gscodec.gaussians import Group
 
 GRID_BITS_MAX = 21
@@ -55,26 +55,35 @@ def stack_group(group: Group) -> Stack:
     return Stack(*arrays, life)
 
 
-def visible_enough(s: Stack) -> np.ndarray:
-    """[N] bool: false for Gaussians that are never drawn, and for the least that together hold `PRUNE_SHARE`."""
-    opacity = 1 / (1 + np.exp(-s.logit_opacities.astype(np.float64)))
-    scales = np.sort(s.log_scales, axis=2).astype(np.float64)
-    importance = (opacity * np.exp(scales[..., 1] + scales[..., 2])).max(0)
-    order = importance.argsort()
-    spent = np.cumsum(importance[order])
+def importance(s: Stack) -> np.ndarray:
+    """[N] f64, opacity times the area of the two longest axes, in the frame where it is largest."""
+    opacity = 1 / (1 + np.exp(-s.logit_opacities))
+    largest_two = s.log_scales.sum(2) - s.log_scales.min(2)
+    return (opacity * np.exp(largest_two)).max(0).astype(np.float64)
+
+
+def ever_drawn(s: Stack) -> np.ndarray:
+    """[N] bool: in some frame opaque enough for the renderer."""
+    return 1 / (1 + np.exp(-s.logit_opacities.max(0))) >= ALPHA_MIN
+
+
+def visible_enough(s: Stack, share: float = PRUNE_SHARE) -> np.ndarray:
+    """[N] bool: false for Gaussians that are never drawn, and for the least important that together hold `share`."""
+    weight = importance(s)
+    order = weight.argsort()
+    spent = np.cumsum(weight[order])
     keep = np.empty(len(order), bool)
-    keep[order] = spent > PRUNE_SHARE * spent[-1] if len(order) else True
-    return keep & (opacity.max(0) >= ALPHA_MIN)
+    keep[order] = spent > share * spent[-1] if len(order) else True
+    return keep & ever_drawn(s)
 
 
-def align_axes(s: Stack, middle: int) -> Stack:
-    """Every Gaussian in the form of `canonical_axes`, the same choice in all frames, quaternions continuous in time."""
-    turn, order = canonical_axes(s.quats[middle], s.log_scales[middle])
-    quats = quat_multiply(s.quats.astype(np.float64), turn[None])
+def align_axes(s: Stack, middle: int, turn: np.ndarray, order: np.ndarray) -> Stack:
+    """Every Gaussian in the form that `canonical_axes` chose, in all frames, quaternions continuous in time."""
+    quats = quat_multiply(s.quats, turn[None].astype(np.float32))
     quats[middle] *= np.where(quats[middle, :, :1] < 0, -1, 1)
     for t in [*range(middle + 1, len(quats)), *range(middle - 1, -1, -1)]:
         before = quats[t - 1] if t > middle else quats[t + 1]
-        quats[t] *= np.where((quats[t] * before).sum(1, keepdims=True) < 0, -1, 1)
+        quats[t] *= np.where(np.einsum("nc,nc->n", quats[t], before) < 0, -1, 1).astype(np.float32)[:, None]
     scales = np.take_along_axis(s.log_scales, order[None], 2)
     return Stack(s.means, quats, scales, s.logit_opacities, s.sh0, s.shN, s.lifetimes)
 
@@ -123,11 +132,11 @@ class Grid:
 
 
 def _appearance(s: Stack) -> dict[str, np.ndarray]:
-    """[T, N, C] of each attribute that only adds up over time."""
+    """[T, N, C] f32 of each attribute that only adds up over time."""
     frames, n, k, _ = s.shN.shape
     arrays = {
-        "log_scales": s.log_scales.astype(np.float64),
-        "logit_opacities": s.logit_opacities.astype(np.float64)[..., None],
+        "log_scales": s.log_scales,
+        "logit_opacities": s.logit_opacities[..., None],
         "sh0": decorrelate(s.sh0),
     }
     if k:
@@ -136,10 +145,11 @@ def _appearance(s: Stack) -> dict[str, np.ndarray]:
 
 
 def _rotation_residual(quats: np.ndarray, canonical: np.ndarray, motion: NodeMotion | None) -> np.ndarray:
-    """[T, N, 3] vector part of what is left after nodes and canonical: dq = q(t) (q_blend(t) q_canonical)^-1."""
-    carried = canonical[None] if motion is None else quat_multiply(motion.turned, canonical[None])
-    dq = quat_multiply(quats, quat_conjugate(np.broadcast_to(carried, quats.shape)))
-    return dq[..., 1:] * np.where(dq[..., :1] < 0, -1, 1)
+    """[T, N, 3] f32, vector part of what is left after nodes and canonical: dq = q(t) (q_blend(t) q_canonical)^-1."""
+    dq = quat_multiply(quats, quat_conjugate(canonical[None].astype(np.float32)))
+    if motion is not None:
+        dq = quat_multiply(dq, quat_conjugate(motion.turned))
+    return np.copysign(1, dq[..., :1]) * dq[..., 1:]
 
 
 def _trajectories(s: Stack, channels: dict, steps: Steps, x: np.ndarray, motion: NodeMotion | None) -> dict:
@@ -148,11 +158,11 @@ def _trajectories(s: Stack, channels: dict, steps: Steps, x: np.ndarray, motion:
     w = np.sqrt(np.maximum(0, 1 - (canonical_v**2).sum(1, keepdims=True)))
     canonical = np.concatenate([w, canonical_v], 1)
     residual = {
-        "means": s.means - (x[None] if motion is None else motion.carried),
+        "means": s.means - (x[None].astype(np.float32) if motion is None else motion.carried),
         "quats": _rotation_residual(s.quats, canonical, motion),
     }
     for name, values in _appearance(s).items():
-        residual[name] = values - dequantize_channels(channels[name])[None]
+        residual[name] = values - dequantize_channels(channels[name])[None].astype(np.float32)
     out = {}
     for name, values in residual.items():
         size = trajectory_step(channel_steps(name, steps, values.shape[2])[0], len(basis))
@@ -162,56 +172,105 @@ def _trajectories(s: Stack, channels: dict, steps: Steps, x: np.ndarray, motion:
     return out
 
 
-def group_integers(group: Group, quality: float, *, keep_all: bool = False, steps: Steps | None = None) -> dict:
-    """Integer form of a group, the input of `_native.encode_group`.
+@dataclass(frozen=True)
+class Coded:
+    """A group in integers, with what is needed to predict another from it.
+
+    Attributes:
+        integers: the input of `_native.encode_group`.
+        source: [N] int, index in the group of each Gaussian that is coded, in the order of the integers.
+        turn, order: [N, 4], [N, 3], the form of each (`canonical_axes`).
+    """
+
+    integers: dict
+    source: np.ndarray
+    turn: np.ndarray
+    order: np.ndarray
+    grid: Grid
+    steps: Steps
+
+
+def code_group(
+    group: Group, quality: float, *, keep_all: bool = False, steps: Steps | None = None, layers: int = 1
+) -> Coded:
+    """An independent group in integers.
 
     Args:
         group: T >= 1 frames of N Gaussians.
         quality: 0 to 100.
         keep_all: code every Gaussian, also the invisible ones.
         steps: instead of those that follow from `quality`.
+        layers: number of layers of falling importance, each as large as all before it together.
     """
     s = stack_group(group)
-    if not keep_all and len(s.means[0]):
-        s = s.take(visible_enough(s))
-    frames, middle = len(s.means), len(s.means) // 2
+    kept = np.arange(len(s.means[0]))
+    if not keep_all and len(kept):
+        kept = np.flatnonzero(visible_enough(s))
+        s = s.take(kept)
+    middle = len(s.means) // 2
     steps = steps or steps_for(quality, subject_radius(s.means[middle]))
     grid = Grid(s.means[middle], steps.means)
     positions = grid.to_integers(s.means[middle])
     order = _native.morton_order(positions)
-    positions, s = positions[order], align_axes(s.take(order), middle)
-    values = {n: v.mean(0) for n, v in _appearance(s).items()}
+    layer = layer_of(importance(s)[order], layers)
+    order = order[layer.argsort(kind="stable")]
+    positions, s = positions[order], s.take(order)
+    turn, axes = canonical_axes(s.quats[middle], s.log_scales[middle])
+    s = align_axes(s, middle, turn, axes)
+    values = canonical_appearance(s)
     values["quats"] = s.quats[middle, :, 1:]
     channels = {n: quantize_channels(v, channel_steps(n, steps, v.shape[1])) for n, v in values.items()}
-    channels["quats"] = _inside_unit_ball(channels["quats"])
+    channels["quats"] = inside_unit_ball(channels["quats"])
     out = {
-        "frames": frames,
+        "frames": len(s.means),
         "origin": grid.origin.tolist(),
         "grid_step": grid.step,
         "grid_bits": grid.bits,
+        "layers": np.bincount(layer, minlength=layers).tolist(),
         "positions": positions,
         "channels": channels,
         "trajectories": {},
     }
     if s.lifetimes is not None:
         out["lifetimes"] = s.lifetimes.astype(np.uint16)
-    if frames == 1 or len(positions) == 0:
-        return out
-    x = grid.to_world(positions)
-    motion = choose_nodes(positions, x, s.means.astype(np.float64), steps, grid.to_world)
+    if len(s.means) > 1 and len(positions):
+        x = grid.to_world(positions)
+        out |= motion_integers(s, channels, steps, x, choose_nodes(positions, x, s.means, steps, grid.to_world))
+    return Coded(out, kept[order], turn, axes, grid, steps)
+
+
+def group_integers(group: Group, quality: float, **options) -> dict:
+    """The integers of `code_group`."""
+    return code_group(group, quality, **options).integers
+
+
+def layer_of(weight: np.ndarray, layers: int) -> np.ndarray:
+    """[N] int, layer of each Gaussian of importance `weight` [N]: the most important 1 / 2^(layers - 1) are layer 0."""
+    share = np.empty(len(weight))  # of Gaussians that are more important
+    share[weight.argsort()[::-1]] = np.arange(len(weight)) / max(len(weight), 1)
+    return np.searchsorted(0.5 ** np.arange(layers - 1, 0, -1), share, side="right")
+
+
+def canonical_appearance(s: Stack) -> dict[str, np.ndarray]:
+    """[N, C] f64 of each attribute that only adds up over time: the mean over the frames."""
+    return {n: v.mean(0, dtype=np.float64) for n, v in _appearance(s).items()}
+
+
+def motion_integers(s: Stack, channels: dict, steps: Steps, x: np.ndarray, motion: NodeMotion | None) -> dict:
+    """ "nodes" and "trajectories" of a group with canonical positions x [N, 3] and channels."""
+    out = {"trajectories": _trajectories(s, channels, steps, x, motion)}
     if motion is not None:
         out["nodes"] = {
-            "positions": motion.positions,
-            "coefficients": motion.coefficients,
-            "rotation_step": motion.rotation_step,
-            "translation_step": steps.node_translation,
-            "neighbors": min(4, len(motion.positions)),
+            "positions": motion.nodes.positions,
+            "coefficients": motion.nodes.coefficients,
+            "rotation_step": motion.nodes.rotation_step,
+            "translation_step": motion.nodes.translation_step,
+            "neighbors": min(NEIGHBORS, len(motion.nodes.positions)),
         }
-    out["trajectories"] = _trajectories(s, channels, steps, x, motion)
     return out
 
 
-def _inside_unit_ball(channels: dict) -> dict:
+def inside_unit_ball(channels: dict) -> dict:
     """Rounding may leave the unit ball; pull such vector parts back by one step per component, towards zero."""
     v = dequantize_channels(channels)
     outside = (v**2).sum(1) > 1

@@ -2,8 +2,9 @@
 
 In: decoded canonical positions and the means of all frames. Out: nodes and integer coefficients of their
 trajectories (spec: "Nodes"), as the decoder will blend them. Nodes are sampled farthest-first; each takes the
-weighted Kabsch rotation of the Gaussians it carries, then all translations of a frame are solved together, because
+weighted Kabsch rotation of the Gaussians it carries, then the translations of all frames are solved together, because
 blending is linear in them. As many nodes are taken as still reduce the residual enough to pay for themselves.
+Their number is found on a sample of the Gaussians.
 """
 
 from __future__ import annotations
@@ -20,23 +21,39 @@ NEIGHBORS = 4  # nodes that a Gaussian blends
 NODE_COUNTS = (1, 16, 64, 256, 1024)
 NODE_BITS = 50.0  # what one more node costs in a group of 20 frames, measured on statue
 RIDGE = 1e-3  # pull of a node's translation towards its own Kabsch solution
+SAMPLE = 12000  # Gaussians that tell how many nodes to take
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Quantized nodes.
+
+    Attributes:
+        positions: [M, 3] u32 on the grid, Morton order.
+        places: [M, 3] f64, the same in the world.
+        coefficients: [K, 6, M] i32, rotation vector then translation.
+        rotation_step: radians; translation_step: world units.
+    """
+
+    positions: np.ndarray
+    places: np.ndarray
+    coefficients: np.ndarray
+    rotation_step: float
+    translation_step: float
+
+    def motion(self, frames: int) -> tuple[np.ndarray, np.ndarray]:
+        """Decoded rotation vectors and translations, [T, M, 3] each."""
+        basis = dct_basis(frames)[: len(self.coefficients)]
+        values = np.einsum("kt,kcm->tmc", basis, self.coefficients)
+        return values[..., :3] * self.rotation_step, values[..., 3:] * self.translation_step
 
 
 @dataclass(frozen=True)
 class NodeMotion:
-    """Quantized nodes and what they do to the Gaussians.
+    """Nodes and what they do to the Gaussians: `carried` [T, N, 3] f32, means after blending; `turned` [T, N, 4] f32,
+    blended rotation of each Gaussian, wxyz."""
 
-    Attributes:
-        positions: [M, 3] u32 on the grid, Morton order.
-        coefficients: [K, 6, M] i32, rotation vector then translation.
-        rotation_step: radians.
-        carried: [T, N, 3] f64, means after blending.
-        turned: [T, N, 4] f64, blended rotation of each Gaussian, wxyz.
-    """
-
-    positions: np.ndarray
-    coefficients: np.ndarray
-    rotation_step: float
+    nodes: Nodes
     carried: np.ndarray
     turned: np.ndarray
 
@@ -84,41 +101,43 @@ def matrix_to_rotvec(R: np.ndarray, near: np.ndarray) -> np.ndarray:
 class Blend:
     """Sparse blending of M nodes over N Gaussians, with the decoder's own neighbours and weights."""
 
-    def __init__(self, grid_positions: np.ndarray, node_positions: np.ndarray):
+    def __init__(self, grid_positions: np.ndarray, node_positions: np.ndarray, dtype=np.float64):
         from scipy.sparse import csr_matrix
 
         n, m = len(grid_positions), len(node_positions)
         self.index, self.weights = _native.node_weights(grid_positions, node_positions, NEIGHBORS)
-        self.weights = self.weights.astype(np.float64)
         k = self.index.shape[1]
-        rows = np.repeat(np.arange(n), k)
-        self.matrix = csr_matrix((self.weights.ravel(), (rows, self.index.ravel().astype(np.int64))), (n, m))
-        self.transposed = self.matrix.T.tocsr()
-        self.mass = np.asarray(self.transposed.sum(1)).ravel() + 1e-9
+        starts = np.arange(n + 1, dtype=np.int32) * k
+        parts = (self.weights.ravel().astype(dtype), self.index.ravel().astype(np.int32), starts)
+        self.matrix = csr_matrix(parts, (n, m))
 
     def rotate(self, x: np.ndarray, nodes: np.ndarray, R: np.ndarray) -> np.ndarray:
         """[N, 3], the blend of every node's rotation about itself, without translations."""
         # sum_j w (R_j (x - n_j) + n_j) = (sum_j w R_j) x + sum_j w (n_j - R_j n_j)
         m = len(nodes)
-        RR = (self.matrix @ R.reshape(m, 9)).reshape(-1, 3, 3)
-        offset = self.matrix @ (nodes - np.einsum("mij,mj->mi", R, nodes))
-        return np.einsum("nij,nj->ni", RR, x) + offset
+        offset = nodes - np.einsum("mij,mj->mi", R, nodes)
+        both = self.matrix @ np.concatenate([R.reshape(m, 9), offset], 1).astype(self.matrix.dtype)
+        return (both[:, :9].reshape(-1, 3, 3) @ x[:, :, None])[..., 0] + both[:, 9:]
 
     def turn(self, quats: np.ndarray) -> np.ndarray:
         """[N, 4] normalised blend of the node quaternions [M, 4], signs aligned to the nearest node's."""
-        near = quats[self.index]  # [N, k, 4]
-        sign = np.where((near * near[:, :1]).sum(-1, keepdims=True) < 0, -1, 1)
-        q = (near * sign * self.weights[..., None]).sum(1)
-        return q / np.linalg.norm(q, axis=1, keepdims=True)
+        quats = quats.astype(self.matrix.dtype)
+        if ((quats @ quats.T) >= 0).all():  # the usual case: no node turns far from another
+            q = self.matrix @ quats
+        else:
+            near = quats[self.index]  # [N, k, 4]
+            sign = np.where((near * near[:, :1]).sum(-1, keepdims=True) < 0, -1, 1)
+            q = (near * sign * self.weights[..., None]).sum(1)
+        return q / np.sqrt((q * q).sum(1, keepdims=True))
 
 
-def _fit_frame(blend: Blend, x, nodes, y, near) -> tuple[np.ndarray, np.ndarray]:
+def _fit_frame(blend: Blend, transposed, mass, x, nodes, y, near) -> tuple[np.ndarray, np.ndarray]:
     """Rotation vectors and translations [M, 3] that carry x [N, 3] to y [N, 3]."""
     m = len(nodes)
-    cx = blend.transposed @ x / blend.mass[:, None]
-    cy = blend.transposed @ y / blend.mass[:, None]
-    H = (blend.transposed @ (x[:, :, None] * y[:, None, :]).reshape(-1, 9)).reshape(m, 3, 3)
-    H -= blend.mass[:, None, None] * cx[:, :, None] * cy[:, None, :]
+    cx = transposed @ x / mass[:, None]
+    cy = transposed @ y / mass[:, None]
+    H = (transposed @ (x[:, :, None] * y[:, None, :]).reshape(-1, 9)).reshape(m, 3, 3)
+    H -= mass[:, None, None] * cx[:, :, None] * cy[:, None, :]
     U, S, Vt = np.linalg.svd(H)
     sign = np.ones((m, 3))
     sign[:, 2] = np.sign(np.linalg.det(U @ Vt))
@@ -127,55 +146,73 @@ def _fit_frame(blend: Blend, x, nodes, y, near) -> tuple[np.ndarray, np.ndarray]
     return matrix_to_rotvec(R, near), cy - np.einsum("mij,mj->mi", R, cx - nodes) - nodes
 
 
-def fit_nodes(grid_positions: np.ndarray, x: np.ndarray, means: np.ndarray, count: int, steps: Steps, to_world):
-    """Fits `count` nodes and quantizes them.
+def fit_nodes(grid_positions: np.ndarray, x: np.ndarray, means: np.ndarray, seeds: np.ndarray, steps: Steps, to_world):
+    """Fits a node at each of the grid points `seeds` [M, 3] and quantizes them.
 
     Args:
         grid_positions: [N, 3] u32, canonical integers; x: [N, 3] f64, their world positions.
         means: [T, N, 3] targets.
         to_world: grid integers -> world positions.
+
+    Returns:
+        Nodes and [T, N, 3], where they carry x.
     """
     from scipy.sparse import identity
     from scipy.sparse.linalg import splu
 
-    chosen = np.unique(grid_positions[farthest_points(x, count)], axis=0)
+    chosen = np.unique(seeds, axis=0)
     node_grid = chosen[_native.morton_order(chosen)]
     nodes = to_world(node_grid)
     blend = Blend(grid_positions, node_grid)
+    transposed = blend.matrix.T.tocsr()
+    mass = np.asarray(transposed.sum(1)).ravel() + 1e-9
     frames, m = len(means), len(nodes)
     # An error of one rotation step at the usual distance from a node moves a Gaussian by one translation step.
     lever = np.sqrt(((x - nodes[blend.index[:, 0]]) ** 2).sum(1).mean())
     rotation_step = float(np.float32(min(steps.node_translation / max(lever, 1e-12), 0.1)))
-    ridge = identity(m, format="csc").multiply(RIDGE * blend.mass).tocsc()
-    solve = splu((blend.transposed @ blend.matrix).tocsc() + ridge).solve
     rotations, translations = np.zeros((2, frames, m, 3))
     near = np.zeros((m, 3))
     for t in range(frames):
-        rotations[t], translations[t] = _fit_frame(blend, x, nodes, means[t], near)
+        rotations[t], translations[t] = _fit_frame(blend, transposed, mass, x, nodes, means[t], near)
         near = rotations[t]
     basis = dct_basis(frames)
-    q_rotations = quantize_trajectory(rotations.reshape(frames, -1), basis, rotation_step).reshape(-1, m, 3)
-    rotations = np.einsum("kt,kmc->tmc", basis, q_rotations * rotation_step)
-    carried = np.empty_like(means)
-    for t in range(frames):  # translations make up for the quantized rotations
-        carried[t] = blend.rotate(x, nodes, rotvec_to_matrix(rotations[t]))
-        left = blend.transposed @ (means[t] - carried[t] - blend.matrix @ translations[t])
-        translations[t] += solve(left)
-    q_translations = quantize_trajectory(translations.reshape(frames, -1), basis, steps.node_translation)
-    q_translations = q_translations.reshape(-1, m, 3)
-    translations = np.einsum("kt,kmc->tmc", basis, q_translations * steps.node_translation)
-    turned = np.empty((*means.shape[:2], 4))
-    for t in range(frames):
-        carried[t] += blend.matrix @ translations[t]
-        turned[t] = blend.turn(rotvec_to_quat(rotations[t]))
+    q_rotations = quantize_trajectory(rotations, basis, rotation_step)
+    rotations = np.tensordot(basis.T, q_rotations * rotation_step, 1)
+    rotated = np.stack([blend.rotate(x, nodes, rotvec_to_matrix(r)) for r in rotations])
+    # Translations make up for the quantized rotations: one solution for all frames and axes.
+    flat = lambda a: np.moveaxis(a, 0, 1).reshape(a.shape[1], -1)  # noqa: E731
+    left = flat(means - rotated) - blend.matrix @ flat(translations)
+    ridge = identity(m, format="csc").multiply(RIDGE * mass).tocsc()
+    solved = splu((transposed @ blend.matrix).tocsc() + ridge).solve(transposed @ left)
+    translations += np.moveaxis(solved.reshape(m, frames, 3), 1, 0)
+    q_translations = quantize_trajectory(translations, basis, steps.node_translation)
     coefficients = np.concatenate([q_rotations, q_translations], 2).transpose(0, 2, 1)  # [K, 6, M]
-    return NodeMotion(node_grid, trim(coefficients), rotation_step, carried, turned)
+    fitted = Nodes(node_grid, nodes, trim(coefficients), rotation_step, steps.node_translation)
+    translations = flat(np.tensordot(basis.T, q_translations * steps.node_translation, 1))
+    moved = (blend.matrix @ translations).reshape(-1, frames, 3)
+    return fitted, rotated + np.moveaxis(moved, 1, 0)
+
+
+def carry(nodes: Nodes, grid_positions: np.ndarray, x: np.ndarray, frames: int) -> NodeMotion:
+    """What `nodes` do to all Gaussians: grid positions [N, 3] u32, world positions x [N, 3]."""
+    blend = Blend(grid_positions, nodes.positions, np.float32)
+    x = x.astype(np.float32)
+    carried, turned = np.empty((frames, len(x), 3), np.float32), np.empty((frames, len(x), 4), np.float32)
+    for t, (r, shift) in enumerate(zip(*nodes.motion(frames), strict=True)):
+        # The shift belongs to the offset: both are blended alike.
+        R = rotvec_to_matrix(r)
+        carried[t] = blend.rotate(x, nodes.places, R) + blend.matrix @ shift.astype(np.float32)
+        turned[t] = blend.turn(rotvec_to_quat(r))
+    return NodeMotion(nodes, carried, turned)
 
 
 def quantize_trajectory(values: np.ndarray, basis: np.ndarray, step: float, dead_zone: float = 0.5) -> np.ndarray:
     """[T, ...] floats -> [T, ...] i32 coefficients; |coefficient| < dead_zone * step becomes 0."""
-    c = np.tensordot(basis, values, 1) / step
-    return (np.sign(c) * np.floor(np.maximum(np.abs(c) + 1 - max(dead_zone, 0.5), 0))).astype(np.int32)
+    frames = len(values)
+    c = (basis / step).astype(values.dtype) @ values.reshape(frames, -1)
+    near = np.rint(c)
+    near[np.abs(c) < dead_zone] = 0
+    return near.astype(np.int32).reshape(values.shape)
 
 
 def trim(coefficients: np.ndarray) -> np.ndarray:
@@ -189,21 +226,25 @@ def choose_nodes(grid_positions, x, means, steps: Steps, to_world) -> NodeMotion
 
     The residual that nodes leave costs about log2(1 + error / step) bits a coefficient, a node `NODE_BITS`.
     """
-    best, best_bits = None, _residual_bits(means - x, steps)
-    for count in NODE_COUNTS:
-        if count * 8 > len(x) and count > 1:
-            break
-        motion = fit_nodes(grid_positions, x, means, count, steps, to_world)
-        bits = _residual_bits(means - motion.carried, steps) + NODE_BITS * len(motion.positions)
+    some = slice(None, None, -(-len(x) // SAMPLE))  # in Morton order: evenly over the subject
+    grid_some, x_some, targets = grid_positions[some], x[some], means[:, some].astype(np.float64)
+    counts = [m for m in NODE_COUNTS if m == 1 or 8 * m <= len(x_some)]
+    seeds = grid_some[farthest_points(x_some, counts[-1])]
+    best, best_bits = 0, _residual_bits(targets - x_some, steps)
+    for count in counts:
+        nodes, carried = fit_nodes(grid_some, x_some, targets, seeds[:count], steps, to_world)
+        bits = _residual_bits(targets - carried, steps) + NODE_BITS * len(nodes.positions) * len(x_some) / len(x)
         if bits < best_bits:
-            best, best_bits = motion, bits
-        elif best is not None:
+            best, best_bits = count, bits
+        elif best:
             break
-    return best
+    if not best:
+        return None
+    return carry(fit_nodes(grid_positions, x, means, seeds[:best], steps, to_world)[0], grid_positions, x, len(means))
 
 
 def _residual_bits(residual: np.ndarray, steps: Steps) -> float:
     """Estimated bits of the residual trajectories [T, N, 3]."""
     frames = len(residual)
-    c = np.abs(np.tensordot(dct_basis(frames), residual, 1)) / trajectory_step(steps.means, frames)
-    return float(np.log2(1 + np.where(c < 0.6, 0, c)).sum() * 2.5)
+    c = np.abs(dct_basis(frames) @ residual.reshape(frames, -1)) / trajectory_step(steps.means, frames)
+    return float(np.log2(1 + c[c >= 0.6]).sum() * 2.5)
