@@ -17,11 +17,12 @@ from gscodec.errors import CaptureError, UsageError
 from gscodec.gaussians import GaussianSequence
 from gscodec.metrics.image import psnr
 from gscodec.render.image import render_image, render_rgba
-from gscodec.train import motion
 from gscodec.train.carve import carve, meeting_point, project
 from gscodec.train.finetune import GroupModel, laplace_bits
+from gscodec.train.graph import NodeGraph, quat_to_matrix, rotvec_to_quat
 from gscodec.train.keyframe import Statistics, grow, prune, train_keyframe
 from gscodec.train.model import from_gaussians
+from gscodec.train.motion import Tracker
 from gscodec.train.settings import TrainSettings, train_settings
 from gscodec.train.train import Checkpoint, initial_model, train_groups
 from gscodec.train.views import Views
@@ -118,26 +119,38 @@ def test_keyframe_learns_a_view_it_has_not_seen(masks):
         assert psnr_of(model, capture, 0) > 22
 
 
-def test_motion_field_finds_the_turn_and_is_what_finds_it(capture):
+def test_tracking_finds_the_turn(capture):
     truth = turning(300, frames=5)
     key = from_gaussians(truth.frame(0))
-    means, turned = motion.track(key, Views(capture, 0), range(3), TINY, radius=1.0)
+    tracker = Tracker(key, Views(capture, 0), TINY, 1.0)
+    models, poses = [tracker.model], [tracker.pose]
+    for frame in (1, 2):
+        tracker.advance(frame)
+        models.append(tracker.model)
+        poses.append(tracker.pose)
     still = np.abs(truth.frame(2).means - truth.frame(0).means).mean()
-    missed = np.abs(truth.frame(2).means - means[2].numpy()).mean()
+    missed = np.abs(truth.frame(2).means - tracker.model.params["means"].numpy()).mean()
     assert missed < 0.25 * still, (missed, still)
-    angle = 2 * np.arccos(np.abs(turned[2, :, 0].numpy()).clip(0, 1))
+    angle = 2 * np.arccos(np.abs(tracker.pose.turned[:, 0].numpy()).clip(0, 1))
     assert np.median(angle) == pytest.approx(0.2, abs=0.08), "0.1 rad a frame"
-    moved = GroupModel(key, means, turned, steps_for(50, 1.0)).gaussians(2)
-    assert psnr_of(moved, capture, 2) > psnr_of(truth.frame(0), capture, 2) + 4
+    group = GroupModel(tracker.graph, None, models, poses, steps_for(50, 1.0))
+    assert psnr_of(group.gaussians(2), capture, 2) > psnr_of(truth.frame(0), capture, 2) + 4
+    carried = np.abs(truth.frame(2).means - group.means[2].numpy()).mean()
+    assert carried < 0.3 * still, "the nodes have found it, not the Gaussians each for itself"
 
 
-def test_rigid_graph_is_zero_for_rigid_motion_and_not_otherwise():
-    g = torch.from_numpy(blob(200).means)
-    graph = motion.RigidGraph(g, 1.0)
-    q = motion.rotvec_to_quat(torch.tensor([[0.3, -0.2, 0.5]])).repeat(200, 1)
-    R = motion.quat_to_matrix(q)
-    assert graph.loss(torch.einsum("nij,nj->ni", R, g) + 1, q) < 1e-5
-    assert graph.loss(1.2 * g, q * 0 + torch.tensor([1.0, 0, 0, 0])) > 0.01
+def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
+    x = torch.from_numpy(blob(200).means)
+    graph = NodeGraph(x, 1.0, count=32)
+    turn = rotvec_to_quat(torch.tensor([[0.3, -0.2, 0.5]])).repeat(len(graph), 1)
+    R = quat_to_matrix(turn)
+    move = torch.einsum("nij,nj->ni", R, graph.nodes) + 1 - graph.nodes
+    means, turned = graph.carry(x, graph.nodes, turn, move)
+    np.testing.assert_allclose(means, x @ R[0].T + 1, atol=1e-5)
+    np.testing.assert_allclose(turned, turn[:1].expand(200, 4), atol=1e-5)
+    assert graph.rigidity(graph.nodes, turn, move) < 1e-5
+    still = rotvec_to_quat(torch.zeros(len(graph), 3))
+    assert graph.rigidity(graph.nodes, still, 0.2 * graph.nodes) > 0.01
 
 
 def test_laplace_bits_are_code_lengths():
@@ -200,6 +213,7 @@ def test_groups_come_out_whole_and_a_stopped_run_goes_on(capture, tmp_path):
         if len(groups) == 1:
             assert Checkpoint(tmp_path).load(3) is not None
     assert [len(g) for g in groups] == [3, 2]
+    np.testing.assert_array_equal(groups[1].parents, np.arange(len(groups[0].frames[0])))
     assert done[-1][0] == done[-1][1], "progress ends at its total"
     assert psnr_of(groups[1].frames[1], capture, 4) > 21
     # The first group again from nothing, the second from the checkpoint of the first.

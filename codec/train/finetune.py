@@ -1,10 +1,11 @@
 """Joint fine-tuning of a group: one canonical set and sparse residual trajectories that fit all frames and views.
 
-The model is the codec's own: frame t = canonical carried by the motion + sum_k basis[k, t] * c_k for every attribute
-that may change. All frames share the canonical attributes, so each Gaussian is seen by frames x views images instead of
-views; what does not pay is pulled to zero by the rate term: the entropy of the coefficients under noise-relaxed
-quantization at the stream's own step sizes, with a learned Laplace scale for each attribute and temporal frequency
-(V3's residual-entropy loss, made differentiable). The temporal term keeps consecutive frames alike.
+The model is the codec's own: frame t = canonical carried by the nodes + sum_k basis[k, t] * c_k for every attribute.
+It starts from the tracked frames, projected on the lowest temporal frequencies. All frames share the canonical
+attributes, so each Gaussian is seen by frames x views images instead of views. Coefficients are used as the decoder
+will have them (rounded, straight-through gradient); what does not pay is pulled to zero by the rate term: their
+entropy under noise-relaxed quantization at the stream's own step sizes, with a learned Laplace scale for each
+attribute and temporal frequency (V3's residual-entropy loss, made differentiable).
 """
 
 from __future__ import annotations
@@ -14,22 +15,25 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from gscodec.bitstream.color import STEP_WEIGHTS
 from gscodec.bitstream.quantization import Steps, trajectory_step
 from gscodec.bitstream.transform import dct_basis
 from gscodec.gaussians import Gaussians
 from gscodec.render.workspace import Workspace
-from gscodec.train.keyframe import RATES
+from gscodec.train import keyframe
+from gscodec.train.graph import NodeGraph, quat_conjugate, quat_multiply
 from gscodec.train.model import Model
-from gscodec.train.motion import quat_multiply, quat_to_matrix
+from gscodec.train.motion import Pose
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, compare
 
-# attribute -> (channels, temporal frequencies that may be used)
-RESIDUALS = {"means": (3, 8), "quats": (3, 4), "sh0": (3, 4)}
-RESIDUAL_RATE = {"means": 0.05, "quats": 0.05, "sh0": 0.05}  # in steps of the stream a step of the optimiser
+# attribute -> temporal frequencies that may be used; what is not listed is constant in a group
+FREQUENCIES = {"means": 10, "quats": 4, "log_scales": 3, "logit_opacities": 3, "sh0": 6}
+ROUND_DOWN = 0.1  # a coefficient below 0.6 steps is not coded, as the encoder does it
+RESIDUAL_RATE = 0.05  # in steps of the stream a step of the optimiser
 LAPLACE_RATE = 0.02
-CARRIERS = 12  # neighbours whose motions are averaged
 MEANS_RATE = 4e-5  # of the canonical means, times the radius
+CANONICAL_SHARE = 0.3  # of the keyframe's rates
 RATE_EVERY = 4  # the rate term has every coefficient, an image few of them: once in so many steps, so much stronger
 
 
@@ -48,72 +52,73 @@ def laplace_bits(x: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
     return torch.where(p > 1e-9, -torch.log2(p.clamp(min=1e-9)), far)
 
 
-def carry(x: torch.Tensor, means: torch.Tensor, turned: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """What of a tracked motion neighbours agree on: each Gaussian as its neighbours' rigid motions would carry it.
-
-    That much the stream's nodes will carry too; the rest is residual, and has to pay for its bits.
-
-    Args:
-        x: [N, 3] keyframe positions; means: [T, N, 3]; turned: [T, N, 4] unit.
-    """
-    from scipy.spatial import cKDTree
-
-    k = min(CARRIERS, len(x))
-    j = torch.from_numpy(cKDTree(x.numpy()).query(x.numpy(), k)[1].astype(np.int64).reshape(len(x), k))
-    out_means, out_turned = torch.empty_like(means), torch.empty_like(turned)
-    offset = x[:, None] - x[j]  # [N, k, 3]
-    for t in range(len(means)):
-        R = quat_to_matrix(turned[t])
-        out_means[t] = (torch.einsum("nkij,nkj->nki", R[j], offset) + means[t][j]).mean(1)
-        q = turned[t][j]
-        q = q * torch.where((q * q[:, :1]).sum(2, keepdim=True) < 0, -1.0, 1.0)
-        out_turned[t] = torch.nn.functional.normalize(q.sum(1), dim=1)
-    return out_means, out_turned
+def rounded(c: torch.Tensor) -> torch.Tensor:
+    """The decoder's integers; the gradient passes straight through."""
+    return c + (torch.sign(c) * torch.floor(c.abs() + 0.5 - ROUND_DOWN) - c).detach()
 
 
 class GroupModel:
     """Canonical model, fixed carrying motion, and the coefficients of what is left.
 
     Args:
-        key: canonical Gaussians.
-        means, turned: [T, N, 3] and [T, N, 4] of `motion.track`.
+        key: canonical Gaussians in the keyframe's pose; None makes it the mean of the tracked frames.
+        tracked: T tracked models; poses: T poses of the nodes of `graph`.
         steps: the stream's quantization.
     """
 
-    def __init__(self, key: Model, means: torch.Tensor, turned: torch.Tensor, steps: Steps):
-        self.key = key
-        carried, self.turned = carry(key.params["means"], means, turned)
-        self.moved = carried - key.params["means"]  # [T, N, 3]
-        self.basis = torch.from_numpy(dct_basis(len(means))).float()  # [T, T]
-        self.unit = {name: trajectory_step(getattr(steps, name), len(means)) for name in RESIDUALS}
-        n = len(key)
-        self.coefficients = {}  # in units of the quantization step
-        for name, (channels, most) in RESIDUALS.items():
-            self.coefficients[name] = torch.zeros(min(most, len(means)), n, channels)
-        left = torch.einsum("kt,tnc->knc", self.basis, means - carried) / self.unit["means"]
-        self.coefficients["means"] += left[: len(self.coefficients["means"])]
-        for c in self.coefficients.values():
-            c.requires_grad_()
+    def __init__(self, graph: NodeGraph, key: Model | None, tracked: list[Model], poses: list[Pose], steps: Steps):
+        self.graph, self.poses = graph, poses
+        self.fixed = key is not None
+        self.key = key or _mean_of(graph, tracked, poses)
+        self.basis = torch.from_numpy(dct_basis(len(tracked))).float()  # [T, T]
+        self.unit = {name: trajectory_step(getattr(steps, name), len(tracked)) for name in FREQUENCIES}
+        self.unit["sh0"] *= float(STEP_WEIGHTS[0])  # Y, Co, Cg share one step; RGB errors add up over them
+        self.means, self.turned = zip(*(self._carry(p) for p in poses), strict=True)
+        self.coefficients = self._project(tracked)  # in units of the quantization step
         self.log_scales = {
             n: torch.full((len(c), 1, 1), -1.0, requires_grad=True) for n, c in self.coefficients.items()
         }
 
+    def _carry(self, pose: Pose) -> tuple[torch.Tensor, torch.Tensor]:
+        nodes = self.graph.nodes
+        return self.graph.carry(self.key.params["means"], nodes, pose.turned, pose.nodes - nodes)
+
+    def _project(self, tracked: list[Model]) -> dict[str, torch.Tensor]:
+        """The tracked frames' lowest frequencies, minus what the nodes carry."""
+        p = self.key.params
+        residual: dict[str, list] = {name: [] for name in FREQUENCIES}
+        for model, means, turned in zip(tracked, self.means, self.turned, strict=True):
+            q = model.params
+            dq = quat_multiply(q["quats"], quat_conjugate(quat_multiply(turned, p["quats"])))
+            residual["means"].append(q["means"] - means)
+            residual["quats"].append(dq[:, 1:] * torch.where(dq[:, :1] < 0, -1.0, 1.0))
+            for name in ("log_scales", "sh0"):
+                residual[name].append(q[name] - p[name])
+            residual["logit_opacities"].append((q["logit_opacities"] - p["logit_opacities"])[:, None])
+        out = {}
+        for name, most in FREQUENCIES.items():
+            low = self.basis[: min(most, len(tracked))]
+            c = torch.einsum("kt,tnc->knc", low, torch.stack(residual[name])) / self.unit[name]
+            out[name] = c.contiguous().requires_grad_()
+        return out
+
     def residual(self, name: str, t: int) -> torch.Tensor:
         """[N, C] residual of an attribute at frame `t`, in its own units."""
-        c = self.coefficients[name]
+        c = rounded(self.coefficients[name])
         return self.unit[name] * torch.einsum("k,knc->nc", self.basis[: len(c), t], c)
 
     def frame(self, t: int) -> dict[str, torch.Tensor]:
         """Attributes of frame `t`; differentiable in the coefficients."""
         p = self.key.params
+        means = self.means[t] if self.fixed else self._carry(self.poses[t])[0]
         dq = self.residual("quats", t)
         w = (1 - dq.square().sum(1, keepdim=True)).clamp(min=1e-6).sqrt()
-        quats = quat_multiply(torch.cat([w, dq], 1), quat_multiply(self.turned[t], p["quats"]))
-        # The canonical means move with fine-tuning; what they moved turns with the Gaussian only to first order.
         return {
             **p,
-            "means": p["means"] + self.moved[t] + self.residual("means", t),
-            "quats": quats,
+            "means": means + self.residual("means", t),
+            "quats": quat_multiply(torch.cat([w, dq], 1), quat_multiply(self.turned[t], p["quats"])),
+            "log_scales": p["log_scales"] + self.residual("log_scales", t),
+            "logit_opacities": p["logit_opacities"] + self.residual("logit_opacities", t)[:, 0],
             "sh0": p["sh0"] + self.residual("sh0", t),
         }
 
@@ -125,12 +130,27 @@ class GroupModel:
             total = total + laplace_bits(c + noise, self.log_scales[name]).sum()
         return total
 
+    @torch.no_grad()
+    def model(self, t: int) -> Model:
+        """Frame `t` as a model."""
+        return Model(self.frame(t))
+
     def gaussians(self, t: int) -> Gaussians:
         """Frame `t` in numpy."""
-        with torch.no_grad():
-            arrays = {n: p.detach().numpy().astype(np.float32) for n, p in self.frame(t).items()}
-        arrays["quats"] = arrays["quats"] / np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
-        return Gaussians(**arrays)
+        return self.model(t).gaussians()
+
+
+def _mean_of(graph: NodeGraph, tracked: list[Model], poses: list[Pose]) -> Model:
+    """Canonical Gaussians: the tracked ones, turned back to the keyframe's pose, on average."""
+    first = tracked[0].params
+    mean = {n: torch.stack([m.params[n] for m in tracked]).mean(0) for n in first}
+    total = torch.zeros_like(first["quats"])
+    for model, pose in zip(tracked, poses, strict=True):
+        _, turned = graph.carry(first["means"], graph.nodes, pose.turned, pose.nodes - graph.nodes)
+        back = quat_multiply(quat_conjugate(turned), model.params["quats"])
+        total += back * torch.where((back * first["quats"]).sum(1, keepdim=True) < 0, -1.0, 1.0)
+    quats = torch.nn.functional.normalize(total, dim=1)
+    return Model({**mean, "means": first["means"], "quats": quats})
 
 
 class _Finetuner:
@@ -141,43 +161,33 @@ class _Finetuner:
         self.rng = np.random.default_rng([settings.seed, frames[0], 2])
         self.noise = torch.Generator().manual_seed(settings.seed)
         self.workspace = Workspace()
-        residuals = [(c, RESIDUAL_RATE[n]) for n, c in group.coefficients.items()]
-        scales = [(s, LAPLACE_RATE) for s in group.log_scales.values()]
-        self.optimizer = torch.optim.Adam(
-            [{"params": [p], "lr": r, "base": r} for p, r in residuals + scales], betas=(0.9, 0.99), fused=True
-        )
-        self.canonical_rates = {"means": MEANS_RATE * radius, **{n: 0.3 * r for n, r in RATES.items()}}
-        group.key.restart()
+        rates = [(c, RESIDUAL_RATE) for c in group.coefficients.values()]
+        rates += [(s, LAPLACE_RATE) for s in group.log_scales.values()]
+        self.optimizer = torch.optim.Adam([{"params": [p], "base": r} for p, r in rates], betas=(0.9, 0.99), fused=True)
+        canonical = {n: CANONICAL_SHARE * r for n, r in keyframe.RATES.items()}
+        self.canonical_rates = {} if group.fixed else {"means": MEANS_RATE * radius, **canonical}
 
     def step(self, t: int, fade: float) -> float:
         """One step on frame `t`, all rates times `fade`; returns the image loss."""
         for g in self.optimizer.param_groups:
             g["lr"] = g["base"] * fade
-        params = self.group.frame(t)
+        group, names = self.group, list(self.group.coefficients)
+        params = group.frame(t)
         target = self.views.draw(self.frames[t])
         result = compare(params, target, self.settings, self.rng, self.workspace)
-        penalty = self._penalty(t, target.rgb.shape[0] * target.rgb.shape[1])
-        heads, seeds = [params[n] for n in RESIDUALS], [result.grads[n] for n in RESIDUALS]
-        if penalty.requires_grad:
-            heads, seeds = [*heads, penalty], [*seeds, torch.ones(())]
+        heads, seeds = [params[n] for n in names], [result.grads[n] for n in names]
+        if self.rng.integers(RATE_EVERY) == 0:
+            pixels = target.rgb.shape[0] * target.rgb.shape[1] * len(self.frames)
+            heads.append(RATE_EVERY * self.settings.rate_lambda / pixels * group.bits(self.noise))
+            seeds.append(torch.ones(()))
         self.optimizer.zero_grad()
         torch.autograd.backward(heads, seeds)
         self.optimizer.step()
-        back = self.group.turned[t] * torch.tensor([1.0, -1, -1, -1])
-        grads = {**result.grads, "quats": quat_multiply(back, result.grads["quats"])}  # to the canonical pose
-        self.group.key.adam(grads, {n: r * fade for n, r in self.canonical_rates.items()})
+        if self.canonical_rates:
+            back = quat_conjugate(group.turned[t])
+            grads = {**result.grads, "quats": quat_multiply(back, result.grads["quats"])}  # to the canonical pose
+            group.key.adam(grads, {n: r * fade for n, r in self.canonical_rates.items()})
         return result.loss
-
-    def _penalty(self, t: int, pixels: int) -> torch.Tensor:
-        """Temporal and rate terms, in the image loss's unit (a mean over pixels)."""
-        s, group, penalty = self.settings, self.group, torch.zeros(())
-        if t + 1 < len(self.frames):
-            for name in group.coefficients:
-                change = (group.residual(name, t + 1) - group.residual(name, t)) / group.unit[name]
-                penalty = penalty + s.temporal_lambda * change.abs().mean(1).sum() / pixels
-        if self.rng.integers(RATE_EVERY) == 0:
-            penalty = penalty + RATE_EVERY * s.rate_lambda / (pixels * len(self.frames)) * group.bits(self.noise)
-        return penalty
 
 
 def finetune(
@@ -189,7 +199,11 @@ def finetune(
     radius: float,
     on_step: Callable[[int, float], None] | None = None,
 ) -> None:
-    """Optimises canonical attributes and coefficients over all frames; `on_step` gets (step, loss)."""
+    """Optimises canonical attributes (unless `group` has fixed ones) and coefficients over all frames.
+
+    Args:
+        on_step: called with (step, loss).
+    """
     steps = settings.finetune_steps * len(frames)
     run = _Finetuner(group, views, frames, settings, radius)
     order: list[int] = []

@@ -53,7 +53,8 @@ def train_keyframe(
     densify: bool = True,
     on_step: Callable[[int, float], None] | None = None,
 ) -> float:
-    """Optimises `model` in place against the views of `frame`; returns the loss at the end.
+    """Optimises `model` in place against the views of `frame`; returns the image loss at the end, without
+    the mask's.
 
     Args:
         steps: optimisation steps, one view each.
@@ -68,7 +69,7 @@ def train_keyframe(
     for step in range(steps):
         result = compare(model.params, views.draw(frame), settings, rng, workspace)
         stats.add(result)
-        losses.append(result.loss)
+        losses.append(result.loss - settings.mask_lambda * result.mask)
         fade = step / max(steps - 1, 1)
         rate = radius * MEANS_RATE[0] * (MEANS_RATE[1] / MEANS_RATE[0]) ** fade
         model.adam(result.grads, {"means": rate, **{n: r * 0.1**fade for n, r in RATES.items()}})

@@ -14,7 +14,7 @@ class TrainSettings:
     Attributes:
         gop: most frames in a group.
         keyframe_steps: optimisation steps for the first keyframe; later ones start warm and take half.
-        motion_steps: steps a frame for the hash-grid motion.
+        motion_steps: steps a frame for tracking.
         finetune_steps: steps a frame for the joint fine-tuning of the group.
         gaussians_max: bound on the count while densifying.
         ssim_lambda: share of D-SSIM in the image loss (3D Gaussian Splatting: 0.2).
@@ -29,15 +29,15 @@ class TrainSettings:
 
     gop: int = 20
     keyframe_steps: int = 1500
-    motion_steps: int = 100
+    motion_steps: int = 200
     finetune_steps: int = 80
     gaussians_max: int = 14000
     initial_points: int = 8000
     ssim_lambda: float = 0.2
     mask_lambda: float = 0.1
     cut_ratio: float = 2.0
-    rigidity: float = 0.3
-    rate_lambda: float = 0.3
+    rigidity: float = 0.1
+    rate_lambda: float = 0.04
     temporal_lambda: float = 0.01
     quality: float = 50.0
     seed: int = 0

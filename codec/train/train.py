@@ -1,7 +1,7 @@
 """Capture -> groups of tracked Gaussians: keyframe, motion, joint fine-tuning, group after group.
 
 Groups come out one at a time, so that they are encoded and safe on disk while the next one trains. After each, a
-checkpoint holds its last frame, from which the next keyframe starts; a run that stops goes on there.
+checkpoint holds what the next one starts from; a run that stops goes on there.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +17,14 @@ import torch
 
 from gscodec.bitstream.quantization import steps_for, subject_radius
 from gscodec.errors import CaptureError
-from gscodec.gaussians import Gaussians, Group
+from gscodec.gaussians import Group
 from gscodec.train.carve import carve, random_box
 from gscodec.train.finetune import GroupModel, finetune
 from gscodec.train.keyframe import train_keyframe
-from gscodec.train.model import Model, from_gaussians, from_points
-from gscodec.train.motion import track
+from gscodec.train.model import NAMES, Model, from_points
+from gscodec.train.motion import Pose, Tracker
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views
-
-WARM_SHARE = 0.5  # of the keyframe's steps, when it starts from the group before
 
 
 @dataclass
@@ -42,13 +40,6 @@ class Progress:
     def eta(self) -> float:
         """Seconds left at the pace so far."""
         return (time.monotonic() - self.started) * (self.total - self.done) / max(self.done, 1)
-
-
-def _steps_left(frames: int, first: bool, s: TrainSettings) -> int:
-    """Estimate of the steps that `frames` frames take, in groups of the full length."""
-    groups = -(-frames // s.gop)
-    keys = groups * int(WARM_SHARE * s.keyframe_steps) + (s.keyframe_steps - int(WARM_SHARE * s.keyframe_steps)) * first
-    return keys + (frames - groups) * s.motion_steps + (frames * s.finetune_steps if s.gop > 1 else 0)
 
 
 def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
@@ -76,7 +67,7 @@ def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
 
 
 class Checkpoint:
-    """The end of the last finished group, on disk: what the next keyframe starts from."""
+    """What the group after the last finished one starts from, on disk."""
 
     def __init__(self, folder: Path | None):
         self.folder = folder
@@ -84,25 +75,25 @@ class Checkpoint:
     def _path(self, next_frame: int) -> Path:
         return self.folder / f"before_{next_frame:06d}.npz"
 
-    def save(self, next_frame: int, last: Gaussians | None) -> None:
-        """Writes the Gaussians of the frame before `next_frame`, atomically, and drops older ones."""
-        if self.folder is None or last is None:
+    def save(self, next_frame: int, subject: Subject | None) -> None:
+        """Writes the subject as it is before `next_frame`, atomically, and drops older ones; None needs no file."""
+        if self.folder is None or subject is None:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
         old = list(self.folder.glob("before_*.npz"))
         part = self.folder / "writing.npz"
-        np.savez(part, **{f.name: getattr(last, f.name) for f in fields(last)})
+        np.savez(part, **subject.state())
         os.replace(part, self._path(next_frame))
         for path in old[:-1]:  # the newest but one stays: the stream may not have the last group yet
             path.unlink()
 
-    def load(self, next_frame: int) -> Gaussians | None:
-        """What `save` wrote for `next_frame`, or None."""
+    def load(self, next_frame: int) -> dict | None:
+        """The state that `save` wrote for `next_frame`, or None."""
         if self.folder is None or not self._path(next_frame).exists():
             return None
         try:
             with np.load(self._path(next_frame)) as z:
-                return Gaussians(**dict(z))
+                return dict(z)
         except (OSError, ValueError, KeyError):
             return None
 
@@ -112,6 +103,32 @@ class Checkpoint:
             for path in self.folder.glob("*.npz"):
                 path.unlink()
             self.folder.rmdir()
+
+
+@dataclass
+class Subject:
+    """What lasts from group to group: Gaussians that are being followed.
+
+    Attributes:
+        tracker: where they are in the last frame.
+        loss: image loss of their keyframe, which tells when they no longer serve.
+        canonical: what all groups since the keyframe refer to; None before the first one is fine-tuned.
+    """
+
+    tracker: Tracker
+    loss: float
+    canonical: Model | None = None
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything as arrays."""
+        canonical = {f"canonical.{n}": p.numpy() for n, p in self.canonical.params.items()}
+        return {"loss": np.array(self.loss), **canonical, **self.tracker.state()}
+
+    @staticmethod
+    def restored(state: dict[str, np.ndarray], views: Views, settings: TrainSettings) -> Subject:
+        """Inverse of `state`."""
+        canonical = {n: torch.from_numpy(state[f"canonical.{n}"]) for n in NAMES}
+        return Subject(Tracker.restored(state, views, settings), float(state["loss"]), Model(canonical))
 
 
 def train_groups(
@@ -124,6 +141,9 @@ def train_groups(
 ) -> Iterator[Group]:
     """Trains `capture` from `first_frame` on and yields each group when it is done.
 
+    A group continues the Gaussians of the one before (`Group.parents`) as long as they serve; where the image loss of a
+    tracked frame is `cut_ratio` times the keyframe's, the group ends and the next one starts anew.
+
     Args:
         first_frame: where an earlier run stopped; a group starts there.
         checkpoints: folder for what the next group starts from; None keeps it in memory only.
@@ -135,56 +155,98 @@ def train_groups(
     # Torch only handles small tensors here; its threads would spin against those of the native kernels.
     torch.set_num_threads(1)
     store = Checkpoint(checkpoints)
-    last = store.load(first_frame) if first_frame else None  # absent after a cut, too
-    progress = Progress(
-        _steps_left(capture.frame_count - first_frame, last is None, settings), started=time.monotonic()
-    )
-    run = _Run(capture, settings, progress, on_progress)
+    run = _Run(capture, settings, on_progress)
+    state = store.load(first_frame) if first_frame else None  # absent after a cut, too
+    if state is not None:
+        run.subject = Subject.restored(state, run.views, settings)
     start = first_frame
     while start < capture.frame_count:
-        frames = range(start, min(start + settings.gop, capture.frame_count))
-        group = run.group(frames, last)
+        run.estimate(capture.frame_count - start)
+        group = run.group(range(start, min(start + settings.gop, capture.frame_count)))
         start += len(group)
-        # Where the motion outran the keyframe its Gaussians are no good start for the next one either.
-        last = group.frames[-1] if len(group) == len(frames) else None
-        progress.total = progress.done + _steps_left(capture.frame_count - start, last is None, settings)
-        store.save(start, last)
+        store.save(start, run.subject)
         yield group
 
 
 class _Run:
-    """What the groups of one run share."""
+    """What the groups of one run share. `subject` is None where the next frame needs a keyframe."""
 
-    def __init__(self, capture, settings: TrainSettings, progress: Progress, on_progress):
-        self.capture, self.settings, self.progress, self.on_progress = capture, settings, progress, on_progress
+    def __init__(self, capture, settings: TrainSettings, on_progress):
+        self.capture, self.settings, self.on_progress = capture, settings, on_progress
         self.views = Views(capture, settings.seed)
+        self.progress = Progress(0, started=time.monotonic())
+        self.subject: Subject | None = None
+
+    def estimate(self, frames: int) -> None:
+        """Sets the total of the progress, if no group is cut."""
+        s = self.settings
+        key = s.keyframe_steps if self.subject is None else 0
+        finetune = s.finetune_steps if s.gop > 1 else 0
+        self.progress.total = self.progress.done + key + frames * (s.motion_steps + finetune)
 
     def _report(self, stage: str) -> Callable:
-        def on_step(*numbers):
+        def on_step(_, loss):
             p = self.progress
-            p.done, p.stage, p.loss = p.done + 1, stage, float(numbers[-1])
+            p.done, p.stage, p.loss = p.done + 1, stage, float(loss)
             p.total = max(p.total, p.done)
             if self.on_progress:
                 self.on_progress(p)
 
         return on_step
 
-    def group(self, frames: range, last: Gaussians | None) -> Group:
-        """Trains one group; it ends before `frames` does where the motion outruns the keyframe."""
-        s, views = self.settings, self.views
-        model = initial_model(self.capture, frames[0], s) if last is None else from_gaussians(last)
+    def group(self, frames: range) -> Group:
+        """Trains one group; it ends before `frames` does where the Gaussians no longer serve."""
+        track = _Track([], [])
+        if self.subject is not None:
+            self._follow(frames, track)
+        parents = np.arange(len(self.subject.tracker.model), dtype=np.int32) if track.models else None
+        if not track.models:  # nothing to follow, or lost at once
+            self.subject = self._keyframe(frames[0])
+            track.add(self.subject.tracker)
+            self._follow(frames[1:], track)
+        subject, done = self.subject, frames[: len(track.models)]
+        if len(done) < len(frames):
+            self.subject = None
+        if len(done) == 1 and parents is None:
+            subject.canonical = track.models[0]
+            return Group([subject.canonical.gaussians()])
+        model = self._finetuned(subject, done, track)
+        subject.canonical = model.key
+        return Group([model.gaussians(t) for t in range(len(done))], parents=parents)
+
+    def _keyframe(self, frame: int) -> Subject:
+        s = self.settings
+        model = initial_model(self.capture, frame, s)
         radius = subject_radius(model.params["means"].numpy())
-        steps = s.keyframe_steps if last is None else int(WARM_SHARE * s.keyframe_steps)
-        on_step = self._report(f"keyframe {frames[0]}")
-        loss = train_keyframe(model, views, frames[0], s, steps=steps, radius=radius, on_step=on_step)
-        if len(frames) == 1:
-            return Group([model.gaussians()])
-        on_step = self._report(f"motion from {frames[0]}")
-        means, turned = track(model, views, frames, s, radius=radius, loss_max=s.cut_ratio * loss, on_step=on_step)
-        frames = frames[: len(means)]
-        group = GroupModel(model, means, turned, steps_for(s.quality, radius))
-        if len(frames) > 1:
-            on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
-            finetune(group, views, frames, s, radius=radius, on_step=on_step)
-        with torch.no_grad():
-            return Group([group.gaussians(t) for t in range(len(frames))])
+        on_step = self._report(f"keyframe {frame}")
+        loss = train_keyframe(model, self.views, frame, s, steps=s.keyframe_steps, radius=radius, on_step=on_step)
+        return Subject(Tracker(model, self.views, s, radius), loss)
+
+    def _follow(self, frames: range, track: _Track) -> None:
+        """Adds the frames to `track` until the subject is lost."""
+        subject = self.subject
+        for frame in frames:
+            loss = subject.tracker.advance(frame, self._report(f"track {frame}"))
+            if loss > self.settings.cut_ratio * subject.loss:
+                break
+            track.add(subject.tracker)
+
+    def _finetuned(self, subject: Subject, frames: range, track: _Track) -> GroupModel:
+        radius = subject.tracker.radius
+        steps = steps_for(self.settings.quality, radius)
+        model = GroupModel(subject.tracker.graph, subject.canonical, track.models, track.poses, steps)
+        on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
+        finetune(model, self.views, frames, self.settings, radius=radius, on_step=on_step)
+        return model
+
+
+@dataclass
+class _Track:
+    """Frame by frame the Gaussians and the nodes."""
+
+    models: list[Model]
+    poses: list[Pose]
+
+    def add(self, tracker: Tracker) -> None:
+        self.models.append(tracker.model)
+        self.poses.append(tracker.pose)

@@ -7,7 +7,7 @@ and the mask term needs only a margin of it.
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,16 +40,16 @@ class Views:
         self.capture = capture
         self.train_cameras = [i for i, c in enumerate(capture.cameras) if c.split == "train"]
         self._seed = seed
-        self._held: OrderedDict[tuple[int, int], Target] = OrderedDict()
+        self._held: OrderedDict[tuple[int, int, float], Target] = OrderedDict()
         self._bytes = 0
         self._order: dict[int, list[int]] = {}
         self._rounds: dict[int, int] = {}
 
-    def target(self, camera: int, frame: int) -> Target:
-        """View of camera index `camera` at `frame`, cropped to the subject."""
-        key = (camera, frame)
+    def target(self, camera: int, frame: int, scale: float = 1.0) -> Target:
+        """View of camera index `camera` at `frame`, cropped to the subject, `scale` times its size (at most 1)."""
+        key = (camera, frame, scale)
         if key not in self._held:
-            self._held[key] = self._load(camera, frame)
+            self._held[key] = self._load(camera, frame) if scale == 1 else shrink(self.target(camera, frame), scale)
             self._bytes += self._size(self._held[key])
             while self._bytes > CACHE_BYTES and len(self._held) > 1:
                 _, old = self._held.popitem(last=False)
@@ -57,7 +57,7 @@ class Views:
         self._held.move_to_end(key)
         return self._held[key]
 
-    def draw(self, frame: int) -> Target:
+    def draw(self, frame: int, scale: float = 1.0) -> Target:
         """The next view of `frame`; every camera once before any comes again, in an order that depends on the frame
         and not on what was drawn before (a resumed run draws the same)."""
         order = self._order.get(frame)
@@ -65,7 +65,7 @@ class Views:
             turn = self._rounds[frame] = self._rounds.get(frame, 0) + 1
             rng = np.random.default_rng([self._seed, frame, turn])
             order = self._order[frame] = rng.permutation(self.train_cameras).tolist()
-        return self.target(order.pop(), frame)
+        return self.target(order.pop(), frame, scale)
 
     @staticmethod
     def _size(t: Target) -> int:
@@ -85,6 +85,24 @@ class Views:
             np.ascontiguousarray(view.rgb[crop]),
             np.ascontiguousarray(view.alpha[crop]),
         )
+
+
+def shrink(target: Target, scale: float) -> Target:
+    """The same view on fewer pixels, each the mean of those it covers."""
+    import cv2
+
+    height, width = target.rgb.shape[:2]
+    size = (max(1, round(scale * width)), max(1, round(scale * height)))
+    alpha = np.full((height, width), 255, np.uint8) if target.alpha is None else target.alpha
+    share = (alpha / np.float32(255))[..., None]
+    small = cv2.resize(share, size, interpolation=cv2.INTER_AREA)
+    rgb = cv2.resize(target.rgb * share, size, interpolation=cv2.INTER_AREA) / np.maximum(small, 1e-3)[..., None]
+    K = target.camera.K * np.array([[size[0] / width], [size[1] / height], [1.0]])
+    return Target(
+        replace(target.camera, K=K, width=size[0], height=size[1]),
+        np.rint(rgb.clip(0, 255)).astype(np.uint8),
+        None if target.alpha is None else np.rint(255 * small).astype(np.uint8),
+    )
 
 
 def compare(params: dict, target: Target, settings: TrainSettings, rng, workspace: Workspace) -> RenderLoss:

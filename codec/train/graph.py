@@ -1,0 +1,115 @@
+"""The node graph of a subject: a few hundred control points whose rigid motions carry all Gaussians.
+
+HiFi4G's coarse deformation graph, and what the stream's nodes are (spec 13.2 and 13.3: same neighbours, same weights):
+tracking optimises the nodes, so a smooth motion is smooth by construction and cheap to code.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gscodec import _native
+
+NODES = 256  # 64 and 1000 track as well (bench/results/ablation.json)
+BLENDED = 4  # nodes that carry one Gaussian
+EDGES = 8  # neighbours of a node in the rigidity term
+GRID = 1e-3  # of the radius: the lattice on which neighbours and weights are computed
+
+
+def quat_multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Hamilton product, [N, 4] wxyz."""
+    aw, au, bw, bu = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
+    w = aw * bw - (au * bu).sum(1, keepdim=True)
+    return torch.cat([w, aw * bu + bw * au + torch.linalg.cross(au, bu, dim=-1)], 1)
+
+
+def quat_conjugate(q: torch.Tensor) -> torch.Tensor:
+    """Inverse of unit wxyz quaternions, [N, 4]."""
+    return q * torch.tensor([1.0, -1.0, -1.0, -1.0])
+
+
+def rotvec_to_quat(v: torch.Tensor) -> torch.Tensor:
+    """[N, 3] radians -> [N, 4] wxyz, smooth at zero."""
+    half = (v.square().sum(1, keepdim=True) + 1e-16).sqrt() / 2
+    return torch.cat([torch.cos(half), v * 0.5 * torch.sinc(half / torch.pi)], 1)
+
+
+def quat_to_matrix(q: torch.Tensor) -> torch.Tensor:
+    """[N, 4] unit wxyz -> [N, 3, 3]."""
+    w, x, y, z = q.unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, 1).view(-1, 3, 3)
+
+
+class NodeGraph:
+    """Nodes of a keyframe and the weights by which they carry its Gaussians.
+
+    Args:
+        means: [N, 3] positions in the keyframe; radius: of the subject, world units.
+
+    Attributes:
+        means: as given.
+        nodes: [M, 3] positions of the nodes in the keyframe.
+    """
+
+    def __init__(self, means: torch.Tensor, radius: float, count: int = NODES):
+        from scipy.spatial import cKDTree
+
+        self.means = means
+        low, step = means.min(0).values, GRID * radius
+        grid = torch.round((means - low) / step).numpy().astype(np.uint32)
+        chosen = np.unique(grid[farthest_points(means.numpy(), count)], axis=0)
+        chosen = chosen[_native.morton_order(chosen)]
+        index, weight = _native.node_weights(grid, chosen, BLENDED)
+        self.index = torch.from_numpy(index.astype(np.int64))
+        self.weight = torch.from_numpy(weight.astype(np.float32))[..., None]
+        self.nodes = low + step * torch.from_numpy(chosen.astype(np.float32))
+        m, k = len(chosen), min(EDGES, len(chosen) - 1)
+        near = cKDTree(self.nodes.numpy()).query(self.nodes.numpy(), k + 1)[1].reshape(m, -1)[:, 1:]
+        self._edges = torch.from_numpy(near.astype(np.int64))
+        length = (self.nodes[self._edges] - self.nodes[:, None]).norm(dim=2, keepdim=True)
+        middle = length.median() if k else torch.ones(())
+        self._hold = torch.exp2(-((length / (1.5 * middle)) ** 2)) / radius  # long edges bridge gaps: they hold less
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def carry(self, x: torch.Tensor, nodes: torch.Tensor, turn: torch.Tensor, move: torch.Tensor):
+        """Points moved by the nodes' rigid motions, blended (spec 13.3).
+
+        Args:
+            x: [N, 3] where the Gaussians are; nodes: [M, 3] where the nodes are.
+            turn: [M, 4] unit wxyz and move: [M, 3], the motion of each node about itself.
+
+        Returns:
+            means [N, 3] and the blended rotation [N, 4] unit wxyz.
+        """
+        R = quat_to_matrix(turn)
+        offset = nodes + move - torch.einsum("mij,mj->mi", R, nodes)
+        rows = torch.cat([R.flatten(1), offset, turn], 1)
+        blend = (rows[self.index] * self.weight).sum(1)
+        means = torch.einsum("nij,nj->ni", blend[:, :9].view(-1, 3, 3), x) + blend[:, 9:12]
+        return means, torch.nn.functional.normalize(blend[:, 12:], dim=1)
+
+    def rigidity(self, nodes: torch.Tensor, turn: torch.Tensor, move: torch.Tensor) -> torch.Tensor:
+        """Mean weighted length by which the edges between nodes miss their rotated selves (Sorkine and Alexa 2007)."""
+        if self._edges.numel() == 0:
+            return move.sum() * 0
+        edge = nodes[self._edges] - nodes[:, None]
+        meant = torch.einsum("mij,mkj->mki", quat_to_matrix(turn), edge) + move[:, None]
+        return (self._hold * (meant - edge - move[self._edges])).square().sum(2).add(1e-12).sqrt().mean()
+
+
+def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
+    """[count] indices of `points` [N, 3], each the farthest from those before it; starts nearest to the centre."""
+    chosen = [int(((points - points.mean(0)) ** 2).sum(1).argmin())]
+    distance = ((points - points[chosen[0]]) ** 2).sum(1)
+    for _ in range(min(count, len(points)) - 1):
+        chosen.append(int(distance.argmax()))
+        np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(1), out=distance)
+    return np.array(chosen)
