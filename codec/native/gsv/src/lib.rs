@@ -3,6 +3,7 @@
 //! No I/O, no unsafe, no panic on input. Clause numbers in comments are those of spec/gsv.md.
 #![forbid(unsafe_code)]
 
+mod assemble;
 pub mod attributes;
 pub mod blend;
 pub mod channels;

@@ -167,6 +167,10 @@ fn broken_rules_stay_errors() {
 /// What a unit holds, as it is in a group; None where the layer is not the same.
 fn content(g: &Group, sound: &Group, u: &Unit) -> Option<Vec<i32>> {
     let k = usize::from(u.layer);
+    if u.kind == Some(UnitType::LayerCorrection) {
+        let at = usize::from(u.attribute == Some(Attribute::LogitOpacities));
+        return Some(vec![g.corrections[k][at].to_bits() as i32]);
+    }
     if g.layers.get(k) != sound.layers.get(k) && u.kind != Some(UnitType::Channels) {
         return None;
     }
