@@ -24,7 +24,7 @@ pub mod map;
 mod model;
 pub mod morton;
 pub mod neighbors;
-mod node_tree;
+mod node_search;
 pub mod positions;
 pub mod range_coder;
 pub mod trajectories;
