@@ -114,13 +114,16 @@ def encode_groups(
     """
     writer = StreamWriter(out, config, fingerprint)
     report = EncodeReport(seconds={"input": 0.0, "quantize": 0.0, "entropy": 0.0})
+    cameras = [
+        Camera(c["name"], np.array(c["K"]), np.array(c["viewmat"]), c["width"], c["height"]) for c in config["cameras"]
+    ]
     clock = time.perf_counter
     try:
         mark = clock()
         for group in groups(writer.groups, writer.frames):
             report.seconds["input"] += clock() - mark
             mark = clock()
-            integers = group_integers(group, settings.quality, keep_all=settings.keep_all)
+            integers = group_integers(group, settings.quality, keep_all=settings.keep_all, cameras=cameras)
             report.seconds["quantize"] += clock() - mark
             mark = clock()
             payload, units = _native.encode_group(integers)

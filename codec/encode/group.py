@@ -12,17 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from gscodec import _native
-from gscodec.bitstream.color import STEP_WEIGHTS, decorrelate
-from gscodec.bitstream.quantization import Steps, steps_for, subject_radius, trajectory_step
-from gscodec.bitstream.transform import dct_basis
+from gscodec.bitstream.color import decorrelate
+from gscodec.bitstream.quantization import error_for, steps_for, subject_radius, trajectory_step
+from gscodec.camera import Camera
+from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply
-from gscodec.encode.motion import NEIGHBORS, NodeMotion, choose_nodes, quantize_trajectory, trim
-from gscodec.gaussians import Group
+from gscodec.encode.importance import Importance, measure, steps_for_error
+from gscodec.encode.motion import NEIGHBORS, NodeMotion, carry, choose_nodes
+from gscodec.gaussians import Gaussians, Group
 
 GRID_BITS_MAX = 21
-ALPHA_MIN = 1 / 255  # what the renderer does not draw (spec: "The picture")
-PRUNE_SHARE = 5e-4  # share of opacity x area that may go; 8 % of the statue's Gaussians hold less
-DEAD_ZONE = 0.6  # in steps; jitter of a trainer stays below it
+PRUNE = 0.3  # a Gaussian goes if the picture without it errs by less than this share of the error per coded Gaussian
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,11 @@ class Stack:
         arrays = (self.means, self.quats, self.log_scales, self.logit_opacities, self.sh0, self.shN)
         return Stack(*(a[:, index] for a in arrays), None if self.lifetimes is None else self.lifetimes[index])
 
+    def frame(self, t: int) -> Gaussians:
+        """All Gaussians as they are at frame `t`."""
+        arrays = (self.means, self.quats, self.log_scales, self.logit_opacities, self.sh0, self.shN)
+        return Gaussians(*(a[t] for a in arrays))
+
 
 def stack_group(group: Group) -> Stack:
     """Loads all frames of `group` (f32)."""
@@ -53,18 +58,6 @@ def stack_group(group: Group) -> Stack:
         held = np.clip(np.arange(len(frames))[:, None], life[:, 0], life[:, 1] - 1)  # [T, N]
         arrays = [a[held, np.arange(len(life))] for a in arrays]
     return Stack(*arrays, life)
-
-
-def visible_enough(s: Stack) -> np.ndarray:
-    """[N] bool: false for Gaussians that are never drawn, and for the least that together hold `PRUNE_SHARE`."""
-    opacity = 1 / (1 + np.exp(-s.logit_opacities))
-    largest_two = s.log_scales.sum(2) - s.log_scales.min(2)
-    importance = (opacity * np.exp(largest_two)).max(0).astype(np.float64)
-    order = importance.argsort()
-    spent = np.cumsum(importance[order])
-    keep = np.empty(len(order), bool)
-    keep[order] = spent > PRUNE_SHARE * spent[-1] if len(order) else True
-    return keep & (opacity.max(0) >= ALPHA_MIN)
 
 
 def align_axes(s: Stack, middle: int) -> Stack:
@@ -79,20 +72,15 @@ def align_axes(s: Stack, middle: int) -> Stack:
     return Stack(s.means, quats, scales, s.logit_opacities, s.sh0, s.shN, s.lifetimes)
 
 
-def channel_steps(name: str, steps: Steps, channels: int) -> np.ndarray:
-    """[C] f32 step of each channel of an attribute."""
-    step = np.full(channels, getattr(steps, name))
-    if name in ("sh0", "shN"):
-        step *= np.tile(STEP_WEIGHTS, channels // 3)
-    return step.astype(np.float32)
-
-
-def quantize_channels(values: np.ndarray, steps: np.ndarray) -> dict:
+def quantize_channels(
+    values: np.ndarray, steps: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float
+) -> dict:
     """[N, C] floats -> channels of `encode_group`; offsets are the medians, so that small integers are common."""
     offsets = np.median(values, axis=0) if len(values) else np.zeros(values.shape[1])
     offsets = offsets.astype(np.float32)
-    q = np.rint((values - offsets) / steps).astype(np.int32)
-    return {"values": np.ascontiguousarray(q.T), "steps": steps.tolist(), "offsets": offsets.tolist()}
+    x = (values - offsets) / steps
+    q = [rdo.keyframe(x[:, c], weights[:, c] * steps[c] ** 2, near, price) for c in range(len(steps))]
+    return {"values": np.array(q).astype(np.int32), "steps": steps.tolist(), "offsets": offsets.tolist()}
 
 
 def dequantize_channels(channels: dict) -> np.ndarray:
@@ -135,55 +123,71 @@ def _appearance(s: Stack) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _rotation_residual(quats: np.ndarray, canonical: np.ndarray, motion: NodeMotion | None) -> np.ndarray:
-    """[T, N, 3] f32, vector part of what is left after nodes and canonical: dq = q(t) (q_blend(t) q_canonical)^-1."""
-    dq = quat_multiply(quats, quat_conjugate(canonical[None].astype(np.float32)))
+def _rest_pose(s: Stack, x: np.ndarray, motion: NodeMotion | None) -> tuple[np.ndarray, np.ndarray]:
+    """Means [N, 3] and quaternions [N, 4] that the nodes carry nearest to all frames, from positions x [N, 3] that they
+    carry already: what jitters in one frame is not the canonical of all."""
+    if motion is None:
+        turned_back, left = s.quats, s.means - x[None].astype(np.float32)
+    else:
+        back = quat_conjugate(motion.turned)
+        turned_back, left = quat_multiply(back, s.quats), _rotate(back, s.means - motion.carried)
+    quats = turned_back.mean(0)
+    return x + left.mean(0), quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
+
+
+def _rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """[..., 3] vectors turned by unit quaternions [..., 4]."""
+    u = np.cross(q[..., 1:], v)
+    return v + 2 * (q[..., :1] * u + np.cross(q[..., 1:], u))
+
+
+def _residual(s: Stack, channels: dict, x: np.ndarray, motion: NodeMotion | None) -> dict[str, np.ndarray]:
+    """[T, N, C] f32 of each attribute: what canonical values and nodes leave over."""
+    v = dequantize_channels(channels["quats"])
+    canonical = np.concatenate([np.sqrt(np.maximum(0, 1 - (v**2).sum(1, keepdims=True))), v], 1)
+    dq = quat_multiply(s.quats, quat_conjugate(canonical[None].astype(np.float32)))
     if motion is not None:
         dq = quat_multiply(dq, quat_conjugate(motion.turned))
-    return np.copysign(1, dq[..., :1]) * dq[..., 1:]
-
-
-def _trajectories(s: Stack, channels: dict, steps: Steps, x: np.ndarray, motion: NodeMotion | None) -> dict:
-    basis = dct_basis(len(s.means))
-    canonical_v = dequantize_channels(channels["quats"])
-    w = np.sqrt(np.maximum(0, 1 - (canonical_v**2).sum(1, keepdims=True)))
-    canonical = np.concatenate([w, canonical_v], 1)
     residual = {
         "means": s.means - (x[None].astype(np.float32) if motion is None else motion.carried),
-        "quats": _rotation_residual(s.quats, canonical, motion),
+        "quats": np.copysign(1, dq[..., :1]) * dq[..., 1:],
     }
     for name, values in _appearance(s).items():
         residual[name] = values - dequantize_channels(channels[name])[None].astype(np.float32)
-    out = {}
-    for name, values in residual.items():
-        size = trajectory_step(channel_steps(name, steps, values.shape[2])[0], len(basis))
-        c = trim(quantize_trajectory(values, basis, size, DEAD_ZONE)).transpose(0, 2, 1)  # [K, C, N]
-        if c.any():
-            out[name] = {"coefficients": np.ascontiguousarray(c), "step": size}
-    return out
+    return residual
 
 
-def group_integers(group: Group, quality: float, *, keep_all: bool = False, steps: Steps | None = None) -> dict:
+def group_integers(group: Group, quality: float, *, keep_all: bool = False, cameras: list[Camera] = ()) -> dict:
     """Integer form of a group, the input of `_native.encode_group`.
 
     Args:
         group: T >= 1 frames of N Gaussians.
         quality: 0 to 100.
         keep_all: code every Gaussian, also the invisible ones.
-        steps: instead of those that follow from `quality`.
+        cameras: from which the subject was captured, if it was.
     """
     s = stack_group(group)
-    if not keep_all and len(s.means[0]):
-        s = s.take(visible_enough(s))
     frames, middle = len(s.means), len(s.means) // 2
-    steps = steps or steps_for(quality, subject_radius(s.means[middle]))
-    grid = Grid(s.means[middle], steps.means)
+    s = align_axes(s, middle)
+    s, importance, radius = _shown(s, middle, quality, keep_all, cameras)
+    steps = _steps(s, importance, middle, quality, radius)
+    grid = Grid(s.means[middle], float(steps["means"][0]))
     positions = grid.to_integers(s.means[middle])
     order = _native.morton_order(positions)
-    positions, s = positions[order], align_axes(s.take(order), middle)
-    values = {n: v.mean(0, dtype=np.float64) for n, v in _appearance(s).items()}
-    values["quats"] = s.quats[middle, :, 1:]
-    channels = {n: quantize_channels(v, channel_steps(n, steps, v.shape[1])) for n, v in values.items()}
+    positions, s, importance = positions[order], s.take(order), importance.take(order)
+    nodes, quats = None, s.quats[middle]
+    if frames > 1 and len(positions):
+        x = grid.to_world(positions)
+        nodes = choose_nodes(
+            positions, x, s.means, grid.step, steps_for(quality, radius).node_translation, grid.to_world
+        )
+        x, quats = _rest_pose(s, x, nodes and carry(nodes, positions, x, frames))
+        positions = grid.to_integers(x)
+        order = _native.morton_order(positions)
+        positions, s, importance, quats = positions[order], s.take(order), importance.take(order), quats[order]
+    near, price = rdo.neighbours(positions), rdo.bit_price(error_for(quality), max(len(positions), 1))
+    values = {n: v.mean(0, dtype=np.float64) for n, v in _appearance(s).items()} | {"quats": quats[:, 1:]}
+    channels = {n: quantize_channels(v, steps[n], importance.weights[n], near, price) for n, v in values.items()}
     channels["quats"] = _inside_unit_ball(channels["quats"])
     out = {
         "frames": frames,
@@ -198,18 +202,45 @@ def group_integers(group: Group, quality: float, *, keep_all: bool = False, step
         out["lifetimes"] = s.lifetimes.astype(np.uint16)
     if frames == 1 or len(positions) == 0:
         return out
-    x = grid.to_world(positions)
-    motion = choose_nodes(positions, x, s.means, steps, grid.to_world)
-    if motion is not None:
+    if nodes is not None:
         out["nodes"] = {
-            "positions": motion.nodes.positions,
-            "coefficients": motion.nodes.coefficients,
-            "rotation_step": motion.nodes.rotation_step,
-            "translation_step": motion.nodes.translation_step,
-            "neighbors": min(NEIGHBORS, len(motion.nodes.positions)),
+            "positions": nodes.positions,
+            "coefficients": nodes.coefficients,
+            "rotation_step": nodes.rotation_step,
+            "translation_step": nodes.translation_step,
+            "neighbors": min(NEIGHBORS, len(nodes.positions)),
         }
-    out["trajectories"] = _trajectories(s, channels, steps, x, motion)
+    x = grid.to_world(positions)
+    residual = _residual(s, channels, x, nodes and carry(nodes, positions, x, frames))
+    for name, values in residual.items():
+        step = trajectory_step(1 / np.sqrt((1 / steps[name].astype(np.float64) ** 2).mean()), frames)
+        coefficients = rdo.trajectory(values, importance.weights[name], step, price)
+        if coefficients.any():
+            out["trajectories"][name] = {"coefficients": coefficients, "step": step}
     return out
+
+
+def _shown(s: Stack, middle: int, quality: float, keep_all: bool, cameras) -> tuple[Stack, Importance, float]:
+    """The Gaussians to code, what each matters, and the radius of the subject."""
+    radius, count = subject_radius(s.means[middle]), s.means.shape[1]
+    if not count:
+        sizes = {"means": 3, "quats": 3} | {n: v.shape[2] for n, v in _appearance(s).items()}
+        return s, Importance({n: np.zeros((0, c)) for n, c in sizes.items()}, np.zeros(0)), radius
+    importance = measure([s.frame(t) for t in sorted({0, middle, len(s.means) - 1})], cameras)
+    if not keep_all:
+        keep = importance.removal * count >= PRUNE * error_for(quality)
+        s, importance = s.take(keep), importance.take(keep)
+    return s, importance, radius
+
+
+def _steps(s: Stack, importance: Importance, middle: int, quality: float, radius: float) -> dict[str, np.ndarray]:
+    """[C] f32 step of each channel of each attribute."""
+    if not len(importance.removal):
+        nominal = steps_for(quality, radius)
+        return {n: np.full(w.shape[1], getattr(nominal, n), np.float32) for n, w in importance.weights.items()}
+    values = {n: v[middle] for n, v in _appearance(s).items()}
+    values |= {"means": s.means[middle], "quats": s.quats[middle, :, 1:]}
+    return steps_for_error(importance.weights, values, error_for(quality), radius)
 
 
 def _inside_unit_ball(channels: dict) -> dict:
