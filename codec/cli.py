@@ -63,16 +63,20 @@ def encode(
     frames: Frames = None,
     gop: Gop = 20,
     keep_all: Annotated[bool, typer.Option("--keep-all", help="Keep Gaussians that nobody can see.")] = False,
+    random_access: Annotated[
+        int, typer.Option(metavar="N", help="Frames from one independent group to the next at most; 0: no prediction.")
+    ] = 60,
+    layers: Annotated[int, typer.Option(help="Layers of importance; the first ones alone are a coarser picture.")] = 1,
     report: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the report there.")] = None,
 ) -> None:
     """Capture or Gaussian sequence to a stream. A second run resumes; Ctrl-C leaves a playable file."""
     from gscodec.commands import encode_input
+    from gscodec.encode.encode import EncodeSettings
     from gscodec.progress import Bar
 
     with Bar() as bar:
-        result = encode_input(
-            seq, out, quality=quality, preset=preset, frames=frames, gop=gop, keep_all=keep_all, bar=bar
-        )
+        settings = EncodeSettings(quality, keep_all, random_access, layers)
+        result = encode_input(seq, out, settings, preset=preset, frames=frames, gop=gop, bar=bar)
     if report:
         report.write_text(json.dumps(result.to_json(), indent=1))
     if result.groups == 0:
@@ -178,6 +182,8 @@ def info(
         f"{facts['bytes']} bytes, {facts['kb_per_frame']:.2f} kB/frame, {facts['mbit_per_s']:.2f} Mbit/s, "
         f"{facts['bits_per_gaussian_frame']:.3f} bits per Gaussian and frame"
     )
+    if len(facts["layers"]) > 1:
+        _out.print("bytes of the layers: " + ", ".join(str(layer["bytes"]) for layer in facts["layers"]))
     for name, u in facts["units"].items():
         _out.print(
             f"  {name:<32}{u['bytes']:>10} bytes {u['share']:>6.1%} {u['bits_per_gaussian']:>8.2f} bits/Gaussian/group"
@@ -206,6 +212,9 @@ def evaluate(
             _out.print(f"{key:<26}{value:.4f}")
         elif isinstance(value, int | str):
             _out.print(f"{key:<26}{value}")
+    for p in result.get("prefixes", ()):
+        psnr = p["codec_psnr"] if p["psnr"] is None else p["psnr"]
+        _out.print(f"first {p['layers']} layers: {p['kb_per_frame']:.2f} kB/frame, {psnr:.2f} dB")
 
 
 def _warn_if_cut(stream) -> None:

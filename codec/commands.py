@@ -24,12 +24,11 @@ AXES = ("x", "y", "z")
 def encode_input(
     source: Path,
     out: Path,
+    settings: EncodeSettings,
     *,
-    quality: float,
     preset: str,
     frames: str | None,
     gop: int,
-    keep_all: bool,
     bar: Bar,
 ) -> EncodeReport:
     """Encodes a capture or splats at `source` into the file `out`.
@@ -39,7 +38,6 @@ def encode_input(
     """
     from gscodec.splats import detect_input
 
-    settings = EncodeSettings(quality=quality, keep_all=keep_all)
     if gop < 1:
         raise UsageError(f"--gop {gop} is out of range, expected at least 1 frame in a group")
     out = Path(out)
@@ -103,7 +101,7 @@ def _restrict(sequence: GaussianSequence, frames: str | None) -> GaussianSequenc
             life = g.lifetimes
             if life is not None:
                 life = np.clip(life - a, 0, b - a)
-            groups.append(Group(g.frames[a:b], life))
+            groups.append(Group(g.frames[a:b], life, parents=g.parents if groups else None))
         start += len(g)
     return sequence.with_groups(groups)
 
@@ -177,26 +175,33 @@ def train_to_folder(
 
 
 def evaluate_stream(stream_path: Path, source: Path, *, split: str, frames: str | None, bar: Bar) -> dict:
-    """Measures a .gsv file against the capture or the splats it came from (keys: README, "Measures")."""
+    """Measures a .gsv file against the capture or the splats it came from (keys: README, "Measures").
+
+    `prefixes` has the figures of its first layers.
+    """
     from gscodec.decode import open_stream
+    from gscodec.decode.report import describe
     from gscodec.metrics.evaluate import evaluate_capture, evaluate_splats
     from gscodec.splats import detect_input, open_sequence
 
-    stream = open_stream(stream_path)
+    whole = open_stream(stream_path)
     on_progress = lambda done, total: bar.update("eval", done, total)  # noqa: E731
-    if detect_input(source) == "splats":
-        sequence = open_sequence(source)
-        chosen = frame_range(frames, min(stream.frame_count, sequence.frame_count))
-        result = evaluate_splats(stream.frame, sequence, frames=chosen, size=stream.byte_count, progress=on_progress)
-    else:
-        capture = _open_capture(source, None)
-        count = min(stream.frame_count, capture.frame_count)
-        chosen = frame_range(frames, count)
-        result = evaluate_capture(
-            stream.frame,
-            capture.frames(chosen.start, chosen.stop),
-            split=split,
-            size=stream.byte_count,
-            progress=on_progress,
-        )
+    splats = detect_input(source) == "splats"
+    reference = open_sequence(source) if splats else _open_capture(source, None)
+    chosen = frame_range(frames, min(whole.frame_count, reference.frame_count))
+
+    def measure(stream, size: int) -> dict:
+        options = {"size": size, "progress": on_progress}
+        if splats:
+            return evaluate_splats(stream.frame, reference, frames=chosen, **options)
+        return evaluate_capture(stream.frame, reference.frames(chosen.start, chosen.stop), split=split, **options)
+
+    result = measure(whole, whole.byte_count)
+    later = [layer["bytes"] for layer in describe(whole)["layers"]][1:]
+    if later:
+        result["prefixes"] = []
+    for k in range(len(later)):
+        found = measure(open_stream(stream_path, layers=k + 1), whole.byte_count - sum(later[k:]))
+        keys = ("bytes", "kb_per_frame", "gaussians", "psnr", "psnr_fg", "codec_psnr", "codec_psnr_fg")
+        result["prefixes"].append({"layers": k + 1} | {name: found[name] for name in keys})
     return result

@@ -113,11 +113,15 @@ class Group:
         frames: T items; may be a lazy sequence that loads on access.
         lifetimes: [N, 2] int32, the frames [t0, t1) of the group in which Gaussian i is shown; None: all frames.
         nodes: coarse motion if the trainer knows it; the encoder fits its own otherwise.
+        parents: [N] int32, index in the group before of the Gaussian that each one continues, -1 for a new one; no two
+            have the same parent. None: nothing is known, as in the first group. This is all that the encoder needs
+            to predict a group: a trainer that starts from the last group's Gaussians says so here.
     """
 
     frames: Sequence[Gaussians]
     lifetimes: np.ndarray | None = None
     nodes: Nodes | None = None
+    parents: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -2,7 +2,7 @@
 //
 //   source --payload--> group worker (decode, evaluate, project) --ellipses of a band--> raster worker --pixels--> canvas
 
-import { Native, load } from "./native.js";
+import { ALL, Native, load } from "./native.js";
 import { Ladder } from "./ladder.js";
 import { Source } from "./source.js";
 
@@ -21,6 +21,7 @@ function start(url) {
 export class Engine extends EventTarget {
   groups = new Map(); // group -> {state: fetching | decoding | ready | failed, worker, header, abort}
   failed = new Map(); // group -> message
+  layers = ALL; // of each group that are fetched and drawn
   stats = { decode: 0, project: 0, blend: 0, gaussians: 0, link: 0 };
   #workers = [];
   #rasters = [];
@@ -117,6 +118,18 @@ export class Engine extends EventTarget {
     else if (next !== null && this.ready(next)) this.#prefetch(next, loop);
   }
 
+  // From now on the first `layers` layers of each group.
+  show(layers) {
+    if (layers === this.layers) return;
+    this.layers = layers;
+    for (const [k, g] of this.groups) {
+      if (g.state === "decoding") continue;
+      g.abort?.abort(new DOMException("not needed any more", "AbortError"));
+      g.worker?.postMessage({ type: "release", group: k });
+      this.groups.delete(k);
+    }
+  }
+
   // The group that plays after i; damaged ones are passed over.
   #after(i, loop) {
     const n = this.source.groups.length;
@@ -134,18 +147,30 @@ export class Engine extends EventTarget {
     const entry = { state: "fetching", abort };
     this.groups.set(i, entry);
     try {
-      const payload = await this.source.payload(i, abort.signal);
+      const { layers } = this;
+      const payload = await this.source.payload(i, abort.signal, layers);
+      const reference = await this.#reference(i, payload, abort.signal, layers);
       if (this.groups.get(i) !== entry) return;
       // the idle worker, else the one that holds less
       const held = (w) => [...this.groups.values()].reduce((n, g) => n + (g.worker !== w ? 0 : g.state === "ready" ? 1 : 9), 0);
       entry.worker = this.#workers.reduce((a, b) => (held(b) < held(a) ? b : a));
       entry.state = "decoding";
       const level = this.source.level(i);
-      entry.worker.postMessage({ type: "decode", group: i, payload, level, bounds: !this.bounds });
+      entry.worker.postMessage({ type: "decode", group: i, payload, level, layers, reference, bounds: !this.bounds });
     } catch (e) {
       if (this.groups.get(i) !== entry || abort.signal.aborted) return;
       this.#fail(i, e.message);
     }
+  }
+
+  // {key, payload} of the group that a predicted one refers to.
+  async #reference(i, payload, signal, layers) {
+    const back = this.source.native.reference(payload);
+    if (!back) return null;
+    const r = i - back;
+    if (r < 0 || this.source.groups[i].sync) throw new Error("it refers to a group that is not in the file");
+    const bytes = await this.source.payload(r, signal, layers);
+    return { key: `${this.source.key(r)}, ${layers} layers`, payload: bytes };
   }
 
   // Payloads of the next seconds, one at a time.
@@ -155,7 +180,7 @@ export class Engine extends EventTarget {
     try {
       let seconds = 0;
       for (let k = this.#after(i, loop); k !== null && k > i && seconds < AHEAD; k = this.#after(k, false)) {
-        await this.source.payload(k);
+        await this.source.payload(k, undefined, this.layers);
         seconds += this.source.groups[k].frames / this.fps;
       }
     } catch {

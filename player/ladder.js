@@ -2,7 +2,7 @@
 // the device can carry just now.
 //
 // Read of the manifest: Representation with @bandwidth and BaseURL, as in the on-demand profile, where each representation
-// is one indexed file. Since any group decodes alone, the quality may change at every group that all files cut alike.
+// is one indexed file. The quality may change at every sync group that all files cut alike: predicted groups stay with theirs.
 
 import { Source, StreamError } from "./source.js";
 
@@ -60,6 +60,9 @@ export class Ladder extends EventTarget {
   get groups() {
     return this.#base?.groups ?? [];
   }
+  get native() {
+    return this.#base.native;
+  }
   get config() {
     return this.#base?.config ?? null;
   }
@@ -110,17 +113,29 @@ export class Ladder extends EventTarget {
     return best;
   }
 
-  async payload(i, signal) {
-    if (this.has(i)) return this.#rungs[this.#chosen.get(i)].source.payload(i, signal);
-    const rung = this.#chosen.size ? this.#choose() : 0;
+  // The sync group that group i is, or that those before it start with.
+  #start(i) {
+    while (i > 0 && !this.groups[i].sync) i--;
+    return i;
+  }
+
+  key(i) {
+    return `${i} of ${this.#chosen.get(i)}`;
+  }
+
+  async payload(i, signal, layers) {
+    const start = this.#start(i);
+    if (this.has(i)) return this.#rungs[this.#chosen.get(i)].source.payload(i, signal, layers);
+    const rung = this.#chosen.get(start) ?? (this.#chosen.size ? this.#choose() : 0);
     const told = this.groups[i];
     for (const k of [rung, 0]) {
       try {
         const source = await this.#open(k);
         const g = source.groups[i];
         if (g?.start_frame !== told.start_frame || g.frames !== told.frames) throw new StreamError("the files of the manifest are not cut alike");
-        const bytes = await source.payload(i, signal);
+        const bytes = await source.payload(i, signal, layers);
         this.#chosen.set(i, k);
+        this.#chosen.set(start, k);
         this.rung = k;
         return bytes;
       } catch (e) {

@@ -4,6 +4,10 @@
 // A module whose only function uses i8x16.splat: does this browser have simd128?
 const SIMD = [0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 10, 10, 1, 8, 0, 65, 0, 253, 15, 253, 98, 11];
 
+const HEADER = 1 << 14; // bytes that have the header of a group
+export const NONE = 255; // no slot
+export const ALL = 255; // layers
+
 export async function load(url) {
   if (typeof WebAssembly !== "object" || !WebAssembly.validate(new Uint8Array(SIMD))) {
     throw new Error("This browser has no WebAssembly SIMD, which the player needs. Any browser of 2023 or later has it.");
@@ -56,10 +60,19 @@ export class Native {
 
   // Groups
 
-  decode(slot, payload, level) {
+  // `reference`: the slot of the group that a predicted one refers to; `layers`: how many are decoded.
+  decode(slot, payload, level, reference = NONE, layers = ALL) {
     this.put(payload);
-    this.check(this.x.decode(slot, level));
+    this.check(this.x.decode(slot, level, reference, layers));
     return JSON.parse(this.text());
+  }
+
+  // How many groups back the group of a payload refers, 0: it is independent.
+  reference(payload) {
+    this.put(payload.subarray(0, HEADER));
+    const back = this.x.reference();
+    this.check(back >= 0);
+    return back;
   }
 
   frame(slot, t) {

@@ -1,12 +1,14 @@
 // <gsv-player src="URL"> plays a .gsv file: the clock, the size of the picture, and what the viewer is told.
 //
-// Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the picture fills the element); quality="auto" or 0.1 to 1.
+// Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the picture fills the element); quality="auto" or 0.1 to 1;
+// layers="2": only the first so many, else "all".
 // Properties: paused, frame, frameCount, fps, camera, stats. Methods: play(), pause(), show(frame). Events: ready, picture,
 // ended, error.
 
 import { Camera } from "./camera.js";
 import { MARKUP, clock, onDrag, onKeys, setIcon } from "./controls.js";
 import { Engine } from "./engine.js";
+import { ALL } from "./native.js";
 
 const BASE = new URL(".", import.meta.url);
 const PIXELS_MAX = 4e6; // of a still picture
@@ -16,7 +18,7 @@ const STILL = 250; // ms without a movement after which the picture is drawn sha
 const STALL = 300; // ms without a picture after which the viewer is told to wait
 
 export class GsvPlayer extends HTMLElement {
-  static observedAttributes = ["src", "loop", "speed", "quality", "size"];
+  static observedAttributes = ["src", "loop", "speed", "quality", "size", "layers"];
   paused = true;
   speed = 1;
   quality = "auto";
@@ -71,7 +73,13 @@ export class GsvPlayer extends HTMLElement {
     if (name === "loop") this.$("[data-do=loop]").setAttribute("aria-pressed", value !== null);
     if (name === "speed" && Number(value) > 0) this.speed = Number(value);
     if (name === "quality" && value) this.quality = value === "auto" ? value : Math.min(Math.max(Number(value) || 1, 0.1), 1);
+    if (name === "layers") this.engine?.show(this.#layers);
     for (const set of ["speed", "quality"]) this.$(`[data-set=${set}]`).value = String(this[set]);
+  }
+
+  get #layers() {
+    const n = Number(this.getAttribute("layers"));
+    return n >= 1 ? n : ALL;
   }
 
   get loop() {
@@ -137,11 +145,12 @@ export class GsvPlayer extends HTMLElement {
     Object.assign(this, { camera: null, paused: true });
     [this.#position, this.#scale, this.#drawn] = [0, null, ""];
     const engine = (this.engine = new Engine(this.$("canvas"), BASE, this.getAttribute("src")));
+    engine.layers = this.#layers;
     const { source } = engine;
     const on = (target, type, f) => target.addEventListener(type, (e) => this.engine === engine && f(e.detail));
     on(engine, "damaged", (d) => this.#damaged(d));
     on(engine, "fatal", (message) => this.#fail("The player has stopped", `${message}.`));
-    on(engine, "decoded", () => this.#begin(engine));
+    on(engine, "decoded", ({ header }) => this.#begin(engine, header));
     on(engine, "picture", (detail) => this.#pictured(detail));
     on(source, "retry", (why) => this.#note("link", `Connection lost (${why}). Trying again…`, true));
     on(source, "connected", () => this.#note("link", null));
@@ -178,8 +187,13 @@ export class GsvPlayer extends HTMLElement {
   }
 
   // The first group is decoded: there is something to look at.
-  #begin(engine) {
+  #begin(engine, header) {
     if (this.camera) return;
+    const layers = this.$("[data-set=layers]");
+    layers.hidden = header.layers < 2;
+    const choices = Array.from({ length: header.layers - 1 }, (_, k) => new Option(`${k + 1} of ${header.layers} layers`, k + 1));
+    layers.replaceChildren(new Option("All layers", "all"), ...choices);
+    layers.value = this.#layers === ALL ? "all" : String(Math.min(this.#layers, header.layers - 1));
     const { config } = engine.source;
     this.camera = new Camera(engine.bounds, config.up, config.cameras);
     const select = this.$("[data-set=view]");
@@ -257,7 +271,7 @@ export class GsvPlayer extends HTMLElement {
 
   #draw(now) {
     const view = this.#view(this.paused && now - this.#moved > STILL);
-    const what = `${this.frame} ${view}`;
+    const what = `${this.frame} ${view} ${this.engine.layers}`;
     if (what === this.#drawn) return;
     this.#drawn = what;
     this.engine.draw(this.frame, view);

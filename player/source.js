@@ -1,9 +1,12 @@
-// A .gsv file behind a URL: where its groups are, and their bytes, by HTTP Range.
+// A .gsv file behind a URL: where its groups are, and their bytes, by HTTP Range. Of a file whose index tells where layers end
+// (ssix), only the first layers are fetched where no more are wanted.
 //
 // A finished file has an index (sidx), so one small request tells everything; without it the headers of the fragments are
 // walked, and a file that still grows is asked for more. A server that ignores Range sends the whole file, which is then kept.
 // Only headers that need no CORS preflight are sent, so any static host will do. A connection that breaks is taken up again
 // where it broke.
+
+import { ALL } from "./native.js";
 
 const HEAD = 1 << 16; // first request
 const STEP = 1 << 12; // a moof and the header of its mdat
@@ -22,13 +25,14 @@ const sleep = (ms, signal) =>
 export class StreamError extends Error {}
 
 export class Source extends EventTarget {
-  groups = []; // {start_frame, frames, offset, size, indexed}: of the payload, or of the fragment if `indexed`
+  groups = []; // {start_frame, frames, sync, offset, size, indexed, ends}: of the payload, or of the fragment if `indexed`;
+  // ends: bytes of it that end with each layer, if that is known
   config = null;
   total = null; // bytes of the file, null if unknown
   complete = false; // nothing will be added
   settled = false; // not complete, and nothing has been added for a while
   received = 0;
-  #cache = new Map();
+  #cache = new Map(); // group -> {bytes, whole}
   #whole = null; // all bytes so far, from a server without Range
   #closing = new AbortController();
 
@@ -57,7 +61,7 @@ export class Source extends EventTarget {
     if (!d.config) throw new StreamError("The file ends before its header does.");
     this.config = d.config;
     if (d.index.length && !this.#whole) {
-      this.#useIndex(d.index);
+      this.#useIndex(d.index, d.layers);
     } else {
       this.#list();
       this.#walk().catch((e) => this.#say("error", e));
@@ -77,19 +81,25 @@ export class Source extends EventTarget {
     this.#closing.abort(new StreamError("closed"));
   }
 
-  // Bytes of group i.
-  async payload(i, signal) {
+  // Names the bytes that `payload` gives: equal for equal ones.
+  key(i) {
+    return String(i);
+  }
+
+  // Bytes of group i, or of its first layers.
+  async payload(i, signal, layers = ALL) {
+    const g = this.groups[i];
+    const size = g.ends?.[layers - 1] ?? g.size;
     const kept = this.#cache.get(i);
-    if (kept) {
+    if (kept && kept.size >= size) {
       this.#cache.delete(i);
       this.#cache.set(i, kept); // the one that was used last is dropped last
-      return kept;
+      return kept.bytes;
     }
-    const g = this.groups[i];
-    let bytes = await this.#read(g.offset, g.offset + g.size, signal);
-    if (bytes.length < g.size) throw new StreamError("the file ends within them");
+    let bytes = await this.#read(g.offset, g.offset + size, signal);
+    if (bytes.length < size) throw new StreamError("the file ends within them");
     if (g.indexed) bytes = this.#unwrap(g, bytes);
-    this.#keep(i, bytes);
+    this.#keep(i, { bytes, size });
     return bytes;
   }
 
@@ -97,32 +107,34 @@ export class Source extends EventTarget {
     this.dispatchEvent(new CustomEvent(type, { detail }));
   }
 
-  #keep(i, bytes) {
-    this.#cache.set(i, bytes);
+  #keep(i, entry) {
+    this.#cache.delete(i);
+    this.#cache.set(i, entry);
     let size = 0;
-    for (const b of this.#cache.values()) size += b.length;
-    for (const [k, b] of this.#cache) {
+    for (const { bytes } of this.#cache.values()) size += bytes.length;
+    for (const [k, { bytes }] of this.#cache) {
       if (size <= CACHE || k === i) break;
       this.#cache.delete(k);
-      size -= b.length;
+      size -= bytes.length;
     }
   }
 
-  #useIndex(index) {
+  #useIndex(index, layers) {
     const end = this.total ?? Infinity;
     const whole = index.filter((g) => g.offset + g.size <= end);
     this.missing = index.slice(whole.length).reduce((n, g) => n + g.frames, 0);
-    this.groups = whole.map((g) => ({ ...g, indexed: true }));
+    this.groups = whole.map((g, i) => ({ ...g, indexed: true, ends: layers[i] }));
     this.complete = true;
     this.#say("groups");
   }
 
-  // The payload within a fragment that the index named.
+  // The payload within a fragment that the index named, or within the start of one.
   #unwrap(g, fragment) {
     const known = this.native.describe().groups.length;
     this.native.x.seek(g.offset);
     this.native.push(fragment);
-    const [found, more] = this.native.describe(known).groups;
+    const { groups, pending } = this.native.describe(known);
+    const [found, more] = fragment.length < g.size ? [pending] : groups;
     if (!found || more || found.start_frame !== g.start_frame || found.frames !== g.frames) {
       throw new StreamError("the index of the file disagrees with its fragments");
     }

@@ -4,8 +4,9 @@
 // raster: ellipses of a band -> its pixels, to the page.
 //
 // Two group workers take turns: one shows its group while the other decodes the next, so nothing decoded ever has to travel.
+// Each keeps the last group that others referred to, since more of these will follow.
 
-import { Native } from "./native.js";
+import { NONE, Native } from "./native.js";
 
 const roles = { group: groupWorker, raster: rasterWorker };
 
@@ -20,11 +21,31 @@ function groupWorker(native, { ports }) {
   ports.forEach((port, i) => (port.onmessage = ({ data }) => spare[i].length < 3 && spare[i].push(data)));
   let shown = "";
 
-  function decode({ group, payload, level, bounds }) {
-    const start = performance.now();
+  let kept = { slot: NONE }; // {key, slot} of the last reference
+
+  function spareSlot() {
     let slot = 0;
-    while ([...slots.values()].includes(slot)) slot++;
-    const header = native.decode(slot, payload, level);
+    while (slot === kept.slot || [...slots.values()].includes(slot)) slot++;
+    return slot;
+  }
+
+  // The slot of the group that `key` and `payload` are of.
+  function keep({ key, payload }, level, layers) {
+    if (kept.key !== key) {
+      if (kept.slot !== NONE) native.x.release(kept.slot);
+      kept = { slot: NONE };
+      const slot = spareSlot();
+      native.decode(slot, payload, level, NONE, layers);
+      kept = { key, slot };
+    }
+    return kept.slot;
+  }
+
+  function decode({ group, payload, level, bounds, layers, reference }) {
+    const start = performance.now();
+    const from = reference ? keep(reference, level, layers) : NONE;
+    const slot = spareSlot();
+    const header = native.decode(slot, payload, level, from, layers);
     slots.set(group, slot);
     shown = "";
     if (bounds) {

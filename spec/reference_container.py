@@ -76,6 +76,9 @@ LEVELS = {  # clause 5: N, frames, nodes, symbols, bytes of a group
 }
 
 
+PAIRS = {1: 2**26, 2: 2**28, 3: 2**30, 4: 2**32}  # clause 5: N M
+
+
 # ---- 2. Container ---------------------------------------------------------------------------------------------------
 
 HEADER_BOXES = (b"ftyp", b"moov", b"sidx", b"moof")  # of the top level

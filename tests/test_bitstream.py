@@ -280,7 +280,7 @@ def test_what_is_not_damaged_decodes():
     decoded = _native.DecodedGroup(bad, 1, strict=False)
     [damage] = decoded.damage()
     assert damage.pop("message").endswith("the unit is damaged")
-    assert damage == {"unit": unit, "type": "trajectories", "attribute": "sh0"}
+    assert damage == {"unit": unit, "type": "trajectories", "layer": 0, "attribute": "sh0"}
     for t in (0, 5):
         frame, want = decoded.frame(t), sound.frame(t)
         np.testing.assert_array_equal(frame["means"], want["means"])
@@ -390,7 +390,7 @@ def make_file(frames=(20, 1, 7)):
     parts, index, start = [], [], 0
     for number, n in enumerate(frames, 1):
         parts.append(_native.fragment(payload, number, start, n, number != 2, CONFIG))
-        index.append((len(parts[-1]), n, number != 2))
+        index.append((len(parts[-1]), n, number != 2, []))
         start += n
     return _native.finish(init, index) + b"".join(parts), payload
 

@@ -30,18 +30,13 @@ INVALID = {Path(entry["file"]).stem: entry for entry in MANIFEST["invalid"]}
 
 def native_groups(data):
     """[(fragment, DecodedGroup)] of a file, by the package."""
-    file = _native.demux(data)
-    groups = []
-    for fragment in file["groups"]:
-        payload = data[fragment["offset"] : fragment["offset"] + fragment["size"]]
-        groups.append((fragment, _native.DecodedGroup(payload, file["config"]["level"])))
-    return groups
+    stream = Stream(data)
+    return [(fragment, stream.group(i)) for i, fragment in enumerate(stream.groups)]
 
 
 def decode_all(data):
     """Every group, by who knows both the file and the group, and so compares them."""
-    stream = Stream(data)
-    return [stream.group(i) for i in range(len(stream.groups))]
+    return [group for _, group in native_groups(data)]
 
 
 def native_hash(integers):
@@ -118,6 +113,27 @@ def test_reference_stops_at_the_cap_of_symbols(monkeypatch):
     monkeypatch.setitem(reference.LEVELS, 1, (65536, 64, 1024, symbols + 10, 2**24))
     with pytest.raises(reference.LimitError, match="symbols"):
         reference.decode_group(payload, 1)
+
+
+@pytest.mark.parametrize("name", ["layers", "layers_most", "layers_predicted", "layer_corrections"])
+def test_prefix(name):
+    """Both decoders decode the first layers alone, also where the sample ends behind them."""
+    data = (VECTORS / VALID[name]["file"]).read_bytes()
+    _, samples = reference.read_container(data)
+    for layers in (1, 2, 3):
+        stream, groups = Stream(data, layers=layers), []
+        for i, sample in enumerate(samples):
+            units = _native.units(sample.payload)
+            end = min((u["offset"] for u in units if u["layer"] >= layers), default=len(sample.payload))
+            options = {"reference": groups[0] if i else None, "layers": layers}
+            groups.append(reference.decode_group(sample.payload[:end], 1, **options))
+            ours = stream.group(i)
+            assert ours.layers == groups[i].counts
+            assert native_hash(ours.integers()) == reference.group_hash(groups[i])
+            expected = reference.evaluate(groups[i], 0)
+            expected.pop("shown")
+            for key, values in expected.items():
+                assert_close(ours.frame(0)[key], values, f"{name}, {layers} layers, {key}")
 
 
 def test_reference_command(tmp_path):

@@ -17,7 +17,7 @@ from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
 from gscodec.encode.group import group_integers, stack_group
 from gscodec.encode.motion import carry, choose_nodes
 from gscodec.encode.writer import StreamWriter
-from gscodec.errors import UsageError
+from gscodec.errors import BitstreamError, CaptureError, UsageError
 from gscodec.gaussians import Gaussians, Group
 
 
@@ -147,6 +147,73 @@ def test_frames_in_any_order_are_the_same(tmp_path):
     stream = open_stream(tmp_path / "a.gsv")
     for t in (11, 0, 5, 6, 1, 10, 3):
         np.testing.assert_array_equal(stream.frame(t).means, straight[t].means)
+
+
+def changing(frames=6) -> list[Group]:
+    """Two groups of a turning body: in the second, 40 Gaussians have gone and 40 are new."""
+    whole = turning(400, frames=2 * frames).groups[0]
+    take = lambda t, index: whole.frames[t].take(index)  # noqa: E731
+    first, second = np.arange(360), np.arange(400)[::-1][:360]
+    parents = np.where(second < 360, second, -1).astype(np.int32)
+    return [
+        Group([take(t, first) for t in range(frames)]),
+        Group([take(frames + t, second) for t in range(frames)], parents=parents),
+    ]
+
+
+@pytest.mark.parametrize("layers", [1, 3])
+def test_a_predicted_group_costs_less_and_keeps_the_content(tmp_path, layers):
+    groups = changing()
+    sequence = turning().with_groups(groups)
+    alone = write(sequence, tmp_path / "alone.gsv", quality=80, keep_all=True, random_access=0, layers=layers)
+    report = write(sequence, tmp_path / "a.gsv", quality=80, keep_all=True, layers=layers)
+    assert (alone.predicted, report.predicted) == (0, 1)
+    assert report.bytes < 0.85 * alone.bytes
+    assert report.units["deaths"] < 100
+    stream = open_stream(tmp_path / "a.gsv")
+    assert [g["sync"] for g in stream.groups] == [True, False]
+    assert stream.group(1).reference == 1
+    assert (stream.group(1).parents() < 0).sum() == 40
+    independent = open_stream(tmp_path / "alone.gsv")
+    for t in (6, 8, 11):  # the predicted one first: a seek
+        a = sequence.frame(t)
+        errors = []
+        for s in (independent, stream):
+            b = s.frame(t)
+            i = nearest(a, b)
+            assert len(np.unique(i)) == len(a) == len(b)
+            b = b.take(i)
+            ca, cb = covariances(a), covariances(b)
+            shape = np.linalg.norm(ca - cb, axis=(1, 2)) / np.linalg.norm(ca, axis=(1, 2))
+            errors.append([np.abs(a.means - b.means).mean(), np.abs(a.sh0 - b.sh0).mean(), np.median(shape)])
+        assert (np.array(errors[1]) < 1.5 * np.array(errors[0])).all(), errors
+
+
+def test_a_group_that_refers_to_a_damaged_one_is_named(tmp_path):
+    write(turning().with_groups(changing()), tmp_path / "a.gsv")
+    data = bytearray((tmp_path / "a.gsv").read_bytes())
+    group = Stream(data).groups[0]
+    data[group["offset"] + 20] ^= 1  # in the header
+    with pytest.raises(BitstreamError, match=r"group 1 .*group 0 .*CRC"):
+        Stream(data, strict=False).group(1)
+
+
+def test_random_access_bounds_the_prediction(tmp_path):
+    group = turning(60, frames=4).groups[0]
+    same = np.arange(60, dtype=np.int32)
+    groups = [group] + [Group(group.frames, parents=same)] * 4
+    for random_access, syncs in ((12, "SPPSP"), (5, "SSSSS"), (0, "SSSSS"), (100, "SPPPP")):
+        write(turning().with_groups(groups), tmp_path / "a.gsv", random_access=random_access)
+        stream = open_stream(tmp_path / "a.gsv")
+        assert "".join("PS"[g["sync"]] for g in stream.groups) == syncs
+        assert len(stream.frame(19)) == len(stream.frame(0))
+
+
+@pytest.mark.parametrize("parents", [np.zeros(60, int), np.arange(50), np.arange(60) + 1])
+def test_parents_that_do_not_fit_are_refused(tmp_path, parents):
+    group = turning(60, frames=2).groups[0]
+    with pytest.raises(CaptureError, match="parents of a group"):
+        write(turning().with_groups([group, Group(group.frames, parents=parents)]), tmp_path / "a.gsv")
 
 
 def test_ctrl_c_leaves_a_playable_file_and_a_second_run_goes_on(tmp_path):

@@ -2,12 +2,14 @@
 
 import base64
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from playing import GROUPS, LENGTH, PLAYER, canvas, load, part, psnr, show
+from playing import FPS, GROUPS, LENGTH, PLAYER, canvas, load, part, psnr, sequence, show
 
 from gscodec.decode import open_stream
+from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
 from gscodec.render.image import render_image
 
 VECTORS = Path(__file__).parent.parent / "spec" / "vectors" / "valid"
@@ -133,6 +135,34 @@ def test_a_phone(browser, server, tmp_path):
         browser.resize(1280, 800)
 
 
+def test_predicted_groups_and_their_layers(browser, server, other, tmp_path):
+    s = sequence(4000)
+    same = np.arange(4000, dtype=np.int32)
+    s = s.with_groups([replace(g, parents=same if k else None) for k, g in enumerate(s.groups)])
+    path = tmp_path / "layers.gsv"
+    config = stream_config(fps=FPS, sh_degree=0, gaussians=4000, frames=LENGTH)
+    settings = EncodeSettings(quality=90, layers=3, random_access=3 * LENGTH)
+    encode_groups(lambda done, frames: iter(s.groups[done:]), path, config, settings, fingerprint={})
+    stream = open_stream(path)
+    assert [g["sync"] for g in stream.groups] == [True, False, False, True, False]
+    url, handler = other(path.read_bytes())
+    load(browser, server.url, src=url, size="160x120", autoplay="off", loop="off", layers="1")
+
+    def compare(stream, t):
+        camera = show(browser, t)
+        want = render_image(stream.frame(t), camera, tuple(stream.config["background"]))
+        assert psnr(canvas(browser), want) >= 35, t
+
+    for t in (4 * LENGTH + 1, LENGTH, 2 * LENGTH + 3):  # the references are behind
+        compare(open_stream(path, layers=1), t)
+    asked = [tuple(map(int, value[6:].split("-"))) for value in handler.log][1:]
+    assert sum(b - a + 1 for a, b in asked) < path.stat().st_size / 2
+    browser.eval(f"{PLAYER}.setAttribute('layers', 'all')")
+    for t in (2 * LENGTH + 3, 0, 4 * LENGTH):
+        compare(stream, t)
+    assert browser.errors == []
+
+
 # The module itself, without the page
 
 INSTANCE = """
@@ -159,9 +189,10 @@ def test_every_vector_decodes_to_the_frames_of_the_native_decoder(browser, serve
     browser.goto(server.url + "?src=none.gsv")
     body = """
         const out = [];
-        for (const g of groups) {
-            native.decode(0, payload(g), config.level);
-            native.frame(0, g.frames >> 1);
+        for (const [i, g] of groups.entries()) {
+            const back = native.reference(payload(g));
+            native.decode(i, payload(g), config.level, back ? i - back : undefined);
+            native.frame(i, g.frames >> 1);
             for (let a = 0; a < 6; a++) { native.x.attribute(a); out.push(base64(native.output())); }
         }
         return [out, native.describe()];

@@ -15,6 +15,7 @@ class Level:
     Attributes:
         level: number in the stream.
         gaussians, frames, nodes: counts.
+        pairs: Gaussians times nodes.
         symbols: integers, as counted by spec 5.
         bytes: size of the payload.
     """
@@ -23,6 +24,7 @@ class Level:
     gaussians: int
     frames: int
     nodes: int
+    pairs: int
     symbols: int
     bytes: int
 

@@ -11,19 +11,31 @@ from gscodec.render.png import write_png
 
 
 def describe(stream: Stream) -> dict:
-    """Facts of a whole file; `units` maps a unit's name to bytes, share of the file and bits per Gaussian and group."""
+    """Facts of a whole file.
+
+    `units` maps a unit's name to bytes, share of the file and bits per Gaussian and group; `layers` the bytes of
+    each layer.
+    """
     units: dict[str, int] = {}
+    layers: dict[int, int] = {}
     groups, most, gaussian_frames = [], 0, 0
     for i, g in enumerate(stream.groups):
         decoded = stream.group(i)
         most = max(most, decoded.count)
         gaussian_frames += decoded.count * g["frames"]
         groups.append(
-            {"start_frame": g["start_frame"], "frames": g["frames"], "bytes": g["size"], "gaussians": decoded.count}
+            {
+                "start_frame": g["start_frame"],
+                "frames": g["frames"],
+                "bytes": g["size"],
+                "gaussians": decoded.count,
+                "reference": i - decoded.reference if decoded.reference else None,
+            }
         )
         for u in decoded.units():
             name = " ".join(x for x in (u["type"], u["attribute"]) if x)
             units[name] = units.get(name, 0) + u["bytes"]
+            layers[u["layer"]] = layers.get(u["layer"], 0) + u["bytes"]
     total, frames = stream.byte_count, max(stream.frame_count, 1)
     units["container"] = total - sum(units.values())
     coded = max(sum(g["gaussians"] for g in groups), 1)
@@ -42,6 +54,7 @@ def describe(stream: Stream) -> dict:
         "cameras": [c["name"] for c in stream.config["cameras"]],
         "complete": stream.complete,
         "units": {n: {"bytes": b, "share": b / total, "bits_per_gaussian": 8 * b / coded} for n, b in units.items()},
+        "layers": [{"bytes": layers[k]} for k in sorted(layers)],
         "per_group": groups,
     }
 

@@ -1,6 +1,7 @@
 """A .gsv file as frames: demux (headers only), decode groups on demand, evaluate the frame that is asked for.
 
-Any frame is one evaluation away from its group's coefficients, so seeking costs at most one group. Needs numpy only.
+Any frame is one evaluation away from its group's coefficients, so seeking costs at most one group, and for a predicted
+one the group that it refers to. Needs numpy only.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from gscodec.camera import Camera
 from gscodec.errors import BitstreamError, LimitError
 from gscodec.gaussians import Gaussians, GaussianSequence, Group
 
-GROUPS_HELD = 2  # decoded groups in memory: the one that plays and the next
+GROUPS_HELD = 3  # decoded groups in memory: the one that plays, the next, and the one to which they refer
 
 
 class Stream:
@@ -30,10 +31,11 @@ class Stream:
         groups: list of {offset, size, start_frame, frames, sync}.
         complete: false if the file ends inside a group (that group is left out).
         strict: damage is an error; otherwise what is not damaged is decoded, and `damage` tells of the rest.
+        layers: how many layers of each group are decoded; None: all.
     """
 
-    def __init__(self, data, name: str = "stream", *, strict: bool = True):
-        self.name, self._data, self.strict = name, data, strict
+    def __init__(self, data, name: str = "stream", *, strict: bool = True, layers: int | None = None):
+        self.name, self._data, self.strict, self.layers = name, data, strict, layers
         index = _native.demux(data)
         self.config, self.groups, self.complete = index["config"], index["groups"], index["complete"]
         self._held: OrderedDict[int, object] = OrderedDict()
@@ -53,10 +55,11 @@ class Stream:
 
     @property
     def damage(self) -> list[dict]:
-        """What was damaged in the groups decoded so far: dicts of group, unit, type, attribute, message.
+        """What was damaged in the groups decoded so far: dicts of group, unit, type, layer, attribute, message.
 
         Damaged trajectories stand still, and a damaged attribute has its offsets everywhere. `unit` is None where a
-        unit is missing because one before it is damaged. A group without sound header and positions stays an error.
+        unit is missing because one before it is damaged. Groups that refer to a damaged one show its damage, which is
+        listed once, for that one. A group without sound header and positions stays an error.
         """
         return [{"group": i, **d} for i, found in sorted(self._damage.items()) for d in found]
 
@@ -86,10 +89,14 @@ class Stream:
             LimitError: it exceeds the level of the file.
         """
         if i not in self._held:
+            where = f"{self.name}: group {i} (frames {self._span(i)})"
             try:
-                group = _native.DecodedGroup(self.payload(i), self.config["level"], self.strict)
+                payload = self.payload(i)
+                reference = self._reference(i, _native.reference_of(payload))
+                options = {"reference": reference} | ({} if self.layers is None else {"layers": self.layers})
+                group = _native.DecodedGroup(payload, self.config["level"], self.strict, **options)
             except (BitstreamError, LimitError) as e:
-                raise type(e)(f"{self.name}: group {i} (frames {self._span(i)}): {e}") from None
+                raise type(e)(f"{where}: {e}") from None
             self._check(i, group)
             if found := group.damage():
                 self._damage[i] = found
@@ -98,6 +105,16 @@ class Stream:
                 self._held.popitem(last=False)
         self._held.move_to_end(i)
         return self._held[i]
+
+    def _reference(self, i: int, back: int):
+        """The group to which group `i` refers, `back` groups before it; None if it is independent."""
+        if back == 0:
+            return None
+        if back > i or self.groups[i]["sync"]:
+            raise BitstreamError(
+                f"predicted from the group {back} before it: expected one of the file, and this to be no sync sample"
+            )
+        return self.group(i - back)
 
     def _check(self, i: int, group) -> None:
         """What the header of a group must have in common with the file (spec 4), which a group does not know."""
@@ -163,8 +180,12 @@ class _Frames(Sequence):
         return Gaussians(**self.stream.group(self.i).frame(t))
 
 
-def open_stream(path: str | Path, *, strict: bool = True) -> Stream:
-    """Opens a .gsv file; not `strict`: what is not damaged is decoded, `Stream.damage` tells of the rest.
+def open_stream(path: str | Path, *, strict: bool = True, layers: int | None = None) -> Stream:
+    """Opens a .gsv file.
+
+    Args:
+        strict: damage is an error; otherwise what is not damaged is decoded, and `Stream.damage` tells of the rest.
+        layers: how many layers of each group are decoded; None: all.
 
     Raises:
         FileNotFoundError: nothing is there.
@@ -176,6 +197,6 @@ def open_stream(path: str | Path, *, strict: bool = True) -> Stream:
             raise BitstreamError(f"{path}: the file is empty, expected a .gsv stream")
         data = mmap.mmap(f.fileno(), 0, access=mmap.ACCESS_READ)
     try:
-        return Stream(data, str(path), strict=strict)
+        return Stream(data, str(path), strict=strict, layers=layers)
     except BitstreamError as e:
         raise BitstreamError(f"{path}: {e}") from None

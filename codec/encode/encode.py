@@ -1,7 +1,7 @@
 """GaussianSequence -> .gsv: the loop over groups, with progress, interruption and resume.
 
 Groups come one at a time from `groups` (a trainer yields them as they are done), are turned to integers, to bytes, and
-appended. Nothing of an earlier group is needed, so a run that stops goes on where it stopped.
+appended. A run that stops goes on where it stopped, with an independent group.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec import _native
 from gscodec.bitstream.levels import smallest_level
 from gscodec.camera import Camera
-from gscodec.encode.group import group_integers
+from gscodec.encode.coder import CodedGroup, GroupCoder
 from gscodec.encode.writer import StreamWriter
 from gscodec.errors import UsageError
 from gscodec.gaussians import Group
+
+LAYERS_MAX = 16  # spec 4
 
 
 @dataclass(frozen=True)
@@ -29,14 +30,23 @@ class EncodeSettings:
     Attributes:
         quality: 0 (small) to 100 (fine); 50 is about 41 dB against the input.
         keep_all: also code Gaussians that are never visible.
+        random_access: frames from one independent group to the next at most; the groups between are predicted from it
+            where their parents are known and it is cheaper. 0 or 1: every group is independent.
+        layers: layers of importance in each group; any first few decode alone.
     """
 
     quality: float = 50.0
     keep_all: bool = False
+    random_access: int = 60
+    layers: int = 1
 
     def __post_init__(self):
         if not 0 <= self.quality <= 100:
             raise UsageError(f"--quality {self.quality:g} is out of range, expected 0 (small) to 100 (fine)")
+        if self.random_access < 0:
+            raise UsageError(f"--random-access {self.random_access} is out of range, expected 0 frames or more")
+        if not 1 <= self.layers <= LAYERS_MAX:
+            raise UsageError(f"--layers {self.layers} is out of range, expected 1 to {LAYERS_MAX}")
 
 
 @dataclass
@@ -45,6 +55,7 @@ class EncodeReport:
 
     frames: int = 0
     groups: int = 0
+    predicted: int = 0  # of these, in this run
     bytes: int = 0
     gaussians: int = 0  # most in one group
     interrupted: bool = False
@@ -113,23 +124,27 @@ def encode_groups(
     Ctrl-C finishes the file with the groups done and returns with `interrupted` set; the next run goes on.
     """
     writer = StreamWriter(out, config, fingerprint)
-    report = EncodeReport(seconds={"input": 0.0, "quantize": 0.0, "entropy": 0.0})
-    cameras = [
-        Camera(c["name"], np.array(c["K"]), np.array(c["viewmat"]), c["width"], c["height"]) for c in config["cameras"]
-    ]
+    coder = GroupCoder(
+        quality=settings.quality,
+        keep_all=settings.keep_all,
+        layers=settings.layers,
+        random_access=settings.random_access,
+        cameras=[
+            Camera(c["name"], np.array(c["K"]), np.array(c["viewmat"]), c["width"], c["height"])
+            for c in config["cameras"]
+        ],
+    )
+    report = EncodeReport(seconds={"input": 0.0, "code": 0.0})
     clock = time.perf_counter
     try:
         mark = clock()
         for group in groups(writer.groups, writer.frames):
             report.seconds["input"] += clock() - mark
             mark = clock()
-            integers = group_integers(group, settings.quality, keep_all=settings.keep_all, cameras=cameras)
-            report.seconds["quantize"] += clock() - mark
-            mark = clock()
-            payload, units = _native.encode_group(integers)
-            report.seconds["entropy"] += clock() - mark
-            writer.append(payload, len(group))
-            _account(report, writer, len(integers["positions"]), units)
+            coded = coder.code(group)
+            report.seconds["code"] += clock() - mark
+            writer.append(coded.payload, len(group), sync=coded.independent)
+            _account(report, writer, coded)
             if on_group:
                 on_group(report)
             mark = clock()
@@ -145,9 +160,10 @@ def encode_groups(
     return report
 
 
-def _account(report: EncodeReport, writer: StreamWriter, count: int, units: list[dict]) -> None:
+def _account(report: EncodeReport, writer: StreamWriter, coded: CodedGroup) -> None:
     report.frames, report.groups, report.bytes = writer.frames, writer.groups, writer.bytes
-    report.gaussians = max(report.gaussians, count)
-    for u in units:
+    report.gaussians = max(report.gaussians, coded.gaussians)
+    report.predicted += not coded.independent
+    for u in coded.units:
         name = u["type"] if not u.get("attribute") else f"{u['type']} {u['attribute']}"
         report.units[name] = report.units.get(name, 0) + u["bytes"]

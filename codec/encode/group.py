@@ -13,12 +13,12 @@ import numpy as np
 
 from gscodec import _native
 from gscodec.bitstream.color import decorrelate
-from gscodec.bitstream.quantization import error_for, steps_for, subject_radius, trajectory_step
+from gscodec.bitstream.quantization import Steps, error_for, steps_for, subject_radius, trajectory_step
 from gscodec.camera import Camera
 from gscodec.encode import rdo
-from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply
+from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
 from gscodec.encode.importance import Importance, measure, steps_for_error
-from gscodec.encode.motion import NEIGHBORS, NodeMotion, carry, choose_nodes
+from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes
 from gscodec.gaussians import Gaussians, Group
 
 GRID_BITS_MAX = 21
@@ -60,9 +60,8 @@ def stack_group(group: Group) -> Stack:
     return Stack(*arrays, life)
 
 
-def align_axes(s: Stack, middle: int) -> Stack:
-    """Every Gaussian in the form of `canonical_axes`, the same choice in all frames, quaternions continuous in time."""
-    turn, order = canonical_axes(s.quats[middle], s.log_scales[middle])
+def align_axes(s: Stack, middle: int, turn: np.ndarray, order: np.ndarray) -> Stack:
+    """Every Gaussian in the form that `canonical_axes` chose, in all frames, quaternions continuous in time."""
     quats = quat_multiply(s.quats, turn[None].astype(np.float32))
     quats[middle] *= np.where(quats[middle, :, :1] < 0, -1, 1)
     for t in [*range(middle + 1, len(quats)), *range(middle - 1, -1, -1)]:
@@ -123,24 +122,6 @@ def _appearance(s: Stack) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _rest_pose(s: Stack, x: np.ndarray, motion: NodeMotion | None) -> tuple[np.ndarray, np.ndarray]:
-    """Means [N, 3] and quaternions [N, 4] that the nodes carry nearest to all frames, from positions x [N, 3] that they
-    carry already: what jitters in one frame is not the canonical of all."""
-    if motion is None:
-        turned_back, left = s.quats, s.means - x[None].astype(np.float32)
-    else:
-        back = quat_conjugate(motion.turned)
-        turned_back, left = quat_multiply(back, s.quats), _rotate(back, s.means - motion.carried)
-    quats = turned_back.mean(0)
-    return x + left.mean(0), quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
-
-
-def _rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """[..., 3] vectors turned by unit quaternions [..., 4]."""
-    u = np.cross(q[..., 1:], v)
-    return v + 2 * (q[..., :1] * u + np.cross(q[..., 1:], u))
-
-
 def _residual(s: Stack, channels: dict, x: np.ndarray, motion: NodeMotion | None) -> dict[str, np.ndarray]:
     """[T, N, C] f32 of each attribute: what canonical values and nodes leave over."""
     v = dequantize_channels(channels["quats"])
@@ -157,51 +138,147 @@ def _residual(s: Stack, channels: dict, x: np.ndarray, motion: NodeMotion | None
     return residual
 
 
-def group_integers(group: Group, quality: float, *, keep_all: bool = False, cameras: list[Camera] = ()) -> dict:
-    """Integer form of a group, the input of `_native.encode_group`.
+@dataclass(frozen=True)
+class Coded:
+    """A group in integers, with what is needed to predict another from it.
+
+    Attributes:
+        integers: the input of `_native.encode_group`.
+        source: [N] int, index in the group of each Gaussian that is coded, in the order of the integers.
+        turn, order: [N, 4], [N, 3], the form of each (`canonical_axes`).
+        steps: attribute -> [C] f32; node_step: of the nodes' translations, world units.
+    """
+
+    integers: dict
+    source: np.ndarray
+    turn: np.ndarray
+    order: np.ndarray
+    grid: Grid
+    steps: dict[str, np.ndarray]
+    node_step: float
+
+
+def code_group(
+    group: Group, quality: float, *, keep_all: bool = False, layers: int = 1, cameras: list[Camera] = ()
+) -> Coded:
+    """An independent group in integers.
 
     Args:
         group: T >= 1 frames of N Gaussians.
         quality: 0 to 100.
         keep_all: code every Gaussian, also the invisible ones.
+        layers: number of layers of falling importance, each as large as all before it together.
         cameras: from which the subject was captured, if it was.
     """
     s = stack_group(group)
     frames, middle = len(s.means), len(s.means) // 2
-    s = align_axes(s, middle)
-    s, importance, radius = _shown(s, middle, quality, keep_all, cameras)
-    steps = _steps(s, importance, middle, quality, radius)
-    grid = Grid(s.means[middle], float(steps["means"][0]))
-    positions = grid.to_integers(s.means[middle])
+    turn, axes = canonical_axes(s.quats[middle], s.log_scales[middle])
+    s = align_axes(s, middle, turn, axes)
+    measured, error = measure_stack(s, cameras), error_for(quality)
+    source = np.arange(len(turn)) if keep_all else np.flatnonzero(measured.removal >= PRUNE * error / max(len(turn), 1))
+    nominal = steps_for(quality, subject_radius(s.means[middle]))
+    steps = _steps(s.take(source), measured.take(source), error, nominal)
+    grid = Grid(s.means[middle, source], float(steps["means"][0]))
+    source = source[_native.morton_order(grid.to_integers(s.means[middle, source]))]
+    nodes, x, quats = _rest_pose(s.take(source), middle, grid, nominal.node_translation)
+    positions = grid.to_integers(x)
     order = _native.morton_order(positions)
-    positions, s, importance = positions[order], s.take(order), importance.take(order)
-    nodes, quats = None, s.quats[middle]
-    if frames > 1 and len(positions):
-        x = grid.to_world(positions)
-        nodes = choose_nodes(
-            positions, x, s.means, grid.step, steps_for(quality, radius).node_translation, grid.to_world
-        )
-        x, quats = _rest_pose(s, x, nodes and carry(nodes, positions, x, frames))
-        positions = grid.to_integers(x)
-        order = _native.morton_order(positions)
-        positions, s, importance, quats = positions[order], s.take(order), importance.take(order), quats[order]
-    near, price = rdo.neighbours(positions), rdo.bit_price(error_for(quality), max(len(positions), 1))
-    values = {n: v.mean(0, dtype=np.float64) for n, v in _appearance(s).items()} | {"quats": quats[:, 1:]}
-    channels = {n: quantize_channels(v, steps[n], importance.weights[n], near, price) for n, v in values.items()}
-    channels["quats"] = _inside_unit_ball(channels["quats"])
+    layer = layer_of(prominence(s.take(source[order])), layers)
+    order = order[layer.argsort(kind="stable")]
+    positions, quats, source = positions[order], quats[order], source[order]
+    s, measured = s.take(source), measured.take(source)
+    near, price = rdo.neighbours(positions), rdo.bit_price(error, max(len(source), 1))
+    values = canonical_appearance(s) | {"quats": quats[:, 1:]}
+    channels = {n: quantize_channels(v, steps[n], measured.weights[n], near, price) for n, v in values.items()}
+    channels["quats"] = inside_unit_ball(channels["quats"])
     out = {
         "frames": frames,
         "origin": grid.origin.tolist(),
         "grid_step": grid.step,
         "grid_bits": grid.bits,
+        "layers": np.bincount(layer, minlength=layers).tolist(),
         "positions": positions,
         "channels": channels,
         "trajectories": {},
     }
     if s.lifetimes is not None:
         out["lifetimes"] = s.lifetimes.astype(np.uint16)
-    if frames == 1 or len(positions) == 0:
-        return out
+    if frames > 1 and len(positions):
+        x = grid.to_world(positions)
+        motion = nodes and carry(nodes, positions, x, frames)
+        out |= motion_integers(s, channels, steps, measured, price, x, nodes, motion)
+    return Coded(out, source, turn[source], axes[source], grid, steps, nominal.node_translation)
+
+
+def group_integers(group: Group, quality: float, **options) -> dict:
+    """The integers of `code_group`."""
+    return code_group(group, quality, **options).integers
+
+
+def prominence(s: Stack) -> np.ndarray:
+    """[N] f32, opacity times the area of the two longest axes, in the frame where it is largest."""
+    largest_two = s.log_scales.sum(2) - s.log_scales.min(2)
+    return (np.exp(largest_two) / (1 + np.exp(-s.logit_opacities))).max(0)
+
+
+def layer_of(weight: np.ndarray, layers: int) -> np.ndarray:
+    """[N] int, layer of each Gaussian of importance `weight` [N]: the most important 1 / 2^(layers - 1) are layer 0."""
+    share = np.empty(len(weight))  # of Gaussians that are more important
+    share[weight.argsort()[::-1]] = np.arange(len(weight)) / max(len(weight), 1)
+    return np.searchsorted(0.5 ** np.arange(layers - 1, 0, -1), share, side="right")
+
+
+def canonical_appearance(s: Stack) -> dict[str, np.ndarray]:
+    """[N, C] f64 of each attribute that only adds up over time: the mean over the frames."""
+    return {n: v.mean(0, dtype=np.float64) for n, v in _appearance(s).items()}
+
+
+def measure_stack(s: Stack, cameras: list[Camera] = ()) -> Importance:
+    """What each Gaussian of a group matters, from its first, middle and last frame."""
+    frames, count = s.means.shape[:2]
+    if not count:
+        sizes = {"means": 3, "quats": 3} | {n: v.shape[2] for n, v in _appearance(s).items()}
+        return Importance({n: np.zeros((0, c)) for n, c in sizes.items()}, np.zeros(0))
+    return measure([s.frame(t) for t in sorted({0, frames // 2, frames - 1})], cameras)
+
+
+def _steps(s: Stack, measured: Importance, error: float, nominal: Steps) -> dict[str, np.ndarray]:
+    """[C] f32 step of each channel of each attribute."""
+    if not len(measured.removal):
+        return {n: np.full(w.shape[1], getattr(nominal, n), np.float32) for n, w in measured.weights.items()}
+    middle = len(s.means) // 2
+    values = {n: v[middle] for n, v in _appearance(s).items()}
+    values |= {"means": s.means[middle], "quats": s.quats[middle, :, 1:]}
+    return steps_for_error(measured.weights, values, error, subject_radius(s.means[middle]))
+
+
+def _rest_pose(s: Stack, middle: int, grid: Grid, node_step: float) -> tuple[Nodes | None, np.ndarray, np.ndarray]:
+    """Nodes, and the means [N, 3] and quaternions [N, 4] that they carry nearest to all frames: what jitters in the
+    middle frame, which is in Morton order, is not the canonical of all."""
+    positions = grid.to_integers(s.means[middle])
+    x, frames = grid.to_world(positions), len(s.means)
+    if frames == 1 or not len(x):
+        return None, s.means[middle], s.quats[middle]
+    nodes = choose_nodes(positions, x, s.means, grid.step, node_step, grid.to_world)
+    if nodes is None:
+        means, quats = s.means.mean(0, dtype=np.float64), s.quats.mean(0)
+    else:
+        motion = carry(nodes, positions, x, frames)
+        back = quat_conjugate(motion.turned)
+        means = x + rotate(back, s.means - motion.carried).mean(0)
+        quats = quat_multiply(back, s.quats).mean(0)
+    return nodes, means, quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
+
+
+def motion_integers(s: Stack, channels, steps, measured: Importance, price: float, x, nodes, motion) -> dict:
+    """ "nodes" and "trajectories" of a group with canonical positions x [N, 3] and channels, which `nodes` carry as
+    `motion` says (both None: not at all)."""
+    out = {"trajectories": {}}
+    for name, values in _residual(s, channels, x, motion).items():
+        step = trajectory_step(1 / np.sqrt((1 / steps[name].astype(np.float64) ** 2).mean()), len(s.means))
+        coefficients = rdo.trajectory(values, measured.weights[name], step, price)
+        if coefficients.any():
+            out["trajectories"][name] = {"coefficients": coefficients, "step": step}
     if nodes is not None:
         out["nodes"] = {
             "positions": nodes.positions,
@@ -210,40 +287,10 @@ def group_integers(group: Group, quality: float, *, keep_all: bool = False, came
             "translation_step": nodes.translation_step,
             "neighbors": min(NEIGHBORS, len(nodes.positions)),
         }
-    x = grid.to_world(positions)
-    residual = _residual(s, channels, x, nodes and carry(nodes, positions, x, frames))
-    for name, values in residual.items():
-        step = trajectory_step(1 / np.sqrt((1 / steps[name].astype(np.float64) ** 2).mean()), frames)
-        coefficients = rdo.trajectory(values, importance.weights[name], step, price)
-        if coefficients.any():
-            out["trajectories"][name] = {"coefficients": coefficients, "step": step}
     return out
 
 
-def _shown(s: Stack, middle: int, quality: float, keep_all: bool, cameras) -> tuple[Stack, Importance, float]:
-    """The Gaussians to code, what each matters, and the radius of the subject."""
-    radius, count = subject_radius(s.means[middle]), s.means.shape[1]
-    if not count:
-        sizes = {"means": 3, "quats": 3} | {n: v.shape[2] for n, v in _appearance(s).items()}
-        return s, Importance({n: np.zeros((0, c)) for n, c in sizes.items()}, np.zeros(0)), radius
-    importance = measure([s.frame(t) for t in sorted({0, middle, len(s.means) - 1})], cameras)
-    if not keep_all:
-        keep = importance.removal * count >= PRUNE * error_for(quality)
-        s, importance = s.take(keep), importance.take(keep)
-    return s, importance, radius
-
-
-def _steps(s: Stack, importance: Importance, middle: int, quality: float, radius: float) -> dict[str, np.ndarray]:
-    """[C] f32 step of each channel of each attribute."""
-    if not len(importance.removal):
-        nominal = steps_for(quality, radius)
-        return {n: np.full(w.shape[1], getattr(nominal, n), np.float32) for n, w in importance.weights.items()}
-    values = {n: v[middle] for n, v in _appearance(s).items()}
-    values |= {"means": s.means[middle], "quats": s.quats[middle, :, 1:]}
-    return steps_for_error(importance.weights, values, error_for(quality), radius)
-
-
-def _inside_unit_ball(channels: dict) -> dict:
+def inside_unit_ball(channels: dict) -> dict:
     """Rounding may leave the unit ball; pull such vector parts back by one step per component, towards zero."""
     v = dequantize_channels(channels)
     outside = (v**2).sum(1) > 1

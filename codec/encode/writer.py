@@ -31,7 +31,7 @@ class StreamWriter:
         self.part = self.out.with_name(self.out.name + ".part")
         self.state = self.out.with_name(self.out.name + ".part.json")
         self.init = _native.init_segment(config)
-        self.fragments: list[tuple[int, int, bool]] = []  # size, frames, sync
+        self.fragments: list[tuple[int, int, bool, list[int]]] = []  # size, frames, sync, bytes up to each layer's end
         fingerprint = json.loads(json.dumps(fingerprint))
         if not self._resume(fingerprint):
             self.part.write_bytes(self.init)
@@ -48,12 +48,13 @@ class StreamWriter:
                 if data[: len(self.init)] != self.init:
                     return False
                 index = _native.demux(data)
+                ends = [layer_ends(_native.units(data[g["offset"] : g["offset"] + g["size"]])) for g in index["groups"]]
         except (OSError, ValueError, BitstreamError):
             return False
         end = len(self.init)
-        for g in index["groups"]:  # a fragment of ours ends with its payload
+        for g, own in zip(index["groups"], ends, strict=True):  # a fragment of ours ends with its payload
             start, end = end, g["offset"] + g["size"]
-            self.fragments.append((end - start, g["frames"], g["sync"]))
+            self.fragments.append((end - start, g["frames"], g["sync"], [end - start - g["size"] + e for e in own]))
         os.truncate(self.part, end)  # a fragment cut short by kill -9
         return True
 
@@ -65,19 +66,20 @@ class StreamWriter:
     @property
     def frames(self) -> int:
         """Frames written so far."""
-        return sum(f for _, f, _ in self.fragments)
+        return sum(f for _, f, *_ in self.fragments)
 
     @property
     def bytes(self) -> int:
         """Size of the file so far, without its index."""
-        return len(self.init) + sum(s for s, _, _ in self.fragments)
+        return len(self.init) + sum(s for s, *_ in self.fragments)
 
     def append(self, payload: bytes, frames: int, *, sync: bool = True) -> None:
         """Writes one group of `frames` frames; it is on disk when this returns."""
         data = _native.fragment(payload, self.groups + 1, self.frames, frames, sync, self.config)
         self._file.write(data)
         self._file.flush()
-        self.fragments.append((len(data), frames, sync))
+        head = len(data) - len(payload)
+        self.fragments.append((len(data), frames, sync, [head + e for e in layer_ends(_native.units(payload))]))
 
     def finish(self, *, keep_part: bool = False) -> None:
         """Writes OUT.gsv: init segment, index, fragments. `keep_part` leaves what a later run needs to go on."""
@@ -95,3 +97,8 @@ class StreamWriter:
     def close(self) -> None:
         """Leaves the .part as it is."""
         self._file.close()
+
+
+def layer_ends(units: list[dict]) -> list[int]:
+    """Bytes of a payload that end with each layer."""
+    return [max(u["offset"] + u["bytes"] for u in units if u["layer"] <= k) for k in range(units[-1]["layer"] + 1)]

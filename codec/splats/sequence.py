@@ -150,19 +150,23 @@ def open_sequence(
         raise CaptureError(f"{path}: no splats, expected one file per frame: {EXPECTED}")
     if path.is_dir() and (path / "sequence.json").is_file():
         return _stored(path, paths, fps)
-    orders, cuts, mode = _tracks(paths, progress)
+    sizes = [splat_size(p) for p in paths]
+    orders, cuts, mode = _tracks(paths, sizes, progress)
     frames = Frames(paths, orders)
     groups = []
     for start, stop in pairwise([*cuts, len(paths)]):
-        groups += [Group(frames[a : min(a + gop, stop)]) for a in range(start, stop, gop)]
+        same = np.arange(sizes[start][0], dtype=np.int32) if stop - start > gop else None
+        spans = [frames[a : min(a + gop, stop)] for a in range(start, stop, gop)]
+        groups += [Group(f, parents=same if k else None) for k, f in enumerate(spans)]
     return SplatSequence(fps or FPS, groups, mode=mode, names=[p.name for p in paths])
 
 
-def _tracks(paths: list[Path], progress: Callable | None) -> tuple[dict[int, np.ndarray], list[int], str]:
+def _tracks(
+    paths: list[Path], sizes: list[tuple], progress: Callable | None
+) -> tuple[dict[int, np.ndarray], list[int], str]:
     """Order of each frame that needs one, the frames at which tracks begin, and the mode."""
     orders: dict[int, np.ndarray] = {}
-    cuts, sizes = [0], [splat_size(p) for p in paths]
-    before = None
+    cuts, before = [0], None
     for t in range(1, len(paths)):
         related: np.ndarray | bool = False
         if sizes[t] == sizes[t - 1]:
@@ -225,7 +229,7 @@ def _stored_group(path: Path, paths: list[Path], start: int, count: int, extra: 
             away = (lifetimes[:, 0] > t) | (t >= lifetimes[:, 1])
             if away.any():
                 hidden[t] = away, arrays[f"hidden_{t}"]
-    return Group(Frames(own, {}, hidden)[:], lifetimes, nodes)
+    return Group(Frames(own, {}, hidden)[:], lifetimes, nodes, arrays.get("parents"))
 
 
 def _camera(c: dict) -> Camera:

@@ -60,6 +60,8 @@ class SequenceWriter:
         entry = {"start": start, "frames": len(group)}
         if group.lifetimes is not None:
             extra["lifetimes"] = group.lifetimes
+        if group.parents is not None:
+            extra["parents"] = group.parents
         if group.nodes is not None:
             extra |= {f"node_{k}": v for k, v in vars(group.nodes).items()}
         if extra:

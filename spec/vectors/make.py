@@ -18,8 +18,13 @@ from parts import (  # noqa: E402
     add_unknown_units,
     box,
     change_payload,
+    change_predicted,
     change_unit,
+    change_unit_of_predicted,
+    deaths_of_others,
+    drop,
     duplicates,
+    encode,
     extremes,
     f32,
     find_unit,
@@ -27,8 +32,12 @@ from parts import (  # noqa: E402
     header,
     ignored_fields,
     insert,
+    late_sizes,
+    layered,
+    layers_file,
     left_over_empty,
     major_brand_only,
+    make_file,
     make_group,
     no_mdat,
     other_mdat_sizes,
@@ -39,9 +48,12 @@ from parts import (  # noqa: E402
     payload_file,
     poke_duration,
     poke_time,
+    predicted,
+    predicted_file,
     reference,
     remove_unit,
     second_moof,
+    sizes_file,
     tied_nodes,
     traj,
     truncated,
@@ -54,6 +66,11 @@ from parts import (  # noqa: E402
 )
 
 MOTION = {"nodes": 12, "trajectories": {"means": 4, "quats": 3, "logit_opacities": 2, "sh0": 20}}
+
+REFERENCE = make_group(120, 4, nodes=5, trajectories={"means": 2, "sh0": 2}, lifetimes=True)
+FULL = make_group(160, 6, seed=4, nodes=8, trajectories={"means": 3, "quats": 6, "sh0": 1}, lifetimes=True)
+UNCHANGED = predicted(REFERENCE, FULL, deaths=lambda i: False, births=0)
+LAYERED = layered(make_group(100, 3, nodes=4, trajectories={"means": 2}), [[0], [1, 2], [3, 4, 5]])
 
 VALID = {  # name: (what it is about, bytes)
     "single_frame": ("one group of one frame", lambda: groups_file(make_group(300, 1))),
@@ -120,6 +137,48 @@ VALID = {  # name: (what it is about, bytes)
     "ignored_fields": ("reserved fields, minor_version and vvhd hold something else", ignored_fields),
     "other_track": ("an audio track, and all other ways to place and time a sample", other_track),
     "major_brand_only": ("gsv1 is the major brand, but no compatible one", major_brand_only),
+    "draft_2": ("no unit_sizes", lambda: units_file(lambda u: None)),
+    "late_sizes": ("a unit of type 10 that is not unit 1", lambda: units_file(late_sizes)),
+    "predicted": (
+        "a predicted group with deaths and births, nodes, trajectories, lifetimes",
+        lambda: predicted_file(REFERENCE, predicted(REFERENCE, FULL)),
+    ),
+    "predicted_same": (
+        "predicted groups without deaths and births, one of them two groups from its reference",
+        lambda: predicted_file(REFERENCE, UNCHANGED, UNCHANGED | {"reference": 2}),
+    ),
+    "predicted_births_only": (
+        "every Gaussian of the reference dies",
+        lambda: predicted_file(REFERENCE, predicted(REFERENCE, FULL, deaths=lambda i: True)),
+    ),
+    "predicted_nothing_left": (
+        "every Gaussian dies, none is born",
+        lambda: predicted_file(REFERENCE, predicted(REFERENCE, FULL, deaths=lambda i: True, births=0)),
+    ),
+    "predicted_sh": (
+        "a predicted group of sh_degree 2",
+        lambda: predicted_file(
+            make_group(60, 2, sh_degree=2),
+            predicted(make_group(60, 2, sh_degree=2), make_group(90, 3, seed=5, sh_degree=2, trajectories={"shN": 2})),
+            sh_degree=2,
+        ),
+    ),
+    "layers": (
+        "three layers with nodes, trajectories, lifetimes, of which the second is empty",
+        lambda: groups_file(layered(FULL, [[0, 2], [], [1, 3, 4]])),
+    ),
+    "layer_corrections": (
+        "corrections of opacity and scale; only that of the last layer counts",
+        lambda: groups_file(layered(FULL, [[0], [1, 2]], [[0.5, 1.0], [0.25, -2.0]])),
+    ),
+    "layers_most": (
+        "16 layers of few Gaussians",
+        lambda: groups_file(layered(make_group(40, 2, trajectories={"means": 2}), [[k] for k in range(16)])),
+    ),
+    "layers_predicted": (
+        "a predicted group with layers, births in each",
+        lambda: predicted_file(LAYERED, predicted(LAYERED, FULL, births=4)),
+    ),
     "no_groups": ("a stream without groups yet", lambda: groups_file(finish=False)),
 }
 
@@ -197,13 +256,51 @@ INVALID = {  # name: (error, part of the package's message, bytes)
     "unit_no_node_trajectories": (B, "", remove_unit(5)),
     "unit_no_trajectories": (B, "", remove_unit(6, 1)),
     "unsupported_step_classes": (B, "not yet supported", insert(unit_dict(7, attribute=2, dependencies=[1]))),
-    "unsupported_deaths": (B, "not yet supported", insert(unit_dict(8))),
-    "unsupported_layer_correction": (B, "not yet supported", insert(unit_dict(9, attribute=2))),
+    "unit_deaths_unannounced": (B, "announces", insert(unit_dict(8))),
+    "unit_layer_correction_attribute": (B, "", insert(unit_dict(9, attribute=3, payload=f32(1)))),
+    "unit_layer_correction_nan": (B, "correction", insert(unit_dict(9, attribute=4, payload=f32(NAN)))),
+    "unit_layer_correction_long": (B, "", insert(unit_dict(9, attribute=4, payload=f32(1) + b"\0"))),
+    "unit_sizes_odd": (B, "four bytes", lambda: sizes_file(lambda p: p[:-1])),
+    "unit_sizes_wrong": (B, "", lambda: sizes_file(lambda p: p[:-1] + bytes([p[-1] ^ 1]))),
     # Group header
-    "header_predicted": (B, "not yet supported", header(flags=1, reference=1)),
+    "predicted_first": (B, "before it", lambda: make_file([(encode(UNCHANGED, encode(REFERENCE)), 6, False)])),
+    "predicted_sync": (B, "sync", lambda: predicted_file(REFERENCE, UNCHANGED, sync=True)),
+    "predicted_from_predicted": (
+        B,
+        "independent group",
+        lambda: predicted_file(REFERENCE, UNCHANGED, UNCHANGED),
+    ),
+    "predicted_reference_0": (B, "reference", change_predicted(lambda h: h[:3] + b"\0\0" + h[5:])),
+    "predicted_layer_count": (B, "layers", change_predicted(lambda h: h[:5] + b"\2" + h[6:])),
+    "predicted_many_births": (B, "births", change_predicted(lambda h: h[:11] + u32(10**6) + h[15:])),
+    "predicted_many_survivors": (
+        B,
+        "survivors",
+        change_predicted(lambda h: h[:6] + u32(250) + b"\3" + u32(0) + h[15:]),
+    ),
+    "predicted_no_deaths": (B, "deaths", change_unit_of_predicted(8, 0, drop)),
+    "predicted_deaths_count": (
+        B,
+        "survivors",
+        change_unit_of_predicted(8, 0, lambda units, u: u.update(payload=deaths_of_others())),
+    ),
+    "predicted_no_births": (B, "positions", change_unit_of_predicted(1, 0, drop)),
+    "predicted_dependency": (
+        B,
+        "depend",
+        change_unit_of_predicted(6, 1, lambda units, u: u.update(dependencies=u["dependencies"][1:])),
+    ),
+    "layer_no_positions": (B, "positions", lambda: layers_file(lambda units: drop(units, find_unit(units, 1, 0, 1)))),
+    "layer_dependency": (
+        B,
+        "depend",
+        lambda: layers_file(lambda units: find_unit(units, 2, 3, 1).update(dependencies=[1])),
+    ),
+    "layer_unannounced": (B, "announces", lambda: layers_file(lambda u: u.append(unit_dict(1, layer=3)))),
     "header_step_classes": (B, "not yet supported", header(flags=2)),
     "header_flags": (B, "flags", header(flags=4)),
-    "header_layers": (B, "not yet supported", header(layer_count=2, layer_counts=[(40, 2), (40, 2)])),
+    "header_layers": (B, "layers", header(layer_count=17, layer_counts=[(40, 2)] * 17)),
+    "header_layers_missing": (B, "positions", header(layer_count=2, layer_counts=[(40, 2), (40, 2)])),
     "header_no_layers": (B, "layer", header(layer_count=0, layer_counts=[])),
     "header_frames_0": (B, "frames", header(frames=0)),
     "header_frames_mismatch": (B, "frames", lambda: units_file(lambda u: None, frames=5)),
@@ -240,6 +337,14 @@ INVALID = {  # name: (error, part of the package's message, bytes)
     "limit_frames": (L, "frames", header(frames=65, duration=65)),
     "limit_nodes": (L, "nodes", header(node_count=1025)),
     "limit_nodes_huge": (L, "nodes", header(node_count=2**32 - 1)),
+    "limit_layers": (L, "Gaussians", header(layer_count=2, layer_counts=[(40000, 7), (40000, 7)])),
+    "limit_pairs": (
+        L,
+        "pairs",
+        lambda: units_file(
+            lambda units: units[0].update(payload=pack_header(node_count=4096, layer_counts=[(70000, 8)])), level=2
+        ),
+    ),
     # Entropy-coded payloads
     "payload_left_over": (B, "", change_payload(1, 0, lambda p: p + b"\1" * 8)),
     "payload_left_over_empty": (B, "", lambda: left_over_empty()),
@@ -263,7 +368,7 @@ def describe(data):
             "start_frame": sample.start_frame,
             "frames": sample.frames,
             "sync": sample.sync,
-            "gaussians": group.header.count,
+            "gaussians": len(group.positions),
             "sha256": reference.group_hash(group),
         }
         for sample, group in groups

@@ -125,8 +125,62 @@ def tied_nodes():
     return group
 
 
-def encode(group):
-    return _native.encode_group(group)[0]
+GAUSSIAN_AXIS = {"positions": 0, "lifetimes": 0, "parents": 0}
+
+
+def take(group, index):
+    """The Gaussians of a group dict at `index`, in that order."""
+    result = dict(group)
+    for name in GAUSSIAN_AXIS:
+        if group.get(name) is not None:
+            result[name] = group[name][index]
+    for kind, key in (("channels", "values"), ("trajectories", "coefficients")):
+        result[kind] = {n: c | {key: np.ascontiguousarray(c[key][..., index])} for n, c in group[kind].items()}
+    return result
+
+
+def layered(group, shares, corrections=None):
+    """A group dict in layers: layer k has every Gaussian whose index modulo len(shares) is one of shares[k]."""
+    n = len(group["positions"])
+    period = sum(len(share) for share in shares)
+    parts = [[i for i in range(n) if i % period in share] for share in shares]
+    result = take(group, np.array([i for part in parts for i in part], int))
+    result["layers"] = [len(part) for part in parts]
+    return result | ({"corrections": corrections} if corrections else {})
+
+
+def predicted(reference, group, *, back=1, deaths=lambda i: i % 5 == 0, births=9):
+    """A predicted group dict: of `reference` those that do not die, and in each layer `births` Gaussians of `group`.
+
+    Nodes, trajectories and lifetimes are those of `group`, which must have enough Gaussians.
+    """
+    parents, kept, first = [], [], 0
+    layers = reference.get("layers") or [len(reference["positions"])]
+    for k, count in enumerate(layers):
+        alive = [i for i in range(first, first + count) if not deaths(i)]
+        kept.append((alive, list(range(k * births, (k + 1) * births))))
+        parents += alive + [-1] * births
+        first += count
+
+    def join(a, b, axis):
+        return np.concatenate([part for i, j in kept for part in (a.take(i, axis), b.take(j, axis))], axis)
+
+    result = dict(reference) | {"reference": back, "parents": np.array(parents, np.int32), "corrections": None}
+    result["frames"] = group["frames"]
+    result["layers"] = [len(alive) + births for alive, _ in kept]
+    result["positions"] = join(reference["positions"], group["positions"], 0)
+    result["channels"] = {
+        n: c | {"values": join(c["values"], group["channels"][n]["values"], 1)}
+        for n, c in reference["channels"].items()
+    }
+    own = take(group, np.arange(len(parents)))
+    return result | {name: own[name] for name in ("trajectories", "nodes", "lifetimes")}
+
+
+def encode(group, reference=None):
+    """The payload of a group dict; `reference`: the payload of the group that a predicted one refers to."""
+    known = reference and _native.DecodedGroup(reference, 4)
+    return _native.encode_group(group, known)[0]
 
 
 # ---- Files ----------------------------------------------------------------------------------------------------------
@@ -145,20 +199,34 @@ CONFIG = {
 
 
 def make_file(payloads, *, finish=True, **config):
-    """payloads: [(bytes, frames)] -> bytes of a .gsv file, groups one after the other, all sync."""
+    """payloads: [(bytes, frames)], with a third item of False for no sync sample -> bytes of a .gsv file."""
     config = CONFIG | config
     init = bytes(_native.init_segment(config))
     fragments, start = [], 0
-    for number, (payload, frames) in enumerate(payloads, 1):
-        fragments.append(bytes(_native.fragment(payload, number, start, frames, True, config)))
+    payloads = [(*p, True)[:3] for p in payloads]
+    for number, (payload, frames, sync) in enumerate(payloads, 1):
+        fragments.append(bytes(_native.fragment(payload, number, start, frames, sync, config)))
         start += frames
     if finish:
-        init = bytes(_native.finish(init, [(len(f), n, True) for f, (_, n) in zip(fragments, payloads, strict=True)]))
+        index = [(len(f), n, s, []) for f, (_, n, s) in zip(fragments, payloads, strict=True)]
+        init = bytes(_native.finish(init, index))
     return init + b"".join(fragments)
 
 
 def groups_file(*groups, **options):
     return make_file([(encode(group), group["frames"]) for group in groups], **options)
+
+
+def predicted_file(first, *others, edit=lambda units: None, sync=False, **options):
+    """An independent group and groups that are predicted from it; `edit` changes the units of the last one."""
+    known = encode(first)
+    payloads = [(known, first["frames"])]
+    for group in others:
+        units = split_units(encode(group, known))
+        if group is others[-1]:
+            edit(units)
+        payloads.append((join_units(units), group["frames"], sync))
+    return make_file(payloads, **options)
 
 
 def box(kind, body):
@@ -319,11 +387,53 @@ def join_units(units):
     return result
 
 
-def units_file(edit, frames=4):
+def without_sizes(units):
+    """Removes unit_sizes, as draft 2 had it, so that units may change their size."""
+    drop(units, units[1])
+    return units
+
+
+def units_file(edit, frames=4, **config):
     """The base group with its units (a list of dicts: unit_type, layer, attribute, dependencies, payload) edited."""
-    units = split_units(encode(base_group()))
+    units = without_sizes(split_units(encode(base_group())))
     edit(units)
-    return make_file([(join_units(units), frames)])
+    return make_file([(join_units(units), frames)], **config)
+
+
+def layers_file(edit):
+    """The base group in layers of a half, with its units edited."""
+    units = without_sizes(split_units(encode(layered(base_group(), [[0], [1]]))))
+    edit(units)
+    return make_file([(join_units(units), 4)])
+
+
+def change_unit_of_predicted(unit_type, attribute, change):
+    """A group predicted from the base group, with deaths and births; `change` gets its units and one of them."""
+    group = predicted(base_group(), make_group(60, 4, seed=6, trajectories={"means": 2}))
+
+    def edit(units):
+        change(without_sizes(units), find_unit(units, unit_type, attribute))
+
+    return lambda: predicted_file(base_group(), group, edit=edit)
+
+
+def change_predicted(edit):
+    """The same with its header edited."""
+    return change_unit_of_predicted(0, 0, lambda units, u: u.update(payload=edit(u["payload"])))
+
+
+def deaths_of_others():
+    """A deaths unit of the base group that says otherwise."""
+    known, group = encode(base_group()), make_group(60, 4, seed=6)
+    units = split_units(encode(predicted(base_group(), group, deaths=lambda i: i % 2), known))
+    return find_unit(units, 8)["payload"]
+
+
+def sizes_file(edit):
+    """The base group with its unit_sizes edited."""
+    units = split_units(encode(base_group()))
+    units[1]["payload"] = edit(units[1]["payload"])
+    return make_file([(join_units(units), 4)])
 
 
 def payload_file(edit):
@@ -336,6 +446,11 @@ def unit_dict(unit_type, layer=0, attribute=0, dependencies=(), payload=b""):
     return dict(zip(names, (unit_type, layer, attribute, list(dependencies), payload), strict=True))
 
 
+def late_sizes(units):
+    """A unit of type 10 that is not unit 1 is unknown."""
+    units.append(unit_dict(10, payload=b"no sizes"))
+
+
 def add_unknown_units(units):
     units.append(unit_dict(200, attribute=17, dependencies=[1], payload=b"from later"))
     units.append(unit_dict(255, layer=3))
@@ -343,20 +458,21 @@ def add_unknown_units(units):
     units.append(unit_dict(10, layer=3, payload=bytes(100)))
 
 
-def find_unit(units, unit_type, attribute=0):
-    return next(u for u in units if (u["unit_type"], u["attribute"]) == (unit_type, attribute))
+def find_unit(units, unit_type, attribute=0, layer=0):
+    return next(u for u in units if (u["unit_type"], u["layer"], u["attribute"]) == (unit_type, layer, attribute))
+
+
+def drop(units, unit):
+    """Removes a unit, and all dependencies on it."""
+    index = units.index(unit)
+    del units[index]
+    for u in units:
+        u["dependencies"] = [d - (d > index) for d in u["dependencies"] if d != index]
 
 
 def remove_unit(unit_type, attribute=0):
-    """The base group without a unit that nothing depends on, or without any dependency on it."""
-
-    def edit(units):
-        index = units.index(find_unit(units, unit_type, attribute))
-        del units[index]
-        for u in units:
-            u["dependencies"] = [d - (d > index) for d in u["dependencies"] if d != index]
-
-    return lambda: units_file(edit)
+    """The base group without a unit."""
+    return lambda: units_file(lambda units: drop(units, find_unit(units, unit_type, attribute)))
 
 
 def change_unit(unit_type, attribute=0, /, **fields):

@@ -18,6 +18,7 @@ pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(node_weights, m)?)?;
     m.add_function(wrap_pyfunction!(encode_group, m)?)?;
     m.add_function(wrap_pyfunction!(units, m)?)?;
+    m.add_function(wrap_pyfunction!(reference_of, m)?)?;
     m.add_function(wrap_pyfunction!(unit_bytes, m)?)?;
     m.add_function(wrap_pyfunction!(levels, m)?)?;
     m.add_function(wrap_pyfunction!(container::init_segment, m)?)?;
@@ -64,15 +65,18 @@ fn node_weights<'py>(
     Ok((index, blend.weight.into_pyarray(py).reshape(shape)?.into_any()))
 }
 
-/// Encodes a group of integers: payload and a report per unit.
+/// Encodes a group of integers: payload and a report per unit. A predicted group needs the group that it refers to.
 #[pyfunction]
+#[pyo3(signature = (group, reference = None))]
 fn encode_group<'py>(
     py: Python<'py>,
     group: &Bound<'py, PyDict>,
+    reference: Option<Py<decoded::DecodedGroup>>,
 ) -> PyResult<(Bound<'py, PyBytes>, Bound<'py, PyList>)> {
-    let group = group_from::group_from(group)?;
+    let reference = reference.as_ref().map(|r| r.get().group());
+    let group = group_from::group_from(group, reference)?;
     let payload = py
-        .detach(|| gsv::encode::encode_group(&group))
+        .detach(|| gsv::encode::encode_group(&group, reference))
         .map_err(|e| raise(py, e))?;
     let report = units_of(py, &payload)?;
     Ok((PyBytes::new(py, &payload), report))
@@ -84,9 +88,19 @@ fn units<'py>(py: Python<'py>, payload: &Bound<'py, PyAny>) -> PyResult<Bound<'p
     units_of(py, bytes_of(payload)?.as_slice()?)
 }
 
+/// How many groups back the group of a payload refers, 0: it is independent; only its header is read.
+#[pyfunction]
+fn reference_of<'py>(py: Python<'py>, payload: &Bound<'py, PyAny>) -> PyResult<u16> {
+    gsv::decode::reference_of(bytes_of(payload)?.as_slice()?).map_err(|e| raise(py, e))
+}
+
 fn units_of<'py>(py: Python<'py>, payload: &[u8]) -> PyResult<Bound<'py, PyList>> {
     let list = PyList::empty(py);
-    for (i, u) in unit::split(payload).map_err(|e| raise(py, e))?.iter().enumerate() {
+    for (i, u) in unit::split(payload, unit::ALL_LAYERS)
+        .map_err(|e| raise(py, e))?
+        .iter()
+        .enumerate()
+    {
         let d = PyDict::new(py);
         d.set_item("unit", i)?;
         d.set_item("type", u.kind.map_or("unknown", |k| k.name()))?;
@@ -127,6 +141,7 @@ fn levels<'py>(py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
         d.set_item("gaussians", l.gaussians)?;
         d.set_item("frames", l.frames)?;
         d.set_item("nodes", l.nodes)?;
+        d.set_item("pairs", l.pairs)?;
         d.set_item("symbols", l.symbols)?;
         d.set_item("bytes", l.bytes)?;
         list.append(d)?;

@@ -73,10 +73,17 @@ pub extern "C" fn describe(first: usize) {
     with(|p| p.describe(first));
 }
 
-/// Input: a group's payload, which goes to `slot`. Output: its header as JSON.
+/// Input: a group's payload, or what precedes its layers behind the first `layers`. It goes to `slot`; the group that it
+/// refers to, if it is a predicted one, is in the slot `reference`. Output: its header as JSON.
 #[unsafe(no_mangle)]
-pub extern "C" fn decode(slot: usize, level: u8) -> bool {
-    with(|p| p.decode(slot, level))
+pub extern "C" fn decode(slot: usize, level: u8, reference: usize, layers: usize) -> bool {
+    with(|p| p.decode(slot, level, reference, layers))
+}
+
+/// Input: a group's payload, or the start of one. How many groups back it refers, 0: it is independent; -1: it is damaged.
+#[unsafe(no_mangle)]
+pub extern "C" fn reference() -> i32 {
+    with(Player::reference)
 }
 
 #[unsafe(no_mangle)]

@@ -14,7 +14,9 @@ fuzz_target!(|input: (u8, &[u8])| {
     let mut skipping = Demuxer::default();
     let mut rest = data;
     while !rest.is_empty() {
-        let skip = usize::try_from(skipping.skippable()).unwrap_or(usize::MAX).min(rest.len());
+        let skip = usize::try_from(skipping.skippable())
+            .unwrap_or(usize::MAX)
+            .min(rest.len());
         let n = if skip > 0 { skip } else { 1 };
         if skip > 0 {
             skipping.skip(skip as u64);

@@ -1,15 +1,28 @@
-//! The unit parser: any bytes as a group payload. Damaged or not, what is decoded is a group.
+//! The unit parser: any bytes as a group payload, alone or with a group to refer to. Damaged or not, what is decoded is a group.
 #![no_main]
 
-use gsv::decode::{decode_damaged, decode_group};
+use gsv::decode::{Decoding, decode_damaged, decode_group, reference_of};
+use gsv::group::Group;
 use gsv::levels::LEVELS;
 use libfuzzer_sys::fuzz_target;
+use std::sync::LazyLock;
 
-fuzz_target!(|data: &[u8]| {
-    let strict = decode_group(data, &LEVELS[0]);
-    match decode_damaged(data, &LEVELS[0]) {
+static REFERENCE: LazyLock<Group> = LazyLock::new(|| {
+    decode_group(include_bytes!("../layered.bin"), &Decoding::at(&LEVELS[0])).expect("the seed is sound")
+});
+
+fuzz_target!(|input: (u8, &[u8])| {
+    let (how, data) = (input.0, input.1);
+    let how = Decoding {
+        reference: (how & 1 != 0).then(|| &*REFERENCE),
+        layers: 1 + usize::from(how >> 1),
+        ..Decoding::at(&LEVELS[0])
+    };
+    let _ = reference_of(data);
+    let strict = decode_group(data, &how);
+    match decode_damaged(data, &how) {
         Ok((group, damage)) => {
-            group.validate().expect("a group");
+            group.validate(how.reference).expect("a group");
             assert_eq!(damage.is_empty(), strict.is_ok());
         }
         Err(_) => assert!(strict.is_err()),

@@ -1,155 +1,253 @@
 //! Payload -> group in integers (spec 3 to 12). The mirror of encode.rs.
 //!
-//! Positions first, since all contexts come from them; then every other unit, in parallel. Memory is taken only for what
+//! Points first, since all contexts come from them; then every other unit, in parallel. Memory is taken only for what
 //! the header announces and the level allows, and trajectories grow against what is left of the level's symbols.
 //! Damage (spec 3) is an error, or what is not affected is decoded and the rest stands still or takes its offsets.
 
 use crate::attributes::Attribute;
 use crate::channels;
+use crate::deaths;
 use crate::error::{Error, Result};
-use crate::group::Group;
-use crate::header::{Header, NodeHeader};
+use crate::fields::{Fields, Reader};
+use crate::group::{BIRTH, Group};
+use crate::header::{Header, LayerHeader, NodeHeader};
 use crate::inventory::{self, Damage};
 use crate::levels::Level;
 use crate::lifetimes;
 use crate::morton;
-use crate::neighbors::{self, Near};
+use crate::neighbors::{self, Contexts, Near};
 use crate::positions;
 use crate::range_coder::Decoder;
 use crate::trajectories::{self, Kind, Stop, Trajectories};
-use crate::unit::{self, Unit, UnitType};
+use crate::unit::{self, ALL_LAYERS, Unit, UnitType};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
+
+/// How a group is to be decoded.
+#[derive(Clone, Copy)]
+pub struct Decoding<'a> {
+    pub level: &'a Level,
+    /// The group that a predicted one refers to.
+    pub reference: Option<&'a Group>,
+    /// Only so many layers; the payload may end behind them.
+    pub layers: usize,
+}
+
+impl<'a> Decoding<'a> {
+    /// All of an independent group.
+    pub fn at(level: &'a Level) -> Self {
+        Decoding {
+            level,
+            reference: None,
+            layers: ALL_LAYERS,
+        }
+    }
+}
 
 /// What a unit decodes to, besides points.
 enum Part {
     Channels(Vec<i32>),
     Lifetimes(Vec<[u16; 2]>),
     Trajectories(Trajectories),
+    Correction(f32),
 }
 
-/// Decodes a group payload under the caps of `level`.
+/// Decodes a group payload under the caps of `how.level`.
 ///
 /// # Errors
 /// `Error::Bitstream` with offsets from the start of the payload; `Error::Limit`.
-pub fn decode_group(payload: &[u8], level: &Level) -> Result<Group> {
-    level.cap("group", "bytes", payload.len() as u64, level.bytes)?;
-    decode_units(&unit::split(payload)?, level)
+pub fn decode_group(payload: &[u8], how: &Decoding) -> Result<Group> {
+    how.level.cap("group", "bytes", payload.len() as u64, how.level.bytes)?;
+    decode_units(&unit::split(payload, how.layers)?, how)
 }
 
 /// Decodes what is not damaged: damaged trajectories are none, damaged channels 0, damaged node units no nodes or no motion
-/// of theirs, and damaged lifetimes leave all Gaussians shown.
+/// of theirs, damaged lifetimes leave all Gaussians shown, damaged deaths all alive, and damaged positions leave a layer without
+/// the Gaussians that it codes.
 ///
 /// # Errors
-/// As `decode_group`, for damage only if it is in the header or in the positions.
-pub fn decode_damaged(payload: &[u8], level: &Level) -> Result<(Group, Vec<Damage>)> {
-    level.cap("group", "bytes", payload.len() as u64, level.bytes)?;
-    decode(&unit::scan(payload)?, level)
+/// As `decode_group`, for damage only if it is in the header, or in an independent group in the positions of the first layer.
+pub fn decode_damaged(payload: &[u8], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
+    how.level.cap("group", "bytes", payload.len() as u64, how.level.bytes)?;
+    decode(&unit::scan(payload, how.layers)?, how)
 }
 
 /// Decodes units whose checksums were verified, or are of no interest (fuzzing).
-pub fn decode_units(units: &[Unit], level: &Level) -> Result<Group> {
-    Ok(decode(units, level)?.0)
+pub fn decode_units(units: &[Unit], how: &Decoding) -> Result<Group> {
+    Ok(decode(units, how)?.0)
 }
 
-fn decode(units: &[Unit], level: &Level) -> Result<(Group, Vec<Damage>)> {
+/// How many groups back the group of a payload refers; 0: it is independent.
+///
+/// # Errors
+/// `Error::Bitstream`: the header is damaged.
+pub fn reference_of(payload: &[u8]) -> Result<u16> {
+    let first = unit::first(payload)?;
+    Header::reference_of(first.payload).map_err(|e| e.at(first.payload_offset, &first.label(0)))
+}
+
+fn decode(units: &[Unit], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
     let Some(first) = units.first() else {
         return Err(Error::bitstream(0, "unit 0", "a group header"));
     };
-    let mut header = Header::read(first.payload).map_err(|e| e.at(first.payload_offset, &first.label(0)))?;
-    let known = header.check(level)?;
-    let damage = inventory::check(units, &header)?;
-    if header.nodes.count > 0 && inventory::find(units, UnitType::NodePositions, None).is_none() {
-        header.nodes = NodeHeader::default();
-    }
+    let before = how.reference.map(|g| &g.header);
+    let header = Header::read(first.payload, before).map_err(|e| e.at(first.payload_offset, &first.label(0)))?;
+    let known = header.check(how.level, before)?;
+    let damage = inventory::check(units, &header, before, how.layers)?;
     let decoder = GroupDecoder {
+        reference: how.reference.filter(|_| header.reference > 0),
         header: &header,
         units,
-        level,
+        level: how.level,
         symbols: AtomicU64::new(known),
     };
-    let points = |kind, count| decoder.points(kind, count);
-    let (positions, node_positions) = rayon::join(
-        || points(UnitType::Positions, header.count),
-        || {
-            if header.nodes.count > 0 {
-                points(UnitType::NodePositions, header.nodes.count)
-            } else {
-                Ok(Vec::new())
-            }
-        },
+    let count = header.layers.len().min(how.layers);
+    let points = |k: usize| decoder.points_of_layer(k);
+    let (layers, node_positions) = rayon::join(
+        || (0..count).into_par_iter().map(points).collect::<Result<Vec<_>>>(),
+        || decoder.points(UnitType::NodePositions, 0, header.nodes.count),
     );
-    let (positions, node_positions) = (positions?, node_positions?);
-    let near = neighbors::nearest(&positions);
+    let (layers, node_positions) = (layers?, node_positions?);
     let near_nodes = neighbors::nearest(&node_positions);
-    let decode = |(i, u): (usize, &Unit)| decoder.part(i, u, &near, &near_nodes).map(|p| p.map(|p| (i, p)));
+    let decode = |(i, u): (usize, &Unit)| decoder.part(i, u, &layers, &near_nodes).map(|p| p.map(|p| (i, p)));
     let parts = units
         .par_iter()
         .enumerate()
         .filter(|(_, u)| u.damage.is_none())
         .map(decode)
         .collect::<Result<Vec<_>>>()?;
-    let mut group = Group {
-        positions,
-        node_positions,
-        ..Group::default()
-    };
-    group.channels = vec![Vec::new(); header.attributes().len()];
-    group.trajectories = vec![Trajectories::default(); header.trajectories.len()];
+    let mut slots: Vec<Slot> = (0..count).map(|_| Slot::new(&header)).collect();
+    let mut node_trajectories = Trajectories::default();
     for (i, part) in parts.into_iter().flatten() {
-        place(&mut group, &header, units[i].attribute, part);
+        let (layer, attribute) = (usize::from(units[i].layer), units[i].attribute);
+        match (part, slots.get_mut(layer)) {
+            (Part::Trajectories(t), _) if attribute.is_none() => node_trajectories = t,
+            (part, Some(slot)) => slot.place(&header, attribute, part),
+            _ => {}
+        }
     }
+    let mut group = assemble(layers, slots, decoder.reference, &header);
+    (group.node_positions, group.node_trajectories) = (node_positions, node_trajectories);
     group.header = header;
-    fill(&mut group);
+    if group.node_positions.is_empty() {
+        group.header.nodes = NodeHeader::default();
+    }
+    if group.node_trajectories.len() != group.node_positions.len() {
+        group.node_trajectories = Trajectories::still(6, group.node_positions.len());
+    }
     Ok((group, damage))
 }
 
-/// Stands in for units that are damaged: channels of 0, no trajectories.
-fn fill(group: &mut Group) {
-    let (h, n) = (&group.header, group.positions.len());
-    for (values, scale) in group.channels.iter_mut().zip(&h.scales) {
-        values.resize(n * scale.steps.len(), 0);
-    }
-    for (t, head) in group.trajectories.iter_mut().zip(&h.trajectories) {
-        if t.channels == 0 {
-            *t = Trajectories::still(head.attribute.channels(h.sh_degree), n);
+/// Points of a layer, before anything else of it is decoded.
+struct LayerPoints {
+    header: LayerHeader,
+    /// As many as the header tells: the layer, and that of the reference, are not damaged.
+    whole: bool,
+    /// Indices in the reference.
+    survivors: Vec<u32>,
+    positions: Vec<[u32; 3]>,
+    contexts: Contexts,
+}
+
+/// What the other units of a layer hold.
+struct Slot {
+    channels: Vec<Vec<i32>>, // of births
+    trajectories: Vec<Option<Trajectories>>,
+    lifetimes: Option<Vec<[u16; 2]>>,
+    correction: [f32; 2],
+}
+
+impl Slot {
+    fn new(h: &Header) -> Slot {
+        Slot {
+            channels: vec![Vec::new(); h.attributes().len()],
+            trajectories: vec![None; h.trajectories.len()],
+            lifetimes: None,
+            correction: [0.0; 2],
         }
     }
-    let nodes = group.node_positions.len();
-    if group.node_trajectories.len() != nodes {
-        group.node_trajectories = Trajectories::still(6, nodes);
+
+    fn place(&mut self, h: &Header, attribute: Option<Attribute>, part: Part) {
+        match part {
+            Part::Lifetimes(l) => self.lifetimes = Some(l),
+            Part::Correction(v) => self.correction[usize::from(attribute == Some(Attribute::LogitOpacities))] = v,
+            Part::Channels(v) => {
+                let at = h.attributes().iter().position(|a| Some(*a) == attribute);
+                if let Some(slot) = at.and_then(|k| self.channels.get_mut(k)) {
+                    *slot = v;
+                }
+            }
+            Part::Trajectories(t) => {
+                let at = h.trajectories.iter().position(|h| Some(h.attribute) == attribute);
+                if let Some(slot) = at.and_then(|k| self.trajectories.get_mut(k)) {
+                    *slot = Some(t);
+                }
+            }
+        }
     }
 }
 
-fn place(group: &mut Group, header: &Header, attribute: Option<Attribute>, part: Part) {
-    match part {
-        Part::Lifetimes(l) => group.lifetimes = Some(l),
-        Part::Channels(v) => {
-            let mut slots = header.attributes().iter().zip(&mut group.channels);
-            if let Some((_, slot)) = slots.find(|(a, _)| Some(**a) == attribute) {
-                *slot = v;
-            }
+/// The layers one after the other; 0 and stillness stand in for what is damaged.
+fn assemble(layers: Vec<LayerPoints>, slots: Vec<Slot>, reference: Option<&Group>, h: &Header) -> Group {
+    let mut group = Group {
+        channels: vec![Vec::new(); h.scales.len()],
+        trajectories: vec![Trajectories::default(); h.trajectories.len()],
+        parents: reference.map(|_| Vec::new()),
+        ..Group::default()
+    };
+    let cut = slots.iter().any(|s| s.lifetimes.is_some());
+    let mut lifetimes = Vec::new();
+    for (layer, slot) in layers.into_iter().zip(slots) {
+        let (n, births) = (layer.positions.len(), layer.header.births as usize);
+        for (k, (own, mut values)) in group.channels.iter_mut().zip(slot.channels).enumerate() {
+            let c = h.scales.get(k).map_or(0, |s| s.steps.len());
+            values.resize(births * c, 0);
+            let before = reference.and_then(|r| r.channels.get(k)).map_or(&[][..], Vec::as_slice);
+            let rows = layer.survivors.iter().map(|p| *p as usize);
+            own.extend(rows.flat_map(|p| before.get(p * c..(p + 1) * c).unwrap_or(&[])));
+            append(own, values);
         }
-        Part::Trajectories(t) if attribute.is_none() => group.node_trajectories = t,
-        Part::Trajectories(t) => {
-            let mut slots = header.trajectories.iter().zip(&mut group.trajectories);
-            if let Some((_, slot)) = slots.find(|(h, _)| Some(h.attribute) == attribute) {
-                *slot = t;
-            }
+        for ((own, head), t) in group
+            .trajectories
+            .iter_mut()
+            .zip(&h.trajectories)
+            .zip(slot.trajectories)
+        {
+            let none = || Trajectories::still(head.attribute.channels(h.sh_degree), n);
+            own.append(t.unwrap_or_else(none));
         }
+        if let Some(parents) = &mut group.parents {
+            parents.extend(&layer.survivors);
+            parents.extend((0..births).map(|_| BIRTH));
+        }
+        if cut {
+            lifetimes.extend(slot.lifetimes.unwrap_or_else(|| vec![[0, h.frames]; n]));
+        }
+        append(&mut group.positions, layer.positions);
+        group.corrections.push(slot.correction);
+        group.layers.push(layer.header);
     }
+    group.lifetimes = cut.then_some(lifetimes);
+    group
+}
+
+/// `extend` that takes over the first.
+fn append<T>(to: &mut Vec<T>, more: Vec<T>) {
+    if to.is_empty() { *to = more } else { to.extend(more) }
 }
 
 struct GroupDecoder<'a> {
     header: &'a Header,
+    reference: Option<&'a Group>,
     units: &'a [Unit<'a>],
     level: &'a Level,
     symbols: AtomicU64, // taken so far
 }
 
 impl GroupDecoder<'_> {
-    fn points(&self, kind: UnitType, count: u32) -> Result<Vec<[u32; 3]>> {
-        let Some(i) = inventory::find(self.units, kind, None) else {
+    /// Points of a unit; none if it is damaged or not there.
+    fn points(&self, kind: UnitType, layer: u8, count: u32) -> Result<Vec<[u32; 3]>> {
+        let Some(i) = inventory::find(self.units, (kind, layer, None)) else {
             return Ok(Vec::new());
         };
         let unit = &self.units[i];
@@ -159,29 +257,77 @@ impl GroupDecoder<'_> {
         Ok(codes.into_iter().map(morton::decode).collect())
     }
 
-    fn part(&self, i: usize, unit: &Unit, near: &[Near], near_nodes: &[Near]) -> Result<Option<Part>> {
+    /// Survivors, then births. Where their positions are damaged there are no births, where deaths are nobody dies.
+    fn points_of_layer(&self, k: usize) -> Result<LayerPoints> {
+        let told = self.header.layers.get(k).copied().unwrap_or_default();
+        let births = self.points(UnitType::Positions, k as u8, told.births)?;
+        let survivors = self.survivors(k)?;
+        let known = |i: &u32| self.reference.and_then(|r| r.positions.get(*i as usize)).copied();
+        let mut positions: Vec<_> = survivors.iter().filter_map(known).collect();
+        let births_count = births.len() as u32;
+        append(&mut positions, births);
+        let header = LayerHeader {
+            count: positions.len() as u32,
+            births: births_count,
+        };
+        Ok(LayerPoints {
+            whole: header == told,
+            header,
+            contexts: Contexts::new(&positions, survivors.len()),
+            survivors,
+            positions,
+        })
+    }
+
+    /// Indices of those of layer `k` of the reference that live on.
+    fn survivors(&self, k: usize) -> Result<Vec<u32>> {
+        let Some(r) = self.reference else {
+            return Ok(Vec::new());
+        };
+        let range = r.range(k..k + 1);
+        let all = range.start as u32..range.end as u32;
+        let unit = inventory::find(self.units, (UnitType::Deaths, k as u8, None)).filter(|_| !range.is_empty());
+        let Some((i, unit)) = unit.and_then(|i| Some((i, self.units.get(i)?))) else {
+            return Ok(all.collect());
+        };
+        let mut c = Decoder::new(unit.payload);
+        let mut dead = vec![false; range.len()];
+        let sound = deaths::code(&mut c, &neighbors::nearest(&r.positions[range]), &mut dead);
+        finish(c, sound, i, unit)?;
+        let survivors: Vec<u32> = all.zip(&dead).filter(|(_, dead)| !**dead).map(|(i, _)| i).collect();
+        let told = self.header.layers.get(k).map_or(0, LayerHeader::survivors);
+        if survivors.len() != told as usize {
+            let expected = format!("{told} survivors as the header says, found {}", survivors.len());
+            return Err(Error::bitstream(unit.payload_offset, unit.label(i), expected));
+        }
+        Ok(survivors)
+    }
+
+    fn part(&self, i: usize, unit: &Unit, layers: &[LayerPoints], near_nodes: &[Near]) -> Result<Option<Part>> {
         let h = self.header;
+        let Some(layer) = layers.get(usize::from(unit.layer)) else {
+            return Ok(None);
+        };
         let mut c = Decoder::new(unit.payload);
         let (part, sound) = match (unit.kind, unit.attribute) {
             (Some(UnitType::Channels), Some(a)) => {
-                let channels = a.channels(h.sh_degree);
+                let (channels, near) = (a.channels(h.sh_degree), layer.contexts.births());
                 let mut values = vec![0; near.len() * channels];
                 let sound = channels::code(&mut c, a, channels, near, &mut values);
                 (Part::Channels(values), sound)
             }
+            (Some(UnitType::Lifetimes | UnitType::Trajectories), _) if !layer.whole => return Ok(None),
             (Some(UnitType::Lifetimes), _) => {
-                let mut l = vec![[0; 2]; near.len()];
-                let sound = lifetimes::code(&mut c, h.frames, near, &mut l);
+                let mut l = vec![[0; 2]; layer.positions.len()];
+                let sound = lifetimes::code(&mut c, h.frames, &layer.contexts.all, &mut l);
                 (Part::Lifetimes(l), sound)
             }
             (Some(UnitType::Trajectories), Some(a)) => {
-                let k = h
-                    .trajectories
-                    .iter()
-                    .find(|t| t.attribute == a)
-                    .map_or(0, |t| t.coefficients);
+                let head = h.trajectories.iter().find(|t| t.attribute == a);
+                let k = usize::from(head.map_or(0, |t| t.coefficients));
                 let source = Trajectories::new(a.channels(h.sh_degree));
-                let t = trajectories::code(&mut c, Kind::Gaussians, usize::from(k), near, &source, self.budget());
+                let near = &layer.contexts.all;
+                let t = trajectories::code(&mut c, Kind::Gaussians, k, near, &source, self.budget());
                 self.count(t, i, unit)?
             }
             (Some(UnitType::NodeTrajectories), _) => {
@@ -189,6 +335,7 @@ impl GroupDecoder<'_> {
                 let t = trajectories::code(&mut c, Kind::Nodes, k, near_nodes, &Trajectories::new(6), u64::MAX);
                 self.count(t, i, unit)?
             }
+            (Some(UnitType::LayerCorrection), _) => return correction(i, unit).map(Some),
             _ => return Ok(None),
         };
         finish(c, sound, i, unit)?;
@@ -214,6 +361,17 @@ impl GroupDecoder<'_> {
         self.level.cap(&unit.label(i), "symbols", sum, self.level.symbols)?;
         Ok((Part::Trajectories(t.unwrap_or_default()), true))
     }
+}
+
+/// Spec 10.2.
+fn correction(i: usize, unit: &Unit) -> Result<Part> {
+    let mut r = Reader::new(unit.payload);
+    let mut value = 0.0;
+    let read = r
+        .f32(&mut value, "a correction")
+        .and_then(|()| r.must(r.rest() == 0, || "one number".into()));
+    read.map_err(|e| e.at(unit.payload_offset, &unit.label(i)))?;
+    Ok(Part::Correction(value))
 }
 
 fn finish(c: Decoder, sound: bool, i: usize, unit: &Unit) -> Result<()> {

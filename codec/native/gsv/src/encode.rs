@@ -1,138 +1,193 @@
 //! Group in integers -> payload (spec 3 to 12). The mirror of decode.rs.
 
+use crate::attributes::Attribute;
 use crate::channels;
-use crate::error::Result;
+use crate::deaths;
+use crate::error::{Error, Result};
 use crate::fields::Writer;
 use crate::group::Group;
 use crate::lifetimes;
 use crate::morton;
-use crate::neighbors::{self, Near};
+use crate::neighbors::{self, Contexts, Near};
 use crate::positions;
 use crate::range_coder::Encoder;
 use crate::trajectories::{self, Kind, Trajectories};
 use crate::unit::{self, UnitType};
 use rayon::prelude::*;
 
-/// A unit to be written; dependencies are indices of units.
+/// Codes the payload of a unit.
+type Code<'a> = Box<dyn Fn() -> Vec<u8> + Sync + 'a>;
+
+/// A unit to be written.
 struct Pending<'a> {
     kind: UnitType,
-    attribute: u8,
-    needs: Option<u8>,
-    code: Box<dyn Fn(&mut Encoder) + Sync + 'a>,
+    layer: usize,
+    attribute: Option<Attribute>,
+    code: Code<'a>,
 }
 
-/// The payload of a group (one MP4 sample).
+/// The payload of a group (one MP4 sample). `reference`: the group that a predicted one refers to.
 ///
 /// # Errors
 /// `Error::Input`: the group breaks an invariant; nothing was written.
-pub fn encode_group(group: &Group) -> Result<Vec<u8>> {
-    group.validate()?;
-    let near = neighbors::nearest(&group.positions);
-    let near_nodes = neighbors::nearest(&group.node_positions);
-    let units = units(group, &near, &near_nodes);
-    let payloads: Vec<Vec<u8>> = units
-        .par_iter()
-        .map(|u| {
-            let mut c = Encoder::default();
-            (u.code)(&mut c);
-            c.finish()
+pub fn encode_group(group: &Group, reference: Option<&Group>) -> Result<Vec<u8>> {
+    group.validate(reference)?;
+    let h = &group.header;
+    if group.layers != h.layers {
+        return Err(Error::Input("expected the layers that the header announces".into()));
+    }
+    let contexts: Vec<Contexts> = (0..group.layers.len())
+        .into_par_iter()
+        .map(|k| {
+            let survivors = group.layers[k].survivors() as usize;
+            Contexts::new(&group.positions[group.range(k..k + 1)], survivors)
         })
         .collect();
+    let near_nodes = neighbors::nearest(&group.node_positions);
+    let mut units = Vec::new();
+    for (k, contexts) in contexts.iter().enumerate() {
+        layer(&mut units, group, reference, k, contexts);
+        if k == 0 && h.nodes.count > 0 {
+            nodes(&mut units, group, &near_nodes);
+        }
+    }
+    let payloads: Vec<Vec<u8>> = units.par_iter().map(|u| (u.code)()).collect();
     let mut header = Writer::default();
-    group.header.clone().fields(&mut header)?;
+    h.clone().fields(&mut header, reference.map(|r| &r.header))?;
     let mut out = Vec::new();
     unit::write(&mut out, [UnitType::GroupHeader as u8, 0, 0], &[], &header.0)?;
+    let mut body = Vec::new();
+    let mut sizes = Vec::new();
     for (u, payload) in units.iter().zip(&payloads) {
-        unit::write(&mut out, [u.kind as u8, 0, u.attribute], u.needs.as_slice(), payload)?;
+        let attribute = u.attribute.map_or(0, |a| a as u8);
+        let start = body.len();
+        unit::write(
+            &mut body,
+            [u.kind as u8, u.layer as u8, attribute],
+            &dependencies(u, &units),
+            payload,
+        )?;
+        sizes.extend(((body.len() - start) as u32).to_be_bytes());
     }
+    unit::write(&mut out, [UnitType::UnitSizes as u8, 0, 0], &[], &sizes)?;
+    out.extend(body);
     Ok(out)
 }
 
-/// All units but the header, in the order of the stream: positions is unit 1, node_positions unit 2 if there are nodes.
-fn units<'a>(group: &'a Group, near: &'a [Near], near_nodes: &'a [Near]) -> Vec<Pending<'a>> {
+/// Indices of the units that `u` needs; the header and unit_sizes come before all of them.
+fn dependencies(u: &Pending, units: &[Pending]) -> Vec<u8> {
+    let needed = |d: &Pending| d.layer == u.layer && u.kind.needs().contains(&d.kind);
+    let found = units.iter().zip(2..).filter(|(d, _)| needed(d));
+    found.map(|(_, i)| i).collect()
+}
+
+/// Appends the units of layer `k`, but for the nodes: points first, since the others depend on them.
+fn layer<'a>(
+    units: &mut Vec<Pending<'a>>,
+    group: &'a Group,
+    reference: Option<&'a Group>,
+    k: usize,
+    contexts: &'a Contexts,
+) {
     let h = &group.header;
-    let bits = u32::from(h.grid_bits);
-    let mut units = vec![points(UnitType::Positions, &group.positions, bits)];
-    if h.nodes.count > 0 {
-        units.push(points(UnitType::NodePositions, &group.node_positions, bits));
-        let k = usize::from(h.nodes.coefficients);
-        let t = &group.node_trajectories;
-        units.push(trajectory(
-            UnitType::NodeTrajectories,
-            0,
-            2,
-            Kind::Nodes,
-            k,
-            near_nodes,
-            t,
-        ));
-    }
-    for (a, values) in h.attributes().iter().zip(&group.channels) {
-        let code = move |c: &mut Encoder| {
-            channels::code(c, *a, a.channels(h.sh_degree), near, &mut values.clone());
-        };
+    let (range, births) = (group.range(k..k + 1), group.layers[k].births as usize);
+    let mut push = |kind, attribute, code| {
         units.push(Pending {
-            kind: UnitType::Channels,
-            attribute: *a as u8,
-            needs: Some(1),
-            code: Box::new(code),
+            kind,
+            layer: k,
+            attribute,
+            code,
         });
+    };
+    if let (Some(r), Some(parents)) = (reference, &group.parents)
+        && h.candidates(k, Some(&r.header)) > 0
+    {
+        let survivors = &parents[range.start..range.end - births];
+        push(UnitType::Deaths, None, deaths_of(r, k, survivors));
+    }
+    if h.reference == 0 || births > 0 {
+        let own = &group.positions[range.end - births..range.end];
+        push(UnitType::Positions, None, points(own, u32::from(h.grid_bits)));
+        for (a, values) in h.attributes().iter().zip(&group.channels) {
+            let c = a.channels(h.sh_degree);
+            let own = &values[(range.end - births) * c..range.end * c];
+            let near = contexts.births();
+            let code = coded(move |e| _ = channels::code(e, *a, c, near, &mut own.to_vec()));
+            push(UnitType::Channels, Some(*a), code);
+        }
     }
     for (head, t) in h.trajectories.iter().zip(&group.trajectories) {
-        let k = usize::from(head.coefficients);
-        units.push(trajectory(
-            UnitType::Trajectories,
-            head.attribute as u8,
-            1,
-            Kind::Gaussians,
-            k,
-            near,
-            t,
-        ));
+        let own = t.part(range.start, range.len());
+        let code = trajectory(Kind::Gaussians, usize::from(head.coefficients), &contexts.all, own);
+        push(UnitType::Trajectories, Some(head.attribute), code);
     }
     if let Some(l) = &group.lifetimes {
-        let code = move |c: &mut Encoder| {
-            lifetimes::code(c, h.frames, near, &mut l.clone());
-        };
-        units.push(Pending {
-            kind: UnitType::Lifetimes,
-            attribute: 0,
-            needs: Some(1),
-            code: Box::new(code),
-        });
+        let own = &l[range];
+        let code = coded(move |e| _ = lifetimes::code(e, h.frames, &contexts.all, &mut own.to_vec()));
+        push(UnitType::Lifetimes, None, code);
     }
-    units
+    let corrected = [Attribute::LogScales, Attribute::LogitOpacities];
+    for (a, v) in corrected
+        .into_iter()
+        .zip(group.corrections[k])
+        .filter(|(_, v)| *v != 0.0)
+    {
+        push(
+            UnitType::LayerCorrection,
+            Some(a),
+            Box::new(move || v.to_be_bytes().to_vec()),
+        );
+    }
 }
 
-fn points(kind: UnitType, points: &[[u32; 3]], bits: u32) -> Pending<'_> {
-    let code = move |c: &mut Encoder| {
+fn nodes<'a>(units: &mut Vec<Pending<'a>>, group: &'a Group, near: &'a [Near]) {
+    let h = &group.header;
+    let k = usize::from(h.nodes.coefficients);
+    let motion = trajectory(Kind::Nodes, k, near, group.node_trajectories.clone());
+    let coded = [
+        (
+            UnitType::NodePositions,
+            points(&group.node_positions, u32::from(h.grid_bits)),
+        ),
+        (UnitType::NodeTrajectories, motion),
+    ];
+    units.extend(coded.map(|(kind, code)| Pending {
+        kind,
+        layer: 0,
+        attribute: None,
+        code,
+    }));
+}
+
+/// A unit that one entropy coder makes.
+fn coded<'a>(f: impl Fn(&mut Encoder) + Sync + 'a) -> Code<'a> {
+    Box::new(move || {
+        let mut c = Encoder::default();
+        f(&mut c);
+        c.finish()
+    })
+}
+
+fn points(points: &[[u32; 3]], bits: u32) -> Code<'_> {
+    coded(move |c| {
         let codes: Vec<u64> = points.iter().map(|p| morton::encode(*p)).collect();
         positions::code(c, &codes, codes.len() as u32, bits);
-    };
-    Pending {
-        kind,
-        attribute: 0,
-        needs: None,
-        code: Box::new(code),
-    }
+    })
 }
 
-fn trajectory<'a>(
-    kind: UnitType,
-    attribute: u8,
-    needs: u8,
-    model: Kind,
-    k: usize,
-    near: &'a [Near],
-    t: &'a Trajectories,
-) -> Pending<'a> {
-    let code = move |c: &mut Encoder| {
-        let _ = trajectories::code(c, model, k, near, t, u64::MAX); // an encoder never stops
-    };
-    Pending {
-        kind,
-        attribute,
-        needs: Some(needs),
-        code: Box::new(code),
-    }
+fn deaths_of<'a>(reference: &'a Group, k: usize, survivors: &'a [u32]) -> Code<'a> {
+    coded(move |c| {
+        let range = reference.range(k..k + 1);
+        let mut dead = vec![true; range.len()];
+        for i in survivors {
+            dead[*i as usize - range.start] = false;
+        }
+        deaths::code(c, &neighbors::nearest(&reference.positions[range]), &mut dead);
+    })
+}
+
+fn trajectory(model: Kind, k: usize, near: &[Near], t: Trajectories) -> Code<'_> {
+    coded(move |c| {
+        let _ = trajectories::code(c, model, k, near, &t, u64::MAX); // an encoder never stops
+    })
 }

@@ -37,14 +37,18 @@ pub struct Evaluator {
     canonical: Frame,
     motions: Vec<Motion>,
     blend: Blend,
-    nodes: Vec<[f32; 3]>,
+    nodes: Vec<[f32; 3]>, // from the origin of the grid
 }
 
 impl Evaluator {
     pub fn new(mut group: Group) -> Evaluator {
         let h = &group.header;
         let point = |p: &[u32; 3]| std::array::from_fn(|a| h.origin[a] + h.grid_step * p[a] as f32);
-        let nodes = group.node_positions.iter().map(point).collect();
+        let nodes = group
+            .node_positions
+            .iter()
+            .map(|p| p.map(|v| h.grid_step * v as f32))
+            .collect();
         let blend = Blend::new(&group.positions, &group.node_positions, usize::from(h.nodes.neighbors));
         let canonical = Frame {
             means: group.positions.iter().map(point).collect(),
@@ -54,8 +58,8 @@ impl Evaluator {
                 .iter()
                 .map(|v| unit(*v))
                 .collect(),
-            log_scales: dequantized(&group, Attribute::LogScales),
-            logit_opacities: dequantized(&group, Attribute::LogitOpacities),
+            log_scales: shifted(dequantized(&group, Attribute::LogScales), group.correction()[0]),
+            logit_opacities: shifted(dequantized(&group, Attribute::LogitOpacities), group.correction()[1]),
             sh0: colours(dequantized(&group, Attribute::Sh0)),
             sh_n: colours(dequantized(&group, Attribute::ShN)),
         };
@@ -127,22 +131,20 @@ impl Evaluator {
         let pose = |(j, n): (usize, &[f32; 3])| {
             let [rx, ry, rz, tx, ty, tz] = transform(self.group.node_trajectories.get(j), 6, basis);
             let q = from_rotation_vector([rx, ry, rz].map(|v| v * h.rotation_step));
-            Pose {
-                q,
-                matrix: matrix(q),
-                centre: *n,
-                shift: [tx, ty, tz].map(|v| v * h.translation_step),
-            }
+            pose(q, *n, [tx, ty, tz].map(|v| v * h.translation_step))
         };
         let poses: Vec<Pose> = self.nodes.iter().enumerate().map(pose).collect();
-        let per = self.blend.per;
+        let (per, origin, step) = (self.blend.per, self.group.header.origin, self.group.header.grid_step);
         let near = self.blend.index.par_chunks(per).zip(self.blend.weight.par_chunks(per));
         let out = frame.means.par_iter_mut().zip(&mut frame.quats);
-        out.zip(near).with_min_len(2048).for_each(|((x, q), (index, weight))| {
-            let (moved, turn) = blended(*x, &poses, index, weight);
-            *x = moved;
-            *q = multiply(turn, *q);
-        });
+        let rest = near.zip(&self.group.positions);
+        out.zip(rest)
+            .with_min_len(2048)
+            .for_each(|((x, q), ((index, weight), p))| {
+                let (moved, turn) = blended(p.map(|v| step * v as f32), &poses, index, weight);
+                *x = std::array::from_fn(|a| origin[a] + moved[a]);
+                *q = multiply(turn, *q);
+            });
     }
 }
 
@@ -175,32 +177,42 @@ impl Motion {
     }
 }
 
-/// Motion of one node at frame t.
-struct Pose {
-    q: Quat,
-    matrix: [[f32; 3]; 3],
-    centre: [f32; 3],
-    shift: [f32; 3],
+/// Motion of one node at frame t, places counted from the origin of the grid: three rows of four, x -> R (x - n) + n + T, then the quaternion of R. One array, so that a
+/// blend is a weighted sum of arrays.
+type Pose = [f32; 16];
+
+fn pose(q: Quat, centre: [f32; 3], shift: [f32; 3]) -> Pose {
+    let mut p = [0.0; 16];
+    for (a, row) in matrix(q).into_iter().enumerate() {
+        p[4 * a..4 * a + 3].copy_from_slice(&row);
+        p[4 * a + 3] = centre[a] + shift[a] - (0..3).map(|b| row[b] * centre[b]).sum::<f32>();
+    }
+    p[12..].copy_from_slice(&q);
+    p
 }
 
 fn blended(x: [f32; 3], poses: &[Pose], index: &[u32], weight: &[f32]) -> ([f32; 3], Quat) {
-    let mut moved = [0.0; 3];
-    let mut q = [0.0; 4];
-    let first = index
-        .first()
-        .and_then(|j| poses.get(*j as usize))
-        .map_or([1.0, 0.0, 0.0, 0.0], |p| p.q);
+    let first = index.first().and_then(|j| poses.get(*j as usize));
+    let Some(first) = first else {
+        return (x, [1.0, 0.0, 0.0, 0.0]);
+    };
+    let mut sum = [0.0; 16];
     for (p, w) in index.iter().filter_map(|j| poses.get(*j as usize)).zip(weight) {
-        let d: [f32; 3] = std::array::from_fn(|a| x[a] - p.centre[a]);
-        for (a, (sum, m)) in moved.iter_mut().zip(p.matrix).enumerate() {
-            *sum += w * (m[0] * d[0] + m[1] * d[1] + m[2] * d[2] + p.centre[a] + p.shift[a]);
-        }
-        let dot: f32 = (0..4).map(|a| p.q[a] * first[a]).sum();
+        let dot: f32 = (12..16).map(|a| p[a] * first[a]).sum();
         let s = if dot < 0.0 { -w } else { *w };
-        (0..4).for_each(|a| q[a] += s * p.q[a]);
+        (0..12).for_each(|a| sum[a] += w * p[a]);
+        (12..16).for_each(|a| sum[a] += s * p[a]);
     }
+    let moved =
+        std::array::from_fn(|a| sum[4 * a] * x[0] + sum[4 * a + 1] * x[1] + sum[4 * a + 2] * x[2] + sum[4 * a + 3]);
+    let q: Quat = std::array::from_fn(|a| sum[12 + a]);
     let length = q.iter().map(|v| v * v).sum::<f32>().sqrt();
-    (moved, if length < 1e-12 { first } else { q.map(|v| v / length) })
+    let q = if length < 1e-12 {
+        std::array::from_fn(|a| first[12 + a])
+    } else {
+        q.map(|v| v / length)
+    };
+    (moved, q)
 }
 
 /// offset + step * integer, C per Gaussian; empty if the group lacks the attribute.
@@ -217,6 +229,14 @@ fn dequantized(group: &Group, a: Attribute) -> Vec<f32> {
             .map(|(v, (step, offset))| offset + step * *v as f32)
     })
     .collect()
+}
+
+/// Spec 10.2: makes up for the layers behind that are not there.
+fn shifted(mut values: Vec<f32>, by: f32) -> Vec<f32> {
+    if by != 0.0 {
+        values.iter_mut().for_each(|v| *v += by);
+    }
+    values
 }
 
 fn colours(mut values: Vec<f32>) -> Vec<f32> {

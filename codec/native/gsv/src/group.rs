@@ -1,18 +1,28 @@
 //! A group in integers, and its invariants: what `encode` takes and `decode` gives.
+//!
+//! Layer after layer, and in each the survivors of the reference before the births: a predicted group has all of its integers
+//! here, also those that its payload leaves out.
 
 use crate::attributes::Attribute;
 use crate::error::{Error, Result};
 use crate::fields::Writer;
-use crate::header::Header;
+use crate::header::{Header, LayerHeader};
 use crate::levels::LEVELS;
 use crate::morton;
 use crate::trajectories::Trajectories;
 use crate::values::MAX_VALUE;
 
-/// N Gaussians over T frames, in Morton order.
+/// Stands for "no such Gaussian in the reference".
+pub const BIRTH: u32 = u32::MAX;
+
+/// N Gaussians over T frames. What a layer codes itself is in Morton order.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Group {
     pub header: Header,
+    /// Gaussians of each decoded layer: as the header says, where nothing is damaged.
+    pub layers: Vec<LayerHeader>,
+    /// Predicted: index in the reference of each Gaussian, or `BIRTH`.
+    pub parents: Option<Vec<u32>>,
     pub positions: Vec<[u32; 3]>,
     /// Per attribute of the header, C integers per Gaussian.
     pub channels: Vec<Vec<i32>>,
@@ -21,6 +31,8 @@ pub struct Group {
     pub node_trajectories: Trajectories,
     /// In the order of `header.trajectories`.
     pub trajectories: Vec<Trajectories>,
+    /// For the prefix that ends with each layer: what is added to its log_scales and logit_opacities.
+    pub corrections: Vec<[f32; 2]>,
 }
 
 fn must(holds: bool, message: impl FnOnce() -> String) -> Result<()> {
@@ -28,20 +40,27 @@ fn must(holds: bool, message: impl FnOnce() -> String) -> Result<()> {
 }
 
 impl Group {
-    /// Checks everything that the bitstream cannot express; the message says what was expected.
-    pub fn validate(&self) -> Result<()> {
+    /// Checks everything that the bitstream cannot express; the message says what was expected. `reference`: the group that
+    /// a predicted one refers to.
+    pub fn validate(&self, reference: Option<&Group>) -> Result<()> {
         let h = &self.header;
-        let n = h.count as usize;
-        h.clone().fields(&mut Writer::default())?;
+        let before = reference.map(|r| &r.header);
+        h.clone().fields(&mut Writer::default(), before)?;
         let top = LEVELS[LEVELS.len() - 1];
-        h.check(&top).map_err(|e| Error::Input(e.to_string()))?;
+        h.check(&top, before).map_err(|e| Error::Input(e.to_string()))?;
+        let n = self.range(0..self.layers.len()).len();
+        must(self.layers.len() <= h.layers.len(), || {
+            "expected the layers that the header announces".into()
+        })?;
         must(self.positions.len() == n, || {
             format!("expected {n} positions, got {}", self.positions.len())
+        })?;
+        must(self.corrections.len() == self.layers.len(), || {
+            "expected a correction for each layer".into()
         })?;
         must(self.node_positions.len() == h.nodes.count as usize, || {
             "expected as many nodes as the header says".into()
         })?;
-        points("positions", &self.positions, h.grid_bits)?;
         points("nodes", &self.node_positions, h.grid_bits)?;
         must(self.channels.len() == h.scales.len(), || {
             "expected channels for each attribute".into()
@@ -53,12 +72,71 @@ impl Group {
             })?;
             range(a.name(), values)?;
         }
+        self.validate_layers(reference)?;
         self.validate_time()
+    }
+
+    /// Survivors in the order of the reference and with its integers, then births in Morton order.
+    fn validate_layers(&self, reference: Option<&Group>) -> Result<()> {
+        let h = &self.header;
+        must(self.parents.is_some() == (h.reference > 0), || {
+            "expected parents in a predicted group only".into()
+        })?;
+        let parents = self.parents.as_deref().unwrap_or(&[]);
+        must(
+            parents.len() == if h.reference > 0 { self.positions.len() } else { 0 },
+            || format!("expected {} parents, got {}", self.positions.len(), parents.len()),
+        )?;
+        for (k, layer) in self.layers.iter().enumerate() {
+            let range = self.range(k..k + 1);
+            let middle = range.start + layer.survivors() as usize;
+            points("positions", &self.positions[middle..range.end], h.grid_bits)?;
+            let Some(r) = reference.filter(|_| h.reference > 0) else {
+                continue;
+            };
+            let (survivors, births) = parents[range.clone()].split_at(middle - range.start);
+            let theirs = r.range(k..k + 1);
+            let known = survivors.iter().all(|p| theirs.contains(&(*p as usize)));
+            must(
+                known && survivors.is_sorted_by(|a, b| a < b) && births.iter().all(|p| *p == BIRTH),
+                || {
+                    format!(
+                        "parents of layer {k}: expected increasing indices in that layer of the reference, then births"
+                    )
+                },
+            )?;
+            let same = |(i, p): (usize, &u32)| self.same(range.start + i, r, *p as usize);
+            must(survivors.iter().enumerate().all(same), || {
+                format!("layer {k}: expected survivors to have the integers of the reference")
+            })?;
+        }
+        Ok(())
+    }
+
+    /// Whether Gaussian `i` has the canonical integers of `j` of the reference.
+    fn same(&self, i: usize, reference: &Group, j: usize) -> bool {
+        let mut channels = self.channels.iter().zip(&reference.channels).zip(&self.header.scales);
+        self.positions.get(i) == reference.positions.get(j)
+            && channels.all(|((own, r), s)| {
+                let c = s.steps.len();
+                own.get(i * c..(i + 1) * c) == r.get(j * c..(j + 1) * c)
+            })
+    }
+
+    /// Where the Gaussians of some layers are.
+    pub fn range(&self, layers: std::ops::Range<usize>) -> std::ops::Range<usize> {
+        let sum = |k: usize| self.layers.iter().take(k).map(|l| l.count as usize).sum();
+        sum(layers.start)..sum(layers.end)
+    }
+
+    /// What is added to log_scales and logit_opacities of all Gaussians while the layers behind are not there.
+    pub fn correction(&self) -> [f32; 2] {
+        self.corrections.last().copied().unwrap_or_default()
     }
 
     fn validate_time(&self) -> Result<()> {
         let h = &self.header;
-        let n = h.count as usize;
+        let n = self.positions.len();
         must(self.trajectories.len() == h.trajectories.len(), || {
             "expected trajectories as the header says".into()
         })?;

@@ -1,4 +1,7 @@
 //! Group header (spec 4): what a group holds and how to dequantize it, and the caps it must keep (spec 5).
+//!
+//! A predicted group has the grid, the attributes and the layers of the group that it refers to, so its header is read and
+//! written with that group's header at hand.
 
 use crate::attributes::Attribute;
 use crate::blend::NEIGHBORS_MAX;
@@ -9,6 +12,8 @@ use crate::map;
 
 const FLAG_PREDICTED: u8 = 1;
 const FLAG_STEP_CLASSES: u8 = 2;
+/// Layers of a group.
+pub const LAYERS_MAX: usize = 16;
 
 /// Dequantization of the channels of one attribute: value = offset + step * integer.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -35,14 +40,30 @@ pub struct NodeHeader {
     pub translation_step: f32,
 }
 
+/// Gaussians of one layer.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct LayerHeader {
+    pub count: u32,
+    /// Those that the group codes itself, behind the survivors of the reference; all of an independent group.
+    pub births: u32,
+}
+
+impl LayerHeader {
+    pub fn survivors(&self) -> u32 {
+        self.count - self.births
+    }
+}
+
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Header {
     pub frames: u16,
+    /// How many groups back the one is whose canonical integers this one takes; 0: independent.
+    pub reference: u16,
     pub origin: [f32; 3],
     pub grid_step: f32,
     pub grid_bits: u8,
     pub sh_degree: u8,
-    pub count: u32,
+    pub layers: Vec<LayerHeader>,
     /// In the order of `Attribute::canonical(sh_degree)`.
     pub scales: Vec<Scale>,
     pub trajectories: Vec<TrajectoryHeader>,
@@ -55,10 +76,11 @@ impl Header {
         Attribute::canonical(self.sh_degree)
     }
 
-    pub fn read(payload: &[u8]) -> Result<Header> {
+    /// `reference`: the header of the group that a predicted one refers to.
+    pub fn read(payload: &[u8], reference: Option<&Header>) -> Result<Header> {
         let mut h = Header::default();
         let mut r = Reader::new(payload);
-        h.fields(&mut r)?;
+        h.fields(&mut r, reference)?;
         let rest = r.rest();
         r.must(rest == 0, || {
             format!("the end of the group header, found {rest} more bytes")
@@ -66,11 +88,62 @@ impl Header {
         Ok(h)
     }
 
+    /// How many groups back the group of this header refers; 0: it is independent.
+    pub fn reference_of(payload: &[u8]) -> Result<u16> {
+        let mut h = Header::default();
+        h.opening(&mut Reader::new(payload))?;
+        Ok(h.reference)
+    }
+
+    /// Gaussians in all layers.
+    pub fn count(&self) -> u64 {
+        self.layers.iter().map(|l| u64::from(l.count)).sum()
+    }
+
     /// Reads or writes all fields, and checks them.
-    pub fn fields<F: Fields>(&mut self, f: &mut F) -> Result<()> {
+    pub fn fields<F: Fields>(&mut self, f: &mut F, reference: Option<&Header>) -> Result<()> {
+        self.opening(f)?;
+        if self.reference > 0 {
+            let Some(r) = reference.filter(|r| r.reference == 0) else {
+                return f.fail("the independent group that this predicted one refers to".into());
+            };
+            self.layers(f, Some(r))?;
+            *self = Header {
+                frames: self.frames,
+                reference: self.reference,
+                layers: std::mem::take(&mut self.layers),
+                trajectories: std::mem::take(&mut self.trajectories),
+                nodes: self.nodes,
+                ..r.clone()
+            };
+        } else {
+            self.grid(f)?;
+            self.layers(f, None)?;
+            self.scales(f)?;
+        }
+        self.trajectories(f)?;
+        self.nodes(f)
+    }
+
+    fn opening<F: Fields>(&mut self, f: &mut F) -> Result<()> {
         f.u16(&mut self.frames)?;
         f.must(self.frames > 0, || "frames >= 1, found 0".into())?;
-        flags(f)?;
+        let mut flags = if self.reference > 0 { FLAG_PREDICTED } else { 0 };
+        f.u8(&mut flags)?;
+        f.must(flags & FLAG_STEP_CLASSES == 0, || {
+            "a group without step classes: not yet supported by this version".into()
+        })?;
+        f.must(flags & !FLAG_PREDICTED == 0, || {
+            format!("reserved flags to be 0, found {flags:#04x}")
+        })?;
+        if flags & FLAG_PREDICTED != 0 {
+            f.u16(&mut self.reference)?;
+            f.must(self.reference > 0, || "a reference >= 1, found 0".into())?;
+        }
+        Ok(())
+    }
+
+    fn grid<F: Fields>(&mut self, f: &mut F) -> Result<()> {
         for v in &mut self.origin {
             f.f32(v, "origin")?;
         }
@@ -78,24 +151,41 @@ impl Header {
         f.u8(&mut self.grid_bits)?;
         f.must((1..=21).contains(&self.grid_bits), || "grid_bits of 1 to 21".into())?;
         f.u8(&mut self.sh_degree)?;
-        f.must(self.sh_degree <= 3, || "sh_degree of 0 to 3".into())?;
-        self.layer(f)?;
-        self.scales(f)?;
-        self.trajectories(f)?;
-        self.nodes(f)
+        f.must(self.sh_degree <= 3, || "sh_degree of 0 to 3".into())
     }
 
-    fn layer<F: Fields>(&mut self, f: &mut F) -> Result<()> {
-        let mut layers = 1;
-        f.u8(&mut layers)?;
-        f.must(layers == 1, || {
-            format!("one layer, found {layers}: not yet supported by this version")
+    fn layers<F: Fields>(&mut self, f: &mut F, reference: Option<&Header>) -> Result<()> {
+        let mut n = self.layers.len().min(255) as u8;
+        f.u8(&mut n)?;
+        f.must((1..=LAYERS_MAX).contains(&usize::from(n)), || {
+            format!("1 to {LAYERS_MAX} layers, found {n}")
         })?;
-        f.u32(&mut self.count)?;
-        let width = map::width_log2(self.count as usize) as u8;
-        let mut found = width;
-        f.u8(&mut found)?;
-        f.must(found == width, || format!("map_width_log2 {width}, found {found}"))
+        if let Some(r) = reference {
+            f.must(usize::from(n) == r.layers.len(), || {
+                format!("the {} layers of the reference, found {n}", r.layers.len())
+            })?;
+        }
+        self.layers.resize(usize::from(n), LayerHeader::default());
+        for (k, layer) in self.layers.iter_mut().enumerate() {
+            f.u32(&mut layer.count)?;
+            let width = map::width_log2(layer.count as usize) as u8;
+            let mut found = width;
+            f.u8(&mut found)?;
+            f.must(found == width, || format!("map_width_log2 {width}, found {found}"))?;
+            let Some(before) = reference.and_then(|r| r.layers.get(k)) else {
+                layer.births = layer.count;
+                continue;
+            };
+            f.u32(&mut layer.births)?;
+            let LayerHeader { count, births } = *layer;
+            f.must(births <= count && count - births <= before.count, || {
+                format!(
+                    "at most {count} births, and at most {} survivors of the reference, found {births} births",
+                    before.count
+                )
+            })?;
+        }
+        Ok(())
     }
 
     fn scales<F: Fields>(&mut self, f: &mut F) -> Result<()> {
@@ -166,29 +256,32 @@ impl Header {
     }
 
     /// Symbols known from the header (spec 5), after all caps were found to be kept.
-    pub fn check(&self, level: &Level) -> Result<u64> {
+    pub fn check(&self, level: &Level, reference: Option<&Header>) -> Result<u64> {
         let unit = "group header";
-        level.cap(unit, "Gaussians", u64::from(self.count), u64::from(level.gaussians))?;
+        let (count, nodes) = (self.count(), u64::from(self.nodes.count));
+        level.cap(unit, "Gaussians", count, u64::from(level.gaussians))?;
         level.cap(unit, "frames", u64::from(self.frames), u64::from(level.frames))?;
-        level.cap(unit, "nodes", u64::from(self.nodes.count), u64::from(level.nodes))?;
-        let channels: usize = self.scales.iter().map(|s| s.steps.len()).sum();
-        let per_gaussian = 3 + channels as u64 + self.trajectories.len() as u64;
-        let nodes = u64::from(self.nodes.count) * (3 + 6 * u64::from(self.nodes.coefficients));
-        let symbols = u64::from(self.count) * per_gaussian + nodes;
+        level.cap(unit, "nodes", nodes, u64::from(level.nodes))?;
+        level.cap(unit, "pairs of Gaussian and node", count * nodes, level.pairs)?;
+        let channels: u64 = self.scales.iter().map(|s| s.steps.len() as u64).sum();
+        let births: u64 = self.layers.iter().map(|l| u64::from(l.births)).sum();
+        let deaths: u64 = (0..self.layers.len()).map(|k| self.candidates(k, reference)).sum();
+        let symbols = births * (3 + channels)
+            + count * self.trajectories.len() as u64
+            + nodes * (3 + 6 * u64::from(self.nodes.coefficients))
+            + deaths;
         level.cap(unit, "symbols", symbols, level.symbols)?;
         Ok(symbols)
     }
-}
 
-fn flags<F: Fields>(f: &mut F) -> Result<()> {
-    let mut flags = 0;
-    f.u8(&mut flags)?;
-    let unsupported = |tool: &str| format!("a group without {tool}: not yet supported by this version");
-    f.must(flags & FLAG_PREDICTED == 0, || {
-        unsupported("prediction from an earlier group")
-    })?;
-    f.must(flags & FLAG_STEP_CLASSES == 0, || unsupported("step classes"))?;
-    f.must(flags == 0, || format!("reserved flags to be 0, found {flags:#04x}"))
+    /// Gaussians of the reference that the deaths unit of layer `k` speaks about; 0: there is no such unit.
+    pub fn candidates(&self, k: usize, reference: Option<&Header>) -> u64 {
+        let before = reference.filter(|_| self.reference > 0).and_then(|r| r.layers.get(k));
+        match (self.layers.get(k), before) {
+            (Some(own), Some(before)) if own.survivors() < before.count => u64::from(before.count),
+            _ => 0,
+        }
+    }
 }
 
 fn coefficients<F: Fields>(f: &F, k: u16, frames: u16) -> Result<()> {

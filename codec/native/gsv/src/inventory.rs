@@ -12,73 +12,120 @@ pub struct Damage {
     pub unit: Option<usize>,
     /// What the unit claims to be, or what is missing; None: a type that this version skips.
     pub kind: Option<UnitType>,
+    pub layer: u8,
     pub attribute: Option<Attribute>,
     pub message: String,
 }
 
-/// The sound unit of a type and attribute.
-pub fn find(units: &[Unit], kind: UnitType, attribute: Option<Attribute>) -> Option<usize> {
-    let sought = |u: &Unit| u.kind == Some(kind) && u.attribute == attribute && u.damage.is_none();
+/// What there is one of in a group.
+pub type Key = (UnitType, u8, Option<Attribute>);
+
+/// The sound unit of a type, layer and attribute.
+pub fn find(units: &[Unit], (kind, layer, attribute): Key) -> Option<usize> {
+    let sought = |u: &Unit| (u.kind, u.layer, u.attribute) == (Some(kind), layer, attribute) && u.damage.is_none();
     units.iter().position(sought)
 }
 
-/// Compares units and header; what is damaged or missing.
+/// Compares units and header; what is damaged or missing. `reference`: the header of the group that a predicted one refers
+/// to; `layers`: how many of the layers are to be decoded.
 ///
 /// # Errors
-/// A sound unit that the header does not announce; one that is missing although nothing is damaged; no sound positions.
-pub fn check(units: &[Unit], header: &Header) -> Result<Vec<Damage>> {
+/// A sound unit that the header does not announce, or without its dependencies; one that is missing although nothing is
+/// damaged; no sound positions of the first layer of an independent group.
+pub fn check(units: &[Unit], header: &Header, reference: Option<&Header>, layers: usize) -> Result<Vec<Damage>> {
     let mut damage: Vec<Damage> = units.iter().enumerate().filter_map(claimed).collect();
-    let mut announced = required(header);
+    let (mut announced, optional) = announced(header, reference, layers);
     let end = units.last().map_or(0, |u| u.payload_offset + u.payload.len());
     let any = !damage.is_empty();
-    for &(kind, attribute) in announced.iter().filter(|(k, a)| find(units, *k, *a).is_none()) {
-        let name = attribute.map_or("", Attribute::name);
-        let message = format!("a {} unit {name}, found none", kind.name());
-        if !any || kind == UnitType::Positions {
+    for &key in announced.iter().filter(|key| find(units, **key).is_none()) {
+        let (kind, layer, attribute) = key;
+        let vital = layer == 0 && kind == UnitType::Positions && header.reference == 0;
+        if !any || vital {
             let own = units
                 .iter()
                 .find(|u| u.kind == Some(kind))
                 .and_then(|u| u.damage.clone());
-            return Err(own.unwrap_or_else(|| Error::bitstream(end, "group", message)));
+            return Err(own.unwrap_or_else(|| Error::bitstream(end, "group", missing(key))));
         }
-        if !damage.iter().any(|d| (d.kind, d.attribute) == (Some(kind), attribute)) {
+        if !damage
+            .iter()
+            .any(|d| (d.kind, d.layer, d.attribute) == (Some(kind), layer, attribute))
+        {
             damage.push(Damage {
                 unit: None,
                 kind: Some(kind),
+                layer,
                 attribute,
-                message: format!("expected {message}"),
+                message: format!("expected {}", missing(key)),
             });
         }
     }
-    announced.push((UnitType::Lifetimes, None));
+    announced.extend(optional);
     for (i, u) in units.iter().enumerate().filter(|(_, u)| u.damage.is_none()) {
-        if u.kind.is_some_and(|k| !announced.contains(&(k, u.attribute))) {
-            let expected = "only units that the header announces";
-            return Err(Error::bitstream(u.offset, u.label(i), expected));
+        let Some(kind) = u.kind else { continue };
+        let fail = |expected: String| Err(Error::bitstream(u.offset, u.label(i), expected));
+        if !announced.contains(&(kind, u.layer, u.attribute)) {
+            return fail("only units that the header announces".into());
+        }
+        for need in kind.needs() {
+            let key = (*need, u.layer, None);
+            let met = |d: &u8| {
+                units
+                    .get(usize::from(*d))
+                    .is_some_and(|d| (d.kind, d.layer) == (Some(*need), u.layer))
+            };
+            if announced.contains(&key) && !u.dependencies.iter().any(met) {
+                return fail(format!("a dependency on the {} unit", need.name()));
+            }
         }
     }
     Ok(damage)
+}
+
+fn missing((kind, layer, attribute): Key) -> String {
+    let attribute = attribute.map_or("", Attribute::name);
+    let of = if layer > 0 {
+        format!(" of layer {layer}")
+    } else {
+        String::new()
+    };
+    format!("a {} unit {attribute}{of}, found none", kind.name())
 }
 
 fn claimed((i, u): (usize, &Unit)) -> Option<Damage> {
     Some(Damage {
         unit: Some(i),
         kind: u.kind,
+        layer: u.layer,
         attribute: u.attribute,
         message: u.damage.as_ref()?.to_string(),
     })
 }
 
-fn required(h: &Header) -> Vec<(UnitType, Option<Attribute>)> {
-    let mut required = vec![(UnitType::GroupHeader, None), (UnitType::Positions, None)];
+/// Units that must be there, and those that may.
+fn announced(h: &Header, reference: Option<&Header>, layers: usize) -> (Vec<Key>, Vec<Key>) {
+    let mut required = vec![(UnitType::GroupHeader, 0, None)];
+    let mut optional = vec![(UnitType::UnitSizes, 0, None)];
     if h.nodes.count > 0 {
-        required.extend([(UnitType::NodePositions, None), (UnitType::NodeTrajectories, None)]);
+        required.extend([
+            (UnitType::NodePositions, 0, None),
+            (UnitType::NodeTrajectories, 0, None),
+        ]);
     }
-    let channels = h.attributes().iter().map(|a| (UnitType::Channels, Some(*a)));
-    let moving = h
-        .trajectories
-        .iter()
-        .map(|t| (UnitType::Trajectories, Some(t.attribute)));
-    required.extend(channels.chain(moving));
-    required
+    for (k, layer) in h.layers.iter().enumerate().take(layers) {
+        let n = k as u8;
+        if h.candidates(k, reference) > 0 {
+            required.push((UnitType::Deaths, n, None));
+        }
+        if h.reference == 0 || layer.births > 0 {
+            required.push((UnitType::Positions, n, None));
+            required.extend(h.attributes().iter().map(|a| (UnitType::Channels, n, Some(*a))));
+        }
+        let moving = |t: &crate::header::TrajectoryHeader| (UnitType::Trajectories, n, Some(t.attribute));
+        required.extend(h.trajectories.iter().map(moving));
+        optional.push((UnitType::Lifetimes, n, None));
+        optional
+            .extend([Attribute::LogScales, Attribute::LogitOpacities].map(|a| (UnitType::LayerCorrection, n, Some(a))));
+    }
+    (required, optional)
 }

@@ -9,26 +9,29 @@ pub struct Level {
     pub gaussians: u32,
     pub frames: u16,
     pub nodes: u32,
+    /// Gaussians times nodes: what a search for neighbours may cost.
+    pub pairs: u64,
     pub symbols: u64,
     pub bytes: u64,
 }
 
-const fn level(level: u8, gaussians: u32, frames: u16, nodes: u32, symbols: u64, bytes: u64) -> Level {
+const fn level(level: u8, gaussians: u32, frames: u16, nodes: u32, pairs: u64, symbols: u64, bytes: u64) -> Level {
     Level {
         level,
         gaussians,
         frames,
         nodes,
+        pairs,
         symbols,
         bytes,
     }
 }
 
 pub const LEVELS: [Level; 4] = [
-    level(1, 1 << 16, 64, 1 << 10, 1 << 23, 1 << 24),
-    level(2, 1 << 18, 128, 1 << 12, 1 << 25, 1 << 26),
-    level(3, 1 << 20, 256, 1 << 14, 1 << 27, 1 << 28),
-    level(4, 1 << 22, 256, 1 << 16, 1 << 29, 1 << 30),
+    level(1, 1 << 16, 64, 1 << 10, 1 << 26, 1 << 23, 1 << 24),
+    level(2, 1 << 18, 128, 1 << 12, 1 << 28, 1 << 25, 1 << 26),
+    level(3, 1 << 20, 256, 1 << 14, 1 << 30, 1 << 27, 1 << 28),
+    level(4, 1 << 22, 256, 1 << 16, 1 << 32, 1 << 29, 1 << 30),
 ];
 
 impl Level {

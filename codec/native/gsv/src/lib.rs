@@ -8,6 +8,7 @@ pub mod blend;
 pub mod channels;
 pub mod container;
 mod crc;
+mod deaths;
 pub mod decode;
 pub mod encode;
 pub mod error;

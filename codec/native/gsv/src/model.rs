@@ -30,6 +30,10 @@ fn curve(x: i32) -> i32 {
     if x < 0 { 65536 - p } else { p }
 }
 
+/// `curve` from -`STRETCH_MAX` on, clamped: what a mixed bin is coded with (squash of spec 6.3).
+static SQUASH: LazyLock<[u16; 2 * STRETCH_MAX as usize + 1]> =
+    LazyLock::new(|| std::array::from_fn(|i| curve(i as i32 - STRETCH_MAX).clamp(P_MIN, 65536 - P_MIN) as u16));
+
 /// Probability in 4096ths -> logistic domain (spec 6.3).
 static STRETCH: LazyLock<[i16; 4096]> = LazyLock::new(|| {
     let mut x = -STRETCH_MAX;
@@ -78,6 +82,7 @@ pub struct Model {
     b: Vec<u32>,
     weights: Vec<[i32; 2]>, // less WEIGHT_NEW
     stretch: &'static [i16; 4096],
+    squash: &'static [u16; 2 * STRETCH_MAX as usize + 1],
     rate: &'static [u32; 256],
 }
 
@@ -89,6 +94,7 @@ impl Model {
             b: vec![0; b],
             weights: vec![[0; 2]; sets * 16],
             stretch: &STRETCH,
+            squash: &SQUASH,
             rate: &RATE,
         }
     }
@@ -104,7 +110,8 @@ impl Model {
         let sb = i32::from(self.stretch[(cb.0 >> 20) as usize]);
         let slot = &mut self.weights[16 * w + 4 * ca.age() + cb.age()];
         let weight = slot.map(|v| v + WEIGHT_NEW);
-        let p = curve((weight[0] * sa + weight[1] * sb) >> 16).clamp(P_MIN, 65536 - P_MIN);
+        let x = ((weight[0] * sa + weight[1] * sb) >> 16).clamp(-STRETCH_MAX, STRETCH_MAX);
+        let p = i32::from(self.squash[(x + STRETCH_MAX) as usize]);
         let bin = c.bin(bin, p as u32);
         let err = if bin { 65536 - p } else { -p };
         let learned = |w: i32, s: i32| (w + ((s * err + 16384) >> 15)).clamp(-WEIGHT_MAX, WEIGHT_MAX) - WEIGHT_NEW;

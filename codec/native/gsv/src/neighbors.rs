@@ -27,6 +27,27 @@ pub fn nearest(points: &[[u32; 3]]) -> Vec<Near> {
         .collect()
 }
 
+/// Neighbours in a layer: of all its Gaussians, and of its births among themselves.
+pub struct Contexts {
+    pub all: Vec<Near>,
+    births: Option<Vec<Near>>,
+}
+
+impl Contexts {
+    /// `positions` of a layer, of which the first `survivors` are those of the reference.
+    pub fn new(positions: &[[u32; 3]], survivors: usize) -> Contexts {
+        let births = positions.get(survivors..).unwrap_or(&[]);
+        Contexts {
+            all: nearest(positions),
+            births: (survivors > 0).then(|| nearest(births)),
+        }
+    }
+
+    pub fn births(&self) -> &[Near] {
+        self.births.as_ref().unwrap_or(&self.all)
+    }
+}
+
 fn nearest_before(points: &[[u32; 3]], i: usize) -> Near {
     let from = i.saturating_sub(WINDOW);
     let mut best = [u64::MAX; NEAR]; // distance << 5 | how far back, less one

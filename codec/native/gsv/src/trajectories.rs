@@ -47,6 +47,24 @@ impl Trajectories {
         self.start.push((self.values.len() / self.channels.max(1)) as u32);
     }
 
+    /// Those of `count` Gaussians from `first` on.
+    pub fn part(&self, first: usize, count: usize) -> Trajectories {
+        let mut out = Trajectories::new(self.channels);
+        (first..first + count).for_each(|i| out.push(self.get(i)));
+        out
+    }
+
+    /// Appends the Gaussians of another layer.
+    pub fn append(&mut self, other: Trajectories) {
+        if self.is_empty() {
+            *self = other;
+            return;
+        }
+        let base = self.start.last().copied().unwrap_or(0);
+        self.start.extend(other.start.iter().skip(1).map(|s| base + s));
+        self.values.extend(other.values);
+    }
+
     pub fn len(&self) -> usize {
         self.start.len().saturating_sub(1)
     }

@@ -19,12 +19,13 @@ pub enum UnitType {
     StepClasses = 7,
     Deaths = 8,
     LayerCorrection = 9,
+    UnitSizes = 10,
 }
 
 use UnitType::*;
 
 impl UnitType {
-    const ALL: [UnitType; 10] = [
+    const ALL: [UnitType; 11] = [
         GroupHeader,
         Positions,
         Channels,
@@ -35,6 +36,7 @@ impl UnitType {
         StepClasses,
         Deaths,
         LayerCorrection,
+        UnitSizes,
     ];
 
     pub fn from_number(n: u8) -> Option<UnitType> {
@@ -53,15 +55,17 @@ impl UnitType {
             StepClasses => "step_classes",
             Deaths => "deaths",
             LayerCorrection => "layer_correction",
+            UnitSizes => "unit_sizes",
         }
     }
 
-    /// The unit type that must be among the dependencies.
-    fn needs(self) -> Option<UnitType> {
+    /// The unit types that it must depend on, where its layer has them.
+    pub fn needs(self) -> &'static [UnitType] {
         match self {
-            Channels | Lifetimes | Trajectories => Some(Positions),
-            NodeTrajectories => Some(NodePositions),
-            _ => None,
+            Channels => &[Positions],
+            Lifetimes | Trajectories => &[Positions, Deaths],
+            NodeTrajectories => &[NodePositions],
+            _ => &[],
         }
     }
 }
@@ -81,25 +85,31 @@ pub struct Unit<'a> {
     pub payload: &'a [u8],
     /// What is wrong with the unit, if it is damaged; then the other fields are what its bytes claim.
     pub damage: Option<Error>,
-    dependencies: Vec<u8>,
+    pub dependencies: Vec<u8>,
 }
 
 impl Unit<'_> {
     /// For messages: "unit 3 (channels sh0)".
     pub fn label(&self, index: usize) -> String {
         let kind = self.kind.map_or("unknown", UnitType::name);
-        match self.attribute {
-            Some(a) => format!("unit {index} ({kind} {})", a.name()),
-            None => format!("unit {index} ({kind})"),
-        }
+        let attribute = self.attribute.map_or(String::new(), |a| format!(" {}", a.name()));
+        let layer = if self.layer > 0 {
+            format!(" of layer {}", self.layer)
+        } else {
+            String::new()
+        };
+        format!("unit {index} ({kind}{attribute}{layer})")
     }
 }
 
 const UNITS_MAX: usize = 255;
 
+/// Every layer there may be.
+pub const ALL_LAYERS: usize = 256;
+
 /// Splits a group payload; every CRC and dependency is checked.
-pub fn split(payload: &[u8]) -> Result<Vec<Unit<'_>>> {
-    let mut units = scan(payload)?;
+pub fn split(payload: &[u8], layers: usize) -> Result<Vec<Unit<'_>>> {
+    let mut units = scan(payload, layers)?;
     match units.iter_mut().find_map(|u| u.damage.take()) {
         Some(damage) => Err(damage),
         None => Ok(units),
@@ -107,16 +117,21 @@ pub fn split(payload: &[u8]) -> Result<Vec<Unit<'_>>> {
 }
 
 /// Splits a group payload and marks damaged units (spec 3): those with a wrong CRC, those that name them, what the payload
-/// ends in, and what breaks a rule behind a damaged unit, whose length may be false.
+/// ends in, and what breaks a rule behind a damaged unit whose length may be false (where no unit_sizes tells).
+///
+/// Units of the first `layers` layers only: the payload may end anywhere behind them.
 ///
 /// # Errors
 /// Unit 0 is damaged, or sound bytes break a rule.
-pub fn scan(payload: &[u8]) -> Result<Vec<Unit<'_>>> {
+pub fn scan(payload: &[u8], layers: usize) -> Result<Vec<Unit<'_>>> {
     let mut units: Vec<Unit> = Vec::new();
-    let (mut offset, mut damaged) = (0, false);
+    let (mut offset, mut damaged, mut sizes) = (0, false, Sizes::default());
     while (offset < payload.len() && units.len() <= UNITS_MAX) || units.is_empty() {
         let index = units.len();
-        let mut unit = read(&payload[offset..], offset, index);
+        let mut unit = read(&payload[offset..], offset, index, sizes.next());
+        if unit.damage.is_none() && usize::from(unit.layer) >= layers {
+            break;
+        }
         if unit.damage.is_none() {
             let checked = check(&unit, &units).map_err(|e| Error::bitstream(offset, unit.label(index), e));
             unit.damage = checked.err();
@@ -129,6 +144,9 @@ pub fn scan(payload: &[u8]) -> Result<Vec<Unit<'_>>> {
         {
             return Err(e);
         }
+        if unit.kind == Some(UnitSizes) && unit.damage.is_none() {
+            sizes = Sizes::new(&unit)?;
+        }
         damaged |= unit.damage.is_some();
         offset += unit.size;
         units.push(unit);
@@ -136,12 +154,47 @@ pub fn scan(payload: &[u8]) -> Result<Vec<Unit<'_>>> {
     Ok(units)
 }
 
-/// The unit that `data` starts with; the rest of the data if it ends in the unit.
-fn read(data: &[u8], offset: usize, index: usize) -> Unit<'_> {
+/// The group header of a payload, which may end behind it.
+pub fn first(payload: &[u8]) -> Result<Unit<'_>> {
+    let mut unit = read(payload, 0, 0, None);
+    match unit.damage.take() {
+        Some(damage) => Err(damage),
+        None if unit.kind == Some(GroupHeader) => Ok(unit),
+        None => Err(Error::bitstream(0, "unit 0", "a group header")),
+    }
+}
+
+/// What a unit_sizes unit tells of the units behind it.
+#[derive(Default)]
+struct Sizes<'a>(&'a [[u8; 4]]);
+
+impl<'a> Sizes<'a> {
+    fn new(unit: &Unit<'a>) -> Result<Sizes<'a>> {
+        let (sizes, rest) = unit.payload.as_chunks();
+        if rest.is_empty() {
+            return Ok(Sizes(sizes));
+        }
+        Err(Error::bitstream(
+            unit.payload_offset,
+            unit.label(1),
+            "sizes of four bytes each",
+        ))
+    }
+
+    fn next(&mut self) -> Option<usize> {
+        let (first, rest) = self.0.split_first()?;
+        self.0 = rest;
+        Some(u32::from_be_bytes(*first) as usize)
+    }
+}
+
+/// The unit that `data` starts with, of the size that unit_sizes tells; the rest of the data if it ends in the unit.
+fn read(data: &[u8], offset: usize, index: usize, told: Option<usize>) -> Unit<'_> {
+    let data = told.and_then(|size| data.get(..size)).unwrap_or(data);
     let mut h = [0u8; 4];
     h.iter_mut().zip(data).for_each(|(h, b)| *h = *b);
     let [number, layer, attribute, dependency_count] = h;
-    let kind = UnitType::from_number(number);
+    let kind = UnitType::from_number(number).filter(|k| *k != UnitSizes || index == 1);
     let mut unit = Unit {
         number,
         kind,
@@ -158,6 +211,11 @@ fn read(data: &[u8], offset: usize, index: usize) -> Unit<'_> {
     let mut r = Reader::new(data);
     if let Err(e) = body(&mut unit, &mut r, data, usize::from(dependency_count)) {
         unit.damage = Some(e.at(offset, &format!("unit {index}")));
+    }
+    if told.is_some_and(|size| size != unit.size) || (told.is_some() && unit.damage.is_some()) {
+        unit.size = data.len();
+        let differ = || Error::bitstream(offset, format!("unit {index}"), "the size that unit_sizes tells");
+        unit.damage = unit.damage.or_else(|| Some(differ()));
     }
     unit
 }
@@ -201,32 +259,22 @@ fn check(unit: &Unit, before: &[Unit]) -> std::result::Result<(), String> {
         return Err("layers in increasing order".into());
     }
     let Some(kind) = unit.kind else { return Ok(()) };
-    if matches!(kind, StepClasses | Deaths | LayerCorrection) {
-        return Err(format!("no {} unit: not yet supported by this version", kind.name()));
-    }
-    if unit.layer > 0 {
-        return Err("units of layer 0: more layers are not yet supported by this version".into());
+    if kind == StepClasses {
+        return Err("no step_classes unit: not yet supported by this version".into());
     }
     let allowed = match kind {
         Channels => 2..=6,
         Trajectories => 1..=6,
+        LayerCorrection => 2..=4,
         _ => 0..=0,
     };
-    if !allowed.contains(&unit.attribute_number) {
+    if !allowed.contains(&unit.attribute_number) || (kind, unit.attribute_number) == (LayerCorrection, 3) {
         return Err(format!("an attribute of {allowed:?}, found {}", unit.attribute_number));
     }
     if sound().any(|u| (u.number, u.layer, u.attribute) == (unit.number, unit.layer, unit.attribute)) {
         return Err("one unit of each type, layer and attribute".into());
     }
-    let found = |need| {
-        unit.dependencies
-            .iter()
-            .any(|d| before[usize::from(*d)].kind == Some(need))
-    };
-    match kind.needs().filter(|need| !found(*need)) {
-        Some(need) => Err(format!("a dependency on the {} unit", need.name())),
-        None => Ok(()),
-    }
+    Ok(())
 }
 
 /// Appends a unit; `id` is its type, layer and attribute, `dependencies` are indices of earlier units. Nothing is checked.

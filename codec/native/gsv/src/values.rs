@@ -10,8 +10,11 @@ use crate::range_coder::Bins;
 /// Integers stay within +-MAX_VALUE, which f32 holds exactly.
 pub const MAX_VALUE: i32 = 1 << 24;
 
-const SLOTS: usize = 64; // bins of a value: zero, sign, 16 magnitudes of each sign, escape
+/// Bins of a value: zero, sign, 16 magnitudes of each sign, escape. They lie otherwise than in spec 6.5, so that those of small
+/// values, of both signs, share a cache line.
+const SLOTS: usize = 64;
 const UNARY: i32 = 16;
+const NEAR_UNARY: usize = 7; // magnitudes of either sign in the first cache line
 const ESCAPE_SLOT: usize = 34;
 const ESCAPE_MAX: u32 = 25;
 const NEAR_WEIGHT: [i32; NEAR] = [4, 3, 2, 2];
@@ -51,7 +54,11 @@ impl ValueModel {
             .iter()
             .zip(NEAR_WEIGHT)
             .fold((0, 0), |(s, g), (v, w)| (s + w * v, g + w));
-        let p = if g == 0 { 0 } else { (2 * s + g).div_euclid(2 * g) };
+        let p = match g {
+            0 => 0,
+            11 => (2 * s + 11).div_euclid(22), // the usual case, a division by a constant
+            _ => (2 * s + g).div_euclid(2 * g),
+        };
         let spread: i32 = near.iter().map(|v| (v - p).abs()).sum();
         let centre = p - p.clamp(-7, 7);
         let m = if p.abs() <= 6 {
@@ -78,10 +85,15 @@ impl ValueModel {
             return 0;
         }
         let negative = bin(c, 1, v < 0);
-        let slot = if negative { 2 + UNARY as usize } else { 2 };
+        let (first, rest) = if negative {
+            (2 + NEAR_UNARY, 16 + UNARY as usize - 2 * NEAR_UNARY)
+        } else {
+            (2, 16 - NEAR_UNARY)
+        };
+        let slot = |v: i32| v as usize + if (v as usize) < NEAR_UNARY { first } else { rest };
         let want = v.abs() - 1;
         let mut got = 0;
-        while got < UNARY && bin(c, slot + got as usize, want > got) {
+        while got < UNARY && bin(c, slot(got), want > got) {
             got += 1;
         }
         if got == UNARY {

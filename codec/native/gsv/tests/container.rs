@@ -46,6 +46,7 @@ fn file() -> (Vec<u8>, Vec<Entry>) {
             size: f.len() as u64,
             frames: *frames,
             sync: *sync,
+            layers: Vec::new(),
         });
         fragments.extend(f);
         start += u64::from(*frames);
@@ -222,4 +223,36 @@ fn a_sample_needs_its_mdat() {
     let empty = fragment(&[], 1, 0, 20, true, &config).unwrap();
     assert!(parsed(&[&init, &empty[..empty.len() - 8]]).groups().is_empty());
     assert_eq!(parsed(&[&init, &empty]).groups().len(), 1);
+}
+
+/// Where layers end, as the file says (spec 2.6); a ssix that does not fit is ignored.
+#[test]
+fn layers_can_be_found() {
+    let config = config();
+    let init = init_segment(&config).unwrap();
+    let group = |size: u64, layers: &[u64]| Reference {
+        size,
+        frames: 1,
+        sync: true,
+        layers: layers.to_vec(),
+    };
+    let large = (1 << 25) + 5;
+    let groups = [group(900, &[300, 300, 900]), group(50, &[]), group(large, &[7, large])];
+    let head = finish(&init, &config, &groups).unwrap();
+    let read = |head: &[u8]| {
+        let mut d = Demuxer::default();
+        d.push(head).unwrap();
+        d.layers().to_vec()
+    };
+    assert_eq!(read(&head), [vec![300, 300, 900], vec![50], vec![7, large]]);
+    let at = head.windows(4).position(|w| w == b"ssix").unwrap();
+    for (offset, byte) in [(8, 1), (11, 9), (15, 200), (19, 3)] {
+        let mut bad = head.clone();
+        bad[at + offset] = byte;
+        let mut d = Demuxer::default();
+        d.push(&bad).unwrap();
+        assert_eq!(d.index().len(), 3);
+    }
+    let plain = finish(&init, &config, &groups[1..2]).unwrap();
+    assert!(!plain.windows(4).any(|w| w == b"ssix"));
 }

@@ -3,11 +3,11 @@
 mod common;
 
 use common::{Random, group, small};
-use gsv::decode::{decode_group, decode_units};
+use gsv::decode::{Decoding, decode_group, decode_units};
 use gsv::encode::encode_group;
 use gsv::error::Error;
 use gsv::levels::Level;
-use gsv::unit;
+use gsv::unit::{self, ALL_LAYERS};
 
 fn level() -> Level {
     Level::get(1).unwrap()
@@ -15,21 +15,24 @@ fn level() -> Level {
 
 #[test]
 fn any_flipped_bit_is_noticed() {
-    let payload = encode_group(&small()).unwrap();
+    let payload = encode_group(&small(), None).unwrap();
     for i in 0..payload.len() {
         for bit in 0..8 {
             let mut bad = payload.clone();
             bad[i] ^= 1 << bit;
-            assert!(decode_group(&bad, &level()).is_err(), "byte {i}, bit {bit}");
+            assert!(
+                decode_group(&bad, &Decoding::at(&level())).is_err(),
+                "byte {i}, bit {bit}"
+            );
         }
     }
 }
 
 #[test]
 fn any_truncation_is_noticed() {
-    let payload = encode_group(&small()).unwrap();
+    let payload = encode_group(&small(), None).unwrap();
     for n in 0..payload.len() {
-        match decode_group(&payload[..n], &level()) {
+        match decode_group(&payload[..n], &Decoding::at(&level())) {
             // what is left may be whole units: then one is missing, unless only the optional last one is
             Ok(g) => assert!(g.lifetimes.is_none()),
             Err(Error::Bitstream { offset, .. }) => assert!(offset <= n as u64),
@@ -47,19 +50,19 @@ fn mutated_units_never_panic() {
     while started.elapsed().as_secs() < 3 {
         let shape = common::Shape {
             seed: r.next(),
-            count: r.below(80) as usize,
+            counts: vec![r.below(80) as usize],
             ..small_shape()
         };
-        let payload = encode_group(&group(&shape)).unwrap();
+        let payload = encode_group(&group(&shape), None).unwrap();
         for _ in 0..16 {
-            let mut units = unit::split(&payload).unwrap();
+            let mut units = unit::split(&payload, ALL_LAYERS).unwrap();
             let mut copies: Vec<Vec<u8>> = units.iter().map(|u| u.payload.to_vec()).collect();
             let victim = r.below(copies.len() as u64) as usize;
             mutate(&mut copies[victim], &mut r);
             for (u, copy) in units.iter_mut().zip(&copies) {
                 u.payload = copy;
             }
-            accepted += u64::from(decode_units(&units, &level()).is_ok());
+            accepted += u64::from(decode_units(&units, &Decoding::at(&level())).is_ok());
             rounds += 1;
         }
     }
@@ -68,7 +71,7 @@ fn mutated_units_never_panic() {
 
 fn small_shape() -> common::Shape {
     common::Shape {
-        count: 0,
+        counts: vec![0],
         frames: 9,
         bits: 8,
         sh_degree: 0,
@@ -99,12 +102,12 @@ fn limits_come_before_memory() {
     let mut g = small();
     let over = |g: &gsv::group::Group, part: &str| {
         let payload = header_only(g);
-        match decode_group(&payload, &level()) {
+        match decode_group(&payload, &Decoding::at(&level())) {
             Err(Error::Limit { expected, .. }) => assert!(expected.contains(part), "{expected}"),
             other => panic!("{part}: {other:?}"),
         }
     };
-    g.header.count = u32::MAX;
+    g.header.layers[0].count = u32::MAX;
     over(&g, "Gaussians");
     g = small();
     g.header.frames = 65;
@@ -117,7 +120,7 @@ fn limits_come_before_memory() {
 
 fn header_only(g: &gsv::group::Group) -> Vec<u8> {
     let mut w = gsv::fields::Writer::default();
-    g.header.clone().fields(&mut w).unwrap();
+    g.header.clone().fields(&mut w, None).unwrap();
     let mut out = Vec::new();
     unit::write(&mut out, [0; 3], &[], &w.0).unwrap();
     out
@@ -128,38 +131,40 @@ fn header_only(g: &gsv::group::Group) -> Vec<u8> {
 fn symbols_are_counted_while_they_grow() {
     let mut g = small();
     let mut level = level();
-    level.symbols = g.header.check(&level).unwrap();
-    let payload = encode_group(&g).unwrap();
-    assert!(matches!(decode_group(&payload, &level), Err(Error::Limit { .. })));
+    level.symbols = g.header.check(&level, None).unwrap();
+    let payload = encode_group(&g, None).unwrap();
+    assert!(matches!(
+        decode_group(&payload, &Decoding::at(&level)),
+        Err(Error::Limit { .. })
+    ));
     g.header.trajectories.clear();
     g.trajectories.clear();
-    let payload = encode_group(&g).unwrap();
-    assert!(decode_group(&payload, &level).is_ok());
+    let payload = encode_group(&g, None).unwrap();
+    assert!(decode_group(&payload, &Decoding::at(&level)).is_ok());
 }
 
 /// Reserved tools are named; unknown unit types are skipped.
 #[test]
 fn later_versions() {
-    let payload = encode_group(&small()).unwrap();
-    let flags = unit::split(&payload).unwrap()[0].payload_offset + 2;
-    for (bit, tool) in [(1u8, "prediction"), (2, "step classes")] {
-        let mut header = unit::split(&payload).unwrap()[0].payload.to_vec();
-        header[flags - unit::split(&payload).unwrap()[0].payload_offset] = bit;
+    let payload = encode_group(&small(), None).unwrap();
+    let mut header = unit::split(&payload, ALL_LAYERS).unwrap()[0].payload.to_vec();
+    for (flags, part) in [
+        (1, "refers to"),
+        (2, "step classes: not yet supported"),
+        (4, "reserved flags"),
+    ] {
+        header[2] = flags;
         let mut bad = Vec::new();
         unit::write(&mut bad, [0; 3], &[], &header).unwrap();
-        let message = decode_group(&bad, &level()).unwrap_err().to_string();
-        assert!(
-            message.contains(tool) && message.contains("not yet supported"),
-            "{message}"
-        );
+        let message = decode_group(&bad, &Decoding::at(&level())).unwrap_err().to_string();
+        assert!(message.contains(part), "{message}");
     }
-    for (number, ok) in [(7, false), (8, false), (9, false), (10, true), (255, true)] {
+    for (number, part) in [(7, "not yet supported"), (8, "announces"), (10, ""), (255, "")] {
         let mut more = payload.clone();
-        unit::write(&mut more, [number, 0, u8::from(number % 2 == 1) * 2], &[], b"later").unwrap();
-        let result = decode_group(&more, &level());
-        assert_eq!(result.is_ok(), ok, "{number}");
-        if !ok {
-            assert!(result.unwrap_err().to_string().contains("not yet supported"));
+        unit::write(&mut more, [number, 0, u8::from(number == 7) * 2], &[], b"later").unwrap();
+        match decode_group(&more, &Decoding::at(&level())) {
+            Ok(_) => assert!(part.is_empty(), "{number}"),
+            Err(e) => assert!(!part.is_empty() && e.to_string().contains(part), "{e}"),
         }
     }
 }
@@ -167,30 +172,30 @@ fn later_versions() {
 /// The rules on units, one by one.
 #[test]
 fn broken_units() {
-    let payload = encode_group(&small()).unwrap();
-    let first = unit::split(&payload).unwrap()[0].size;
+    let payload = encode_group(&small(), None).unwrap();
+    let first = unit::split(&payload, ALL_LAYERS).unwrap()[0].size;
     let with = |number, attribute, dependencies: &[u8], part: &str| {
         let mut bad = payload[..first].to_vec();
         unit::write(&mut bad, [number, 0, attribute], dependencies, b"").unwrap();
-        let message = decode_group(&bad, &level()).unwrap_err().to_string();
+        let message = decode_group(&bad, &Decoding::at(&level())).unwrap_err().to_string();
         assert!(message.contains(part), "{message}");
     };
     with(0, 0, &[], "no other");
     with(1, 0, &[1], "earlier units");
     with(1, 0, &[0, 0], "earlier units");
     with(1, 3, &[], "attribute of");
-    with(2, 2, &[], "dependency on the positions unit");
+    with(2, 2, &[], "found none");
     with(1, 0, &[], "a node_positions unit");
     let twice = [payload.as_slice(), &payload[first..]].concat();
     assert!(
-        decode_group(&twice, &level())
+        decode_group(&twice, &Decoding::at(&level()))
             .unwrap_err()
             .to_string()
             .contains("one unit of each")
     );
-    assert!(decode_group(&[], &level()).is_err());
+    assert!(decode_group(&[], &Decoding::at(&level())).is_err());
     assert!(
-        decode_group(&payload[first..], &level())
+        decode_group(&payload[first..], &Decoding::at(&level()))
             .unwrap_err()
             .to_string()
             .contains("group header")

@@ -4,20 +4,25 @@ mod common;
 
 use common::{Random, small};
 use gsv::attributes::Attribute;
-use gsv::decode::{decode_damaged, decode_group};
+use gsv::decode::{Decoding, decode_damaged, decode_group};
 use gsv::encode::encode_group;
 use gsv::error::Error;
 use gsv::evaluate::{Evaluator, Frame};
+use gsv::group::Group;
 use gsv::inventory::Damage;
-use gsv::levels::{LEVELS, Level};
-use gsv::unit::{self, UnitType};
+use gsv::levels::LEVELS;
+use gsv::trajectories::Trajectories;
+use gsv::unit::{self, ALL_LAYERS, Unit, UnitType};
+use std::ops::Range;
 
-const LEVEL: &Level = &LEVELS[0];
+fn how() -> Decoding<'static> {
+    Decoding::at(&LEVELS[0])
+}
 
 /// The small group with the last byte of a unit's payload flipped.
 fn damaged(kind: UnitType, attribute: Option<Attribute>) -> (Vec<u8>, usize) {
-    let mut payload = encode_group(&small()).unwrap();
-    let units = unit::split(&payload).unwrap();
+    let mut payload = encode_group(&small(), None).unwrap();
+    let units = unit::split(&payload, ALL_LAYERS).unwrap();
     let i = units
         .iter()
         .position(|u| (u.kind, u.attribute) == (Some(kind), attribute));
@@ -33,7 +38,7 @@ fn named(damage: &[Damage]) -> Vec<(Option<usize>, Option<UnitType>, Option<Attr
 
 #[test]
 fn a_sound_group_has_no_damage() {
-    let (group, damage) = decode_damaged(&encode_group(&small()).unwrap(), LEVEL).unwrap();
+    let (group, damage) = decode_damaged(&encode_group(&small(), None).unwrap(), &how()).unwrap();
     assert_eq!(group, small());
     assert!(damage.is_empty());
 }
@@ -42,31 +47,31 @@ fn a_sound_group_has_no_damage() {
 fn a_damaged_attribute_costs_only_itself() {
     for (k, a) in Attribute::canonical(1).iter().enumerate() {
         let (payload, i) = damaged(UnitType::Channels, Some(*a));
-        let (group, damage) = decode_damaged(&payload, LEVEL).unwrap();
+        let (group, damage) = decode_damaged(&payload, &how()).unwrap();
         assert_eq!(named(&damage), [(Some(i), Some(UnitType::Channels), Some(*a))]);
         assert!(damage[0].message.contains("CRC"), "{}", damage[0].message);
         let mut want = small();
         want.channels[k].fill(0);
         assert_eq!(group, want);
-        assert!(matches!(decode_group(&payload, LEVEL), Err(Error::Bitstream { .. })));
+        assert!(matches!(decode_group(&payload, &how()), Err(Error::Bitstream { .. })));
     }
     for (k, a) in Attribute::ALL.iter().enumerate() {
         let (payload, i) = damaged(UnitType::Trajectories, Some(*a));
-        let (group, damage) = decode_damaged(&payload, LEVEL).unwrap();
+        let (group, damage) = decode_damaged(&payload, &how()).unwrap();
         assert_eq!(named(&damage), [(Some(i), Some(UnitType::Trajectories), Some(*a))]);
         assert!((0..12).all(|i| group.trajectories[k].get(i).is_empty()));
         let mut want = small();
         want.trajectories[k] = group.trajectories[k].clone();
         assert_eq!(group, want);
     }
-    let (group, damage) = decode_damaged(&damaged(UnitType::Lifetimes, None).0, LEVEL).unwrap();
+    let (group, damage) = decode_damaged(&damaged(UnitType::Lifetimes, None).0, &how()).unwrap();
     assert_eq!((group.lifetimes, damage.len()), (None, 1));
 }
 
 #[test]
 fn without_their_nodes_gaussians_stay_where_they_are() {
     let rest = |payload: &[u8]| {
-        let (mut group, damage) = decode_damaged(payload, LEVEL).unwrap();
+        let (mut group, damage) = decode_damaged(payload, &how()).unwrap();
         (group.trajectories, group.header.trajectories) = (Vec::new(), Vec::new());
         let mut frame = Frame::default();
         Evaluator::new(group).frame(3, &mut frame);
@@ -100,16 +105,16 @@ fn without_their_nodes_gaussians_stay_where_they_are() {
 fn positions_and_header_cannot_be_missed() {
     for kind in [UnitType::Positions, UnitType::GroupHeader] {
         let (payload, _) = damaged(kind, None);
-        let message = decode_damaged(&payload, LEVEL).unwrap_err().to_string();
+        let message = decode_damaged(&payload, &how()).unwrap_err().to_string();
         assert!(message.contains("CRC"), "{message}");
     }
 }
 
 #[test]
 fn what_is_cut_off_is_missing() {
-    let payload = encode_group(&small()).unwrap();
-    let units = unit::split(&payload).unwrap();
-    let (group, damage) = decode_damaged(&payload[..units[5].offset + 3], LEVEL).unwrap();
+    let payload = encode_group(&small(), None).unwrap();
+    let units = unit::split(&payload, ALL_LAYERS).unwrap();
+    let (group, damage) = decode_damaged(&payload[..units[5].offset + 3], &how()).unwrap();
     assert_eq!(damage[0].unit, Some(5));
     assert!(
         damage[1..]
@@ -118,15 +123,15 @@ fn what_is_cut_off_is_missing() {
     );
     let lost = damage.iter().filter(|d| d.kind == Some(UnitType::Trajectories)).count();
     assert_eq!(lost, 6);
-    group.validate().unwrap();
+    group.validate(None).unwrap();
     // whole units that are missing, with nothing damaged, are a broken rule
-    assert!(decode_damaged(&payload[..units[5].offset], LEVEL).is_err());
+    assert!(decode_damaged(&payload[..units[5].offset], &how()).is_err());
 }
 
 #[test]
 fn damage_where_there_are_no_gaussians() {
     let shape = common::Shape {
-        count: 0,
+        counts: vec![0],
         frames: 3,
         bits: 5,
         sh_degree: 0,
@@ -136,8 +141,8 @@ fn damage_where_there_are_no_gaussians() {
         moving: 0b10,
         seed: 1,
     };
-    let mut payload = encode_group(&common::group(&shape)).unwrap();
-    let units = unit::split(&payload).unwrap();
+    let mut payload = encode_group(&common::group(&shape), None).unwrap();
+    let units = unit::split(&payload, ALL_LAYERS).unwrap();
     let at = units
         .iter()
         .find(|u| u.kind == Some(UnitType::Trajectories))
@@ -145,24 +150,115 @@ fn damage_where_there_are_no_gaussians() {
         .offset
         + 4;
     payload[at] ^= 1;
-    let (group, damage) = decode_damaged(&payload, LEVEL).unwrap();
+    let (group, damage) = decode_damaged(&payload, &how()).unwrap();
     assert_eq!(damage.len(), 1);
-    group.validate().unwrap();
+    group.validate(None).unwrap();
 }
 
 /// A sound unit that breaks a rule is not damage.
 #[test]
 fn broken_rules_stay_errors() {
-    let mut payload = encode_group(&small()).unwrap();
+    let mut payload = encode_group(&small(), None).unwrap();
     unit::write(&mut payload, [7, 0, 2], &[1], b"").unwrap();
-    let message = decode_damaged(&payload, LEVEL).unwrap_err().to_string();
+    let message = decode_damaged(&payload, &how()).unwrap_err().to_string();
     assert!(message.contains("not yet supported"), "{message}");
+}
+
+/// What a unit holds, as it is in a group; None where the layer is not the same.
+fn content(g: &Group, sound: &Group, u: &Unit) -> Option<Vec<i32>> {
+    let k = usize::from(u.layer);
+    if g.layers.get(k) != sound.layers.get(k) && u.kind != Some(UnitType::Channels) {
+        return None;
+    }
+    let range = g.range(k..k + 1);
+    let births = range.end - g.layers[k].births as usize..range.end;
+    let moving = |t: &Trajectories, range: Range<usize>| range.flat_map(|i| [&[-7], t.get(i)].concat()).collect();
+    Some(match (u.kind?, u.attribute) {
+        (UnitType::Positions, _) => g.positions[births].as_flattened().iter().map(|v| *v as i32).collect(),
+        (UnitType::Channels, Some(a)) => {
+            let c = a.channels(g.header.sh_degree);
+            g.channels_of(a)?[births.start * c..births.end * c].to_vec()
+        }
+        (UnitType::Trajectories, Some(a)) => {
+            let at = g.header.trajectories.iter().position(|t| t.attribute == a)?;
+            moving(&g.trajectories[at], range)
+        }
+        (UnitType::NodeTrajectories, _) => moving(&g.node_trajectories, 0..g.node_positions.len()),
+        (UnitType::NodePositions, _) => g.node_positions.as_flattened().iter().map(|v| *v as i32).collect(),
+        (UnitType::Lifetimes, _) => {
+            let l = g.lifetimes.as_ref()?;
+            l[range].as_flattened().iter().map(|v| i32::from(*v)).collect()
+        }
+        _ => vec![],
+    })
+}
+
+/// Damaged byte by byte: everything stays but the unit and those that name it, and it is said.
+#[test]
+fn a_damaged_byte_costs_its_unit_and_those_that_name_it() {
+    let reference = common::group(&common::layered());
+    let later = common::predicted(&reference, &common::layered());
+    for (sound, before) in [(&small(), None), (&reference, None), (&later, Some(&reference))] {
+        let how = Decoding {
+            reference: before,
+            ..how()
+        };
+        let payload = encode_group(sound, before).unwrap();
+        let units = unit::split(&payload, ALL_LAYERS).unwrap();
+        let mut lost = 0;
+        for at in 0..payload.len() {
+            let mut bad = payload.clone();
+            bad[at] ^= 0x41;
+            let hit = units.iter().rposition(|u| u.offset <= at).unwrap();
+            let Ok((group, damage)) = decode_damaged(&bad, &how) else {
+                lost += 1;
+                let vital = hit == 0 || (units[hit].kind == Some(UnitType::Positions) && units[hit].layer == 0);
+                assert!(vital, "byte {at} of unit {hit}");
+                continue;
+            };
+            group.validate(before).unwrap();
+            assert_eq!(damage[0].unit, Some(hit), "byte {at}");
+            let names = |u: &Unit| u.dependencies.contains(&(hit as u8));
+            for (i, u) in units.iter().enumerate().filter(|(i, u)| *i != hit && !names(u)) {
+                assert_eq!(
+                    content(&group, sound, u),
+                    content(sound, sound, u),
+                    "byte {at} of unit {hit}, unit {i}"
+                );
+            }
+        }
+        assert!(lost < payload.len() / 3);
+    }
+}
+
+/// What a reference has lost is lost in the groups that refer to it, which decode all the same.
+#[test]
+fn damage_of_the_reference_is_that_of_its_followers() {
+    let reference = common::group(&common::layered());
+    let later = common::predicted(&reference, &common::layered());
+    let payload = encode_group(&later, Some(&reference)).unwrap();
+    let sound = encode_group(&reference, None).unwrap();
+    for u in unit::split(&sound, ALL_LAYERS).unwrap().iter().skip(1) {
+        let mut bad = sound.clone();
+        bad[u.payload_offset] ^= 8;
+        if let Ok((reference, damage)) = decode_damaged(&bad, &how()) {
+            assert_eq!(damage[0].kind, u.kind);
+            let how = Decoding {
+                reference: Some(&reference),
+                ..how()
+            };
+            let (group, own) = decode_damaged(&payload, &how).unwrap();
+            assert!(own.is_empty());
+            group.validate(Some(&reference)).unwrap();
+            Evaluator::new(group).frame(1, &mut Frame::default());
+        }
+    }
 }
 
 /// Whatever comes out is a group.
 #[test]
 fn random_damage() {
-    let sound = encode_group(&small()).unwrap();
+    let sound = encode_group(&small(), None).unwrap();
     let mut r = Random(5);
     let mut decoded = 0;
     for _ in 0..1000 {
@@ -171,8 +267,8 @@ fn random_damage() {
             let at = r.below(payload.len() as u64) as usize;
             payload[at] = r.next() as u8;
         }
-        if let Ok((group, damage)) = decode_damaged(&payload, LEVEL) {
-            group.validate().unwrap();
+        if let Ok((group, damage)) = decode_damaged(&payload, &how()) {
+            group.validate(None).unwrap();
             assert!(!damage.is_empty() || payload == sound);
             decoded += 1;
         }

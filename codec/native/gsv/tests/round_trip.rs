@@ -2,25 +2,34 @@
 
 mod common;
 
-use common::{Random, Shape, group, shape, small};
-use gsv::decode::decode_group;
+use common::{Random, Shape, group, layered, predicted, shape, small, with};
+use gsv::decode::{Decoding, decode_group};
 use gsv::encode::encode_group;
 use gsv::error::Error;
 use gsv::evaluate::{Evaluator, Frame};
 use gsv::group::Group;
 use gsv::levels::Level;
+use gsv::unit::{self, ALL_LAYERS};
 use proptest::prelude::*;
 
 fn decoded(g: &Group) -> Group {
-    let payload = encode_group(g).unwrap();
-    let out = decode_group(&payload, &Level::get(4).unwrap()).unwrap();
-    assert_eq!(encode_group(g).unwrap(), payload, "encoding must not depend on threads");
+    let payload = encode_group(g, None).unwrap();
+    let out = decode_group(&payload, &Decoding::at(&Level::get(4).unwrap())).unwrap();
+    assert_eq!(
+        encode_group(g, None).unwrap(),
+        payload,
+        "encoding must not depend on threads"
+    );
     out
 }
 
 /// Trajectories hold the channels even where they are empty.
 fn same(a: &Group, b: &Group) {
     assert_eq!(a.header, b.header);
+    assert_eq!(
+        (&a.layers, &a.parents, &a.corrections),
+        (&b.layers, &b.parents, &b.corrections)
+    );
     assert_eq!(a.positions, b.positions);
     assert_eq!(a.channels, b.channels);
     assert_eq!(a.lifetimes, b.lifetimes);
@@ -37,6 +46,37 @@ proptest! {
     fn groups_come_back(s in shape()) {
         let g = group(&s);
         same(&g, &decoded(&g));
+    }
+
+    #[test]
+    fn predicted_groups_come_back(s in shape(), seed: u64) {
+        let reference = group(&s);
+        let g = predicted(&reference, &Shape { seed, ..s });
+        let payload = encode_group(&g, Some(&reference)).unwrap();
+        same(&g, &decode_group(&payload, &with(&reference)).unwrap());
+        prop_assert!(decode_group(&payload, &Decoding::at(&Level::get(1).unwrap())).is_err());
+    }
+
+    #[test]
+    fn a_prefix_is_the_first_layers(s in shape()) {
+        let g = group(&s);
+        let payload = encode_group(&g, None).unwrap();
+        let units = unit::split(&payload, ALL_LAYERS).unwrap();
+        let level = Level::get(1).unwrap();
+        for layers in 1..=g.layers.len() {
+            let how = Decoding { layers, ..Decoding::at(&level) };
+            let end = units.iter().find(|u| usize::from(u.layer) >= layers).map_or(payload.len(), |u| u.offset);
+            let prefix = decode_group(&payload, &how).unwrap();
+            prop_assert_eq!(&prefix, &decode_group(&payload[..end], &how).unwrap());
+            let range = g.range(0..layers);
+            prop_assert_eq!(&prefix.positions, &g.positions[range.clone()]);
+            for (t, whole) in prefix.trajectories.iter().zip(&g.trajectories) {
+                prop_assert!(range.clone().all(|i| t.get(i) == whole.get(i)));
+            }
+            let mut frame = Frame::default();
+            Evaluator::new(prefix).frame(0, &mut frame);
+            prop_assert_eq!(frame.means.len(), range.len());
+        }
     }
 
     #[test]
@@ -58,7 +98,7 @@ proptest! {
 #[test]
 fn all_points_in_one_place() {
     let mut g = group(&Shape {
-        count: 5000,
+        counts: vec![5000],
         nodes: 0,
         moving: 0,
         lifetimes: false,
@@ -73,7 +113,7 @@ fn all_points_in_one_place() {
 #[test]
 fn many_points_and_longest_trajectories() {
     let s = Shape {
-        count: 20_000,
+        counts: vec![20_000],
         frames: 256,
         moving: 0b10,
         magnitude: 2,
@@ -84,7 +124,7 @@ fn many_points_and_longest_trajectories() {
     g.header.trajectories[0].coefficients = 256;
     let mut r = Random(1);
     let mut t = gsv::trajectories::Trajectories::new(3);
-    for i in 0..s.count {
+    for i in 0..20_000 {
         let own: Vec<i32> = (0..if i % 997 == 0 { 768 } else { 0 }).map(|_| r.value(24)).collect();
         t.push(&own);
     }
@@ -94,7 +134,7 @@ fn many_points_and_longest_trajectories() {
 
 fn tiny() -> Shape {
     Shape {
-        count: 1,
+        counts: vec![1],
         frames: 1,
         bits: 6,
         sh_degree: 0,
@@ -112,7 +152,7 @@ fn impossible_groups_are_refused() {
     let refused = |change: fn(&mut Group), part: &str| {
         let mut g = small();
         change(&mut g);
-        match encode_group(&g) {
+        match encode_group(&g, None) {
             Err(Error::Input(m)) => assert!(m.contains(part), "{m}"),
             other => panic!("{part}: {other:?}"),
         }
@@ -122,10 +162,39 @@ fn impossible_groups_are_refused() {
     refused(|g| g.header.frames = 0, "frames");
     refused(|g| g.header.grid_bits = 22, "grid_bits");
     refused(|g| g.header.grid_step = f32::NAN, "grid_step");
-    refused(|g| g.header.count += 1, "positions");
+    refused(|g| g.positions.truncate(11), "positions");
+    refused(|g| g.header.layers[0].count += 1, "layers that the header");
+    refused(|g| g.header.layers.clear(), "1 to 16 layers");
     refused(|g| g.channels[1][0] = (1 << 24) + 1, "quats");
     refused(|g| g.header.trajectories[0].coefficients = 6, "coefficients");
     refused(|g| g.header.nodes.neighbors = 9, "neighbors");
     refused(|g| g.lifetimes = Some(vec![[3, 3]; 12]), "lifetime of Gaussian 0");
     refused(|g| g.header.frames = 300, "frames, level 4");
+}
+
+/// What a predicted group must have of its reference.
+#[test]
+fn impossible_predictions_are_refused() {
+    let reference = group(&layered());
+    let refused = |change: fn(&mut Group), part: &str| {
+        let mut g = predicted(&reference, &layered());
+        change(&mut g);
+        match encode_group(&g, Some(&reference)) {
+            Err(Error::Input(m)) => assert!(m.contains(part), "{m}"),
+            other => panic!("{part}: {other:?}"),
+        }
+    };
+    refused(|g| g.parents.as_mut().unwrap().swap(0, 1), "increasing indices");
+    refused(|g| g.parents.as_mut().unwrap()[0] = 99, "increasing indices");
+    refused(|g| g.parents = None, "parents");
+    refused(|g| g.positions[0][0] ^= 1, "integers of the reference");
+    refused(|g| g.channels[1][0] += 1, "integers of the reference");
+    let g = predicted(&reference, &layered());
+    assert!(encode_group(&g, None).unwrap_err().to_string().contains("refers to"));
+    assert!(
+        encode_group(&g, Some(&g))
+            .unwrap_err()
+            .to_string()
+            .contains("independent group")
+    );
 }

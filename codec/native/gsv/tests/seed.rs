@@ -1,17 +1,35 @@
-//! The sound group that fuzz/fuzz_targets/units.rs starts from.
+//! The sound groups that the targets in fuzz/ start from.
 
 mod common;
 
-const PATH: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../fuzz/seed.bin");
+use common::{group, layered, predicted, small, with};
+use gsv::decode::{Decoding, decode_group};
+use gsv::encode::encode_group;
+use gsv::levels::LEVELS;
 
-#[test]
-fn the_seed_is_sound() {
-    let payload = std::fs::read(PATH).unwrap();
-    gsv::decode::decode_group(&payload, &gsv::levels::LEVELS[0]).unwrap();
+fn read(name: &str) -> Vec<u8> {
+    std::fs::read(format!("{}/../fuzz/{name}.bin", env!("CARGO_MANIFEST_DIR"))).unwrap()
 }
 
 #[test]
-#[ignore = "writes the seed: run when the syntax changes"]
-fn write_the_seed() {
-    std::fs::write(PATH, gsv::encode::encode_group(&common::small()).unwrap()).unwrap();
+fn the_seeds_are_sound() {
+    let how = Decoding::at(&LEVELS[0]);
+    decode_group(&read("seed"), &how).unwrap();
+    let reference = decode_group(&read("layered"), &how).unwrap();
+    decode_group(&read("predicted"), &with(&reference)).unwrap();
+}
+
+#[test]
+#[ignore = "writes the seeds: run when the syntax changes"]
+fn write_the_seeds() {
+    let reference = group(&layered());
+    let later = predicted(&reference, &layered());
+    for (name, group, reference) in [
+        ("seed", &small(), None),
+        ("layered", &reference, None),
+        ("predicted", &later, Some(&reference)),
+    ] {
+        let path = format!("{}/../fuzz/{name}.bin", env!("CARGO_MANIFEST_DIR"));
+        std::fs::write(path, encode_group(group, reference).unwrap()).unwrap();
+    }
 }

@@ -135,12 +135,13 @@ pub fn fragment<'py>(
     Ok(PyBytes::new(py, &out))
 }
 
-/// What precedes the fragments of a finished file: `init` and an index of (fragment size, frames, sync).
+/// What precedes the fragments of a finished file: `init` and an index of (fragment size, frames, sync, bytes of the
+/// fragment that end with each layer).
 #[pyfunction]
 pub fn finish<'py>(
     py: Python<'py>,
     init: &Bound<'py, PyAny>,
-    index: Vec<(u64, u32, bool)>,
+    index: Vec<(u64, u32, bool, Vec<u64>)>,
 ) -> PyResult<Bound<'py, PyBytes>> {
     let mut demuxer = Demuxer::default();
     let init = bytes_of(init)?;
@@ -151,7 +152,12 @@ pub fn finish<'py>(
     };
     let groups: Vec<Reference> = index
         .into_iter()
-        .map(|(size, frames, sync)| Reference { size, frames, sync })
+        .map(|(size, frames, sync, layers)| Reference {
+            size,
+            frames,
+            sync,
+            layers,
+        })
         .collect();
     let out = write::finish(init, config, &groups).map_err(|e| raise(py, e))?;
     Ok(PyBytes::new(py, &out))

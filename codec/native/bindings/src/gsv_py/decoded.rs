@@ -2,13 +2,14 @@
 
 use super::values::{bytes_of, raise};
 use gsv::attributes::sh_coefficients;
-use gsv::decode::{decode_damaged, decode_group};
+use gsv::decode::{Decoding, decode_damaged, decode_group};
 use gsv::evaluate::{Evaluator, Frame};
+use gsv::group::{BIRTH, Group};
 use gsv::inventory::Damage;
 use gsv::levels::Level;
 use gsv::map::Map;
 use gsv::trajectories::Trajectories;
-use gsv::unit;
+use gsv::unit::{self, ALL_LAYERS};
 use numpy::ndarray::{Array2, Array3};
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods};
 use pyo3::exceptions::PyIndexError;
@@ -25,19 +26,32 @@ pub struct DecodedGroup {
 
 #[pymethods]
 impl DecodedGroup {
-    /// `strict`: damage is an error; otherwise `damage` lists what was not decoded.
+    /// `strict`: damage is an error; otherwise `damage` lists what was not decoded. `reference`: the group that a predicted
+    /// one refers to. `layers`: only so many, the payload may end behind them.
     #[new]
-    #[pyo3(signature = (payload, level, strict = true))]
-    fn new(py: Python, payload: &Bound<PyAny>, level: u8, strict: bool) -> PyResult<Self> {
+    #[pyo3(signature = (payload, level, strict = true, *, reference = None, layers = ALL_LAYERS))]
+    fn new(
+        py: Python,
+        payload: &Bound<PyAny>,
+        level: u8,
+        strict: bool,
+        reference: Option<Py<DecodedGroup>>,
+        layers: usize,
+    ) -> PyResult<Self> {
         let bytes = bytes_of(payload)?.as_slice()?.to_vec(); // ours while the GIL is released
+        let reference = reference.as_ref().map(|r| r.get().group());
         let decoded = py.detach(|| {
-            let level = Level::get(level)?;
-            let (group, damage) = if strict {
-                (decode_group(&bytes, &level)?, Vec::new())
-            } else {
-                decode_damaged(&bytes, &level)?
+            let how = Decoding {
+                level: &Level::get(level)?,
+                reference,
+                layers: layers.max(1),
             };
-            let units = unit::scan(&bytes)?;
+            let (group, damage) = if strict {
+                (decode_group(&bytes, &how)?, Vec::new())
+            } else {
+                decode_damaged(&bytes, &how)?
+            };
+            let units = unit::scan(&bytes, how.layers)?;
             let label = |u: &unit::Unit| u.kind.map_or("unknown", |k| k.name()).to_string();
             let units = units
                 .iter()
@@ -57,8 +71,25 @@ impl DecodedGroup {
     }
 
     #[getter]
-    fn count(&self) -> u32 {
-        self.evaluator.group().header.count
+    fn count(&self) -> usize {
+        self.group().positions.len()
+    }
+
+    /// Gaussians of each decoded layer.
+    #[getter]
+    fn layers(&self) -> Vec<u32> {
+        self.group().layers.iter().map(|l| l.count).collect()
+    }
+
+    /// [N] i32: index of each Gaussian in the group to which this one refers, -1 for births; None: it is independent.
+    fn parents<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyArray1<i32>>> {
+        Some(parents_into(py, self.group().parents.as_ref()?))
+    }
+
+    /// How many groups back the one is that this one refers to; 0: it is independent.
+    #[getter]
+    fn reference(&self) -> u16 {
+        self.group().header.reference
     }
 
     #[getter]
@@ -76,7 +107,7 @@ impl DecodedGroup {
         self.check(t)?;
         let mut frame = Frame::default();
         py.detach(|| self.evaluator.frame(t, &mut frame));
-        let n = self.count() as usize;
+        let n = self.count();
         let k = sh_coefficients(self.sh_degree());
         let d = PyDict::new(py);
         let flat = |v: Vec<[f32; 3]>| v.into_flattened().into_pyarray(py).reshape([n, 3]);
@@ -118,6 +149,7 @@ impl DecodedGroup {
             d.set_item("unit", damage.unit)?;
             d.set_item("type", damage.kind.map_or("unknown", |k| k.name()))?;
             d.set_item("attribute", damage.attribute.map(|a| a.name()))?;
+            d.set_item("layer", damage.layer)?;
             d.set_item("message", &damage.message)?;
             list.append(d)?;
         }
@@ -152,6 +184,10 @@ impl DecodedGroup {
 }
 
 impl DecodedGroup {
+    pub fn group(&self) -> &Group {
+        self.evaluator.group()
+    }
+
     fn check(&self, t: u16) -> PyResult<()> {
         if t < self.frames() {
             return Ok(());
@@ -180,6 +216,12 @@ fn dense<'py>(py: Python<'py>, t: &Trajectories, k: u16) -> Bound<'py, PyAny> {
     a.into_pyarray(py).into_any()
 }
 
+/// [N] i32, -1 for births.
+fn parents_into<'py>(py: Python<'py>, parents: &[u32]) -> Bound<'py, PyArray1<i32>> {
+    let known = |p: &u32| if *p == BIRTH { -1 } else { *p as i32 };
+    parents.iter().map(known).collect::<Vec<_>>().into_pyarray(py)
+}
+
 fn integers<'py>(py: Python<'py>, e: &Evaluator) -> PyResult<Bound<'py, PyDict>> {
     let (g, h) = (e.group(), &e.group().header);
     let d = PyDict::new(py);
@@ -199,6 +241,15 @@ fn integers<'py>(py: Python<'py>, e: &Evaluator) -> PyResult<Bound<'py, PyDict>>
         channels.set_item(a.name(), one)?;
     }
     d.set_item("channels", channels)?;
+    d.set_item("layers", g.layers.iter().map(|l| l.count).collect::<Vec<_>>())?;
+    d.set_item(
+        "corrections",
+        g.corrections.iter().map(|c| c.to_vec()).collect::<Vec<_>>(),
+    )?;
+    if let Some(parents) = &g.parents {
+        d.set_item("reference", h.reference)?;
+        d.set_item("parents", parents_into(py, parents))?;
+    }
     let trajectories = PyDict::new(py);
     for (head, t) in h.trajectories.iter().zip(e.trajectories()) {
         let one = PyDict::new(py);

@@ -2,14 +2,14 @@
 
 use super::values::{array, invalid, item, optional, points, value};
 use gsv::attributes::{Attribute, sh_coefficients};
-use gsv::group::Group;
-use gsv::header::{Header, NodeHeader, Scale, TrajectoryHeader};
+use gsv::group::{BIRTH, Group};
+use gsv::header::{Header, LayerHeader, NodeHeader, Scale, TrajectoryHeader};
 use gsv::trajectories::Trajectories;
-use numpy::{PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
+use numpy::{PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-pub fn group_from(d: &Bound<PyDict>) -> PyResult<Group> {
+pub fn group_from(d: &Bound<PyDict>, reference: Option<&Group>) -> PyResult<Group> {
     let positions = points(d, "positions")?;
     let channels: Bound<PyDict> = value(d, "channels")?;
     let mut header = Header {
@@ -17,7 +17,6 @@ pub fn group_from(d: &Bound<PyDict>) -> PyResult<Group> {
         origin: value(d, "origin")?,
         grid_step: value(d, "grid_step")?,
         grid_bits: value(d, "grid_bits")?,
-        count: positions.len() as u32,
         sh_degree: sh_degree(&channels)?,
         ..Header::default()
     };
@@ -25,6 +24,7 @@ pub fn group_from(d: &Bound<PyDict>) -> PyResult<Group> {
         positions,
         ..Group::default()
     };
+    layers_from(d, &mut header, &mut group)?;
     for a in header.attributes() {
         let c: Bound<PyDict> = value(&channels, a.name())?;
         let width = a.channels(header.sh_degree);
@@ -58,8 +58,54 @@ pub fn group_from(d: &Bound<PyDict>) -> PyResult<Group> {
         }
         group.lifetimes = Some(a.as_array().outer_iter().map(|r| [r[0], r[1]]).collect());
     }
+    let same = |r: &Group| {
+        let h = &r.header;
+        (h.origin, h.grid_step, h.grid_bits, &h.scales)
+            == (header.origin, header.grid_step, header.grid_bits, &header.scales)
+    };
+    if header.reference > 0 && !reference.is_some_and(same) {
+        return invalid("a predicted group: expected its reference, with the same grid, steps and offsets".into());
+    }
     group.header = header;
     Ok(group)
+}
+
+/// `layers`, `corrections`, and of a predicted group `reference` and `parents`.
+fn layers_from(d: &Bound<PyDict>, header: &mut Header, group: &mut Group) -> PyResult<()> {
+    let n = group.positions.len();
+    let counts: Vec<u32> = match optional(d, "layers")? {
+        Some(_) => value(d, "layers")?,
+        None => vec![n as u32],
+    };
+    if counts.iter().map(|c| *c as usize).sum::<usize>() != n {
+        return invalid(format!("layers: expected counts that sum up to {n}, got {counts:?}"));
+    }
+    group.corrections = match optional(d, "corrections")? {
+        Some(_) => value(d, "corrections")?,
+        None => vec![[0.0; 2]; counts.len()],
+    };
+    if optional(d, "parents")?.is_some() {
+        header.reference = value(d, "reference")?;
+        let parents = array(d, "parents", "int32")?;
+        let Ok(parents) = parents.extract::<PyReadonlyArray1<i32>>() else {
+            return invalid("parents: expected shape [N]".into());
+        };
+        let known = |p: &i32| u32::try_from(*p).unwrap_or(BIRTH);
+        group.parents = Some(parents.as_array().iter().map(known).collect());
+    }
+    let mut first = 0;
+    for count in counts {
+        let last = first + count as usize;
+        let born = |p: &[u32]| p.iter().filter(|p| **p == BIRTH).count() as u32;
+        let births = group
+            .parents
+            .as_ref()
+            .map_or(count, |p| p.get(first..last).map_or(0, born));
+        header.layers.push(LayerHeader { count, births });
+        first = last;
+    }
+    group.layers = header.layers.clone();
+    Ok(())
 }
 
 fn sh_degree(channels: &Bound<PyDict>) -> PyResult<u8> {

@@ -3,7 +3,7 @@
 use super::text;
 use gsv::attributes::sh_coefficients;
 use gsv::container::demux::Demuxer;
-use gsv::decode::decode_group;
+use gsv::decode::{Decoding, decode_group, reference_of};
 use gsv::evaluate::{Evaluator, Frame};
 use gsv::levels::Level as Caps;
 use raster::{Band, Bands, Level, Projected, Rasterizer, Region, Shade, Splats, View};
@@ -60,21 +60,41 @@ impl Player {
         self.output = text::describe(&self.demuxer, first).into_bytes();
     }
 
-    pub fn decode(&mut self, slot: usize, level: u8) -> bool {
-        self.release(slot);
-        let group = Caps::get(level).and_then(|caps| decode_group(&self.input, &caps));
+    /// The reference of a predicted group is in its slot.
+    pub fn decode(&mut self, slot: usize, level: u8, reference: usize, layers: usize) -> bool {
+        let decoded = Caps::get(level).and_then(|caps| {
+            let how = Decoding {
+                level: &caps,
+                reference: self
+                    .groups
+                    .get(reference)
+                    .and_then(Option::as_ref)
+                    .map(Evaluator::group),
+                layers,
+            };
+            decode_group(&self.input, &how)
+        });
         self.input = Vec::new();
+        self.release(slot);
         let Some(place) = self.groups.get_mut(slot) else {
             return self.done(Err::<(), _>(format!("expected a slot below {SLOTS}")));
         };
-        match group {
+        match decoded {
             Err(e) => self.done(Err::<(), _>(e)),
             Ok(group) => {
-                self.output = text::header(&group.header).into_bytes();
+                self.output = text::header(&group.header, group.positions.len()).into_bytes();
                 *place = Some(Evaluator::new(group));
                 true
             }
         }
+    }
+
+    /// How many groups back the group of the input refers; -1 with the message in `output` if that cannot be told.
+    pub fn reference(&mut self) -> i32 {
+        let result = reference_of(&self.input);
+        let back = result.as_ref().map_or(-1, |back| i32::from(*back));
+        self.done(result);
+        back
     }
 
     pub fn release(&mut self, slot: usize) {

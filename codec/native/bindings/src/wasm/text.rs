@@ -5,21 +5,25 @@ use gsv::container::demux::{Demuxer, Entry};
 use gsv::header::Header;
 use std::fmt::Write;
 
-/// {config, groups, index, complete}; config is null before moov has passed.
+/// {config, groups, pending, index, layers, complete}; config is null before moov has passed, pending but after a moof.
 pub fn describe(d: &Demuxer, first: usize) -> String {
     let groups = list(d.groups().iter().skip(first), entry);
     let index = list(d.index().iter(), entry);
+    let layers = list(d.layers().iter(), |ends| list(ends.iter(), u64::to_string));
+    let pending = d.pending().map_or("null".into(), entry);
     let config = d.config().map_or("null".into(), config);
     format!(
-        r#"{{"config":{config},"groups":{groups},"index":{index},"complete":{}}}"#,
+        r#"{{"config":{config},"groups":{groups},"pending":{pending},"index":{index},"layers":{layers},"complete":{}}}"#,
         d.complete()
     )
 }
 
-pub fn header(h: &Header) -> String {
+pub fn header(h: &Header, gaussians: usize) -> String {
     format!(
-        r#"{{"frames":{},"gaussians":{},"sh_degree":{}}}"#,
-        h.frames, h.count, h.sh_degree
+        r#"{{"frames":{},"gaussians":{gaussians},"sh_degree":{},"layers":{}}}"#,
+        h.frames,
+        h.sh_degree,
+        h.layers.len()
     )
 }
 

@@ -46,6 +46,7 @@ pub struct Demuxer {
     /// Where the fragments end according to sidx.
     end: Option<u64>,
     index: Vec<Entry>,
+    layers: Vec<Vec<u64>>,
 }
 
 impl Default for Demuxer {
@@ -60,6 +61,7 @@ impl Default for Demuxer {
             groups: Vec::new(),
             end: None,
             index: Vec::new(),
+            layers: Vec::new(),
         }
     }
 }
@@ -121,6 +123,11 @@ impl Demuxer {
     /// and mdat. A promise, which the fragments need not keep (spec 2.5).
     pub fn index(&self) -> &[Entry] {
         &self.index
+    }
+
+    /// For each entry of `index` the bytes of the fragment that end with each layer; empty where ssix does not tell.
+    pub fn layers(&self) -> &[Vec<u64>] {
+        &self.layers
     }
 
     /// Goes on at the fragment that starts at `position`: what is pushed next is taken to come from there.
@@ -200,7 +207,7 @@ impl Demuxer {
             self.sample_within(body)
                 .map_err(|expected| Error::bitstream(start as usize, "mdat box", expected))?;
         }
-        if !matches!(&kind, b"ftyp" | b"moov" | b"moof" | b"sidx") {
+        if !matches!(&kind, b"ftyp" | b"moov" | b"moof" | b"sidx" | b"ssix") {
             self.state = State::Skip { left: body, media };
             self.skip(0);
         } else if body > HEADER_BOX_MAX {
@@ -242,6 +249,11 @@ impl Demuxer {
             }
             b"sidx" => {
                 self.announced(body);
+                Ok(())
+            }
+            b"ssix" => {
+                let told = movie::layer_index(body).filter(|l| l.len() == self.index.len());
+                self.layers = told.unwrap_or_default();
                 Ok(())
             }
             _ => self.fragment(start, body),

@@ -178,6 +178,30 @@ pub fn index(body: &[u8]) -> Option<(u64, Vec<Reference>)> {
     (references.len() == usize::from(count)).then(|| (first_offset, references.iter().map(words).collect()))
 }
 
+/// Spec 2.6: for each reference of sidx the bytes of the fragment that end with each layer; None if it is malformed.
+pub fn layer_index(body: &[u8]) -> Option<Vec<Vec<u64>>> {
+    let (words, rest) = body.get(4..)?.as_chunks::<4>();
+    let mut words = words.iter().map(|w| u32::from_be_bytes(*w));
+    let mut all = Vec::new();
+    for _ in 0..words.next()? {
+        let (mut ends, mut end) = (Vec::new(), 0);
+        for _ in 0..words.next()? {
+            let range = words.next()?;
+            end += u64::from(range & 0xFF_FFFF);
+            let layer = (range >> 24) as usize;
+            if layer == ends.len() {
+                ends.push(end);
+            } else if layer + 1 == ends.len() {
+                ends[layer] = end;
+            } else {
+                return None;
+            }
+        }
+        all.push(ends);
+    }
+    (rest.is_empty() && words.next().is_none()).then_some(all)
+}
+
 /// Spec 2.4: the group that a moof announces, None if it has none of the track. `moof`: where the moof box starts.
 pub fn fragment(body: &[u8], track: &Track, moof: u64) -> Result<Option<Entry>> {
     for b in boxes(body)?.into_iter().filter(|b| &b.kind == b"traf") {

@@ -7,15 +7,19 @@ pub const TRACK_ID: u32 = 1;
 pub const BRAND: &[u8; 4] = b"gsv1";
 const FLAGS_SYNC: u32 = 0x0200_0000; // sample_depends_on = 2: on no other
 const FLAGS_OTHER: u32 = 0x0101_0000; // depends on others, is not a sync sample
+/// Bytes that a range of ssix can hold.
+const RANGE_MAX: u64 = (1 << 24) - 1;
 const UNITY: [u32; 9] = [1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30];
 
 /// A group as sidx and demuxers see it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Reference {
     /// Bytes of the fragment: moof and mdat.
     pub size: u64,
     pub frames: u32,
     pub sync: bool,
+    /// Bytes of the fragment that end with each layer; none if that is not known.
+    pub layers: Vec<u64>,
 }
 
 /// A box around `parts`.
@@ -127,7 +131,8 @@ pub fn fragment(
     Ok(out)
 }
 
-/// What precedes the fragments of a finished file: the init segment and a sidx of them (spec 2.5).
+/// What precedes the fragments of a finished file: the init segment, a sidx of them (spec 2.5), and where a group has more
+/// than one layer a ssix (spec 2.6).
 pub fn finish(init: &[u8], config: &Config, groups: &[Reference]) -> Result<Vec<u8>> {
     let per = groups.len().div_ceil(usize::from(u16::MAX)).max(1); // groups per reference
     let mut references = Vec::new();
@@ -154,5 +159,33 @@ pub fn finish(init: &[u8], config: &Config, groups: &[Reference]) -> Result<Vec<
         count.to_be_bytes().to_vec(),
     ]
     .concat();
-    Ok([init, &full(b"sidx", 1, 0, &[&head, &references])].concat())
+    let mut out = [init, &full(b"sidx", 1, 0, &[&head, &references])].concat();
+    if per == 1 && groups.iter().any(|g| g.layers.len() > 1) {
+        out.extend(layer_index(groups));
+    }
+    Ok(out)
+}
+
+/// Spec 2.6.
+fn layer_index(groups: &[Reference]) -> Vec<u8> {
+    let mut body = words(&[groups.len() as u32]);
+    for g in groups {
+        let whole = [g.size];
+        let ends = if g.layers.is_empty() { &whole[..] } else { &g.layers };
+        let mut ranges = Vec::new();
+        let mut from = 0;
+        for (k, end) in ends.iter().enumerate() {
+            loop {
+                let size = end.saturating_sub(from).min(RANGE_MAX); // 0 for a layer without units
+                ranges.push((k as u32) << 24 | size as u32);
+                from += size;
+                if from >= *end {
+                    break;
+                }
+            }
+        }
+        body.extend(words(&[ranges.len() as u32]));
+        body.extend(words(&ranges));
+    }
+    full(b"ssix", 0, 0, &[&body])
 }

@@ -2,8 +2,10 @@
 #![allow(dead_code)] // each test takes what it needs
 
 use gsv::attributes::Attribute;
-use gsv::group::Group;
-use gsv::header::{Header, NodeHeader, Scale, TrajectoryHeader};
+use gsv::decode::Decoding;
+use gsv::group::{BIRTH, Group};
+use gsv::header::{Header, LayerHeader, NodeHeader, Scale, TrajectoryHeader};
+use gsv::levels::LEVELS;
 use gsv::morton;
 use gsv::trajectories::Trajectories;
 use proptest::prelude::*;
@@ -11,7 +13,8 @@ use proptest::prelude::*;
 /// What shapes a random group.
 #[derive(Debug, Clone)]
 pub struct Shape {
-    pub count: usize,
+    /// Of each layer.
+    pub counts: Vec<usize>,
     pub frames: u16,
     pub bits: u8,
     pub sh_degree: u8,
@@ -26,7 +29,10 @@ pub struct Shape {
 
 pub fn shape() -> impl Strategy<Value = Shape> {
     let sizes = (
-        prop_oneof![Just(0usize), Just(1), 2..200usize],
+        prop_oneof![
+            prop_oneof![Just(0usize), Just(1), 2..200usize].prop_map(|n| vec![n]),
+            proptest::collection::vec(0..60usize, 1..5),
+        ],
         1..40u16,
         1..=21u8,
         0..=3u8,
@@ -39,8 +45,8 @@ pub fn shape() -> impl Strategy<Value = Shape> {
         any::<u64>(),
     );
     (sizes, rest).prop_map(
-        |((count, frames, bits, sh_degree), (nodes, magnitude, lifetimes, moving, seed))| Shape {
-            count,
+        |((counts, frames, bits, sh_degree), (nodes, magnitude, lifetimes, moving, seed))| Shape {
+            counts,
             frames,
             bits,
             sh_degree,
@@ -113,11 +119,14 @@ pub fn group(s: &Shape) -> Group {
         grid_step: 0.002,
         grid_bits: s.bits,
         sh_degree: s.sh_degree,
-        count: s.count as u32,
+        layers: s.counts.iter().map(|n| layer(*n, *n)).collect(),
         ..Header::default()
     };
+    let count: usize = s.counts.iter().sum();
     let mut g = Group {
-        positions: points(&mut r, s.count, s.bits),
+        positions: s.counts.iter().flat_map(|n| points(&mut r, *n, s.bits)).collect(),
+        layers: header.layers.clone(),
+        corrections: s.counts.iter().map(|n| [*n as f32, 0.5 * (n % 2) as f32]).collect(),
         ..Group::default()
     };
     for a in header.attributes() {
@@ -126,9 +135,23 @@ pub fn group(s: &Shape) -> Group {
             steps: vec![0.5; c],
             offsets: vec![-1.0; c],
         });
-        g.channels
-            .push((0..c * s.count).map(|_| r.value(s.magnitude)).collect());
+        g.channels.push((0..c * count).map(|_| r.value(s.magnitude)).collect());
     }
+    motion(&mut g, &mut header, s, &mut r);
+    g.header = header;
+    g
+}
+
+fn layer(count: usize, births: usize) -> LayerHeader {
+    LayerHeader {
+        count: count as u32,
+        births: births as u32,
+    }
+}
+
+/// What is its own in every group: trajectories, nodes and lifetimes of its Gaussians.
+fn motion(g: &mut Group, header: &mut Header, s: &Shape, r: &mut Random) {
+    let count = g.positions.len();
     for attribute in Attribute::ALL {
         let channels = attribute.channels(s.sh_degree);
         if channels > 0 && s.moving >> attribute as u8 & 1 != 0 {
@@ -139,7 +162,7 @@ pub fn group(s: &Shape) -> Group {
                 step: 0.01,
             });
             g.trajectories
-                .push(trajectories(&mut r, s.count, channels, coefficients, s.magnitude));
+                .push(trajectories(r, count, channels, coefficients, s.magnitude));
         }
     }
     if s.nodes > 0 {
@@ -152,24 +175,91 @@ pub fn group(s: &Shape) -> Group {
             rotation_step: 0.01,
             translation_step: 0.002,
         };
-        g.node_positions = points(&mut r, s.nodes, s.bits);
-        g.node_trajectories = trajectories(&mut r, s.nodes, 6, coefficients, s.magnitude);
+        g.node_positions = points(r, s.nodes, s.bits);
+        g.node_trajectories = trajectories(r, s.nodes, 6, coefficients, s.magnitude);
     }
     if s.lifetimes {
         let mut life = || {
             let t0 = r.below(u64::from(s.frames)) as u16;
             [t0, t0 + 1 + r.below(u64::from(s.frames - t0)) as u16]
         };
-        g.lifetimes = Some((0..s.count).map(|_| life()).collect());
+        g.lifetimes = Some((0..count).map(|_| life()).collect());
     }
+}
+
+/// A group that is predicted from `reference`: some of its Gaussians, others before them and some new ones.
+pub fn predicted(reference: &Group, s: &Shape) -> Group {
+    let mut r = Random(s.seed ^ 0xABCD);
+    let before = &reference.header;
+    let mut g = Group {
+        channels: vec![Vec::new(); reference.channels.len()],
+        corrections: vec![[0.0, 1.0]; before.layers.len()],
+        ..Group::default()
+    };
+    let mut parents = Vec::new();
+    for k in 0..before.layers.len() {
+        let (all, births) = (r.below(2) == 0, r.below(4) as usize);
+        let survivors: Vec<u32> = reference
+            .range(k..k + 1)
+            .map(|i| i as u32)
+            .filter(|_| all || r.below(4) > 0)
+            .collect();
+        let own = points(&mut r, births, s.bits);
+        let known = |p: &u32| reference.positions[*p as usize];
+        g.positions.extend(survivors.iter().map(known).chain(own));
+        for (k, values) in g.channels.iter_mut().enumerate() {
+            let c = before.scales[k].steps.len();
+            let rows = survivors
+                .iter()
+                .flat_map(|p| &reference.channels[k][*p as usize * c..][..c]);
+            values.extend(rows);
+            values.extend((0..births * c).map(|_| r.value(s.magnitude)));
+        }
+        g.layers.push(layer(survivors.len() + births, births));
+        parents.extend(survivors);
+        parents.extend((0..births).map(|_| BIRTH));
+    }
+    g.parents = Some(parents);
+    let mut header = Header {
+        frames: s.frames,
+        reference: 1 + r.below(3) as u16,
+        layers: g.layers.clone(),
+        trajectories: Vec::new(),
+        nodes: NodeHeader::default(),
+        ..before.clone()
+    };
+    motion(&mut g, &mut header, s, &mut r);
     g.header = header;
     g
+}
+
+/// Decoding at level 1, of a group with a reference.
+pub fn with(reference: &Group) -> Decoding<'_> {
+    Decoding {
+        reference: Some(reference),
+        ..Decoding::at(&LEVELS[0])
+    }
+}
+
+/// The shape of `small`, with layers.
+pub fn layered() -> Shape {
+    Shape {
+        counts: vec![6, 3, 5],
+        frames: 5,
+        bits: 6,
+        sh_degree: 1,
+        nodes: 3,
+        magnitude: 6,
+        lifetimes: true,
+        moving: 0xFF,
+        seed: 11,
+    }
 }
 
 /// A group with a bit of everything, small enough to damage byte by byte.
 pub fn small() -> Group {
     group(&Shape {
-        count: 12,
+        counts: vec![12],
         frames: 5,
         bits: 6,
         sh_degree: 1,

@@ -1,0 +1,91 @@
+"""Groups -> payloads: each independent, or predicted from the last independent one where that is cheaper.
+
+The coder remembers the last independent group as it was coded, and where the Gaussians of the groups since came from.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gscodec import _native
+from gscodec.camera import Camera
+from gscodec.encode.group import Coded, code_group
+from gscodec.encode.predicted import predict_group
+from gscodec.errors import CaptureError
+from gscodec.gaussians import Group
+
+DOUBT = 0.7  # a predicted group of more than so many bytes a frame of its reference is coded both ways
+
+
+@dataclass
+class CodedGroup:
+    """Payload of a group, the bytes of its units, and whether it is independent."""
+
+    payload: bytes
+    units: list[dict]
+    gaussians: int
+    independent: bool
+
+
+@dataclass
+class _Reference:
+    coded: Coded
+    decoded: object  # _native.DecodedGroup
+    bytes: int
+    frames: int  # of it and of the groups since
+    back: int  # groups since, itself included
+    index: np.ndarray  # of each Gaussian of the group before: which one it is in the reference, -1: none
+
+
+class GroupCoder:
+    """Codes groups in their order.
+
+    Args:
+        quality, keep_all, layers, cameras: as in `code_group`.
+        random_access: frames from one independent group to the next at most; 0 or 1: every group is independent.
+    """
+
+    def __init__(self, *, quality: float, keep_all: bool, layers: int, random_access: int, cameras: list[Camera] = ()):
+        self._options = {"quality": quality, "keep_all": keep_all, "cameras": cameras}
+        self._layers = layers
+        self._random_access, self._reference = random_access, None
+
+    def code(self, group: Group) -> CodedGroup:
+        """Raises CaptureError: its parents do not fit the group before."""
+        parents, r = self._parents(group), self._reference
+        if parents is None or r.frames + len(group) > self._random_access:
+            return self._independent(group)
+        integers = predict_group(group, parents, r.back, r.coded, **self._options)
+        payload, units = _native.encode_group(integers, r.decoded)
+        if len(payload) > DOUBT * r.bytes:
+            other = self._independent(group)
+            if len(other.payload) <= len(payload):
+                return other
+            self._reference = r
+        r.frames, r.back, r.index = r.frames + len(group), r.back + 1, parents
+        return CodedGroup(payload, units, len(integers["positions"]), False)
+
+    def _independent(self, group: Group) -> CodedGroup:
+        coded = code_group(group, layers=self._layers, **self._options)
+        payload, units = _native.encode_group(coded.integers)
+        if self._random_access > len(group):
+            decoded = _native.DecodedGroup(payload, len(_native.levels()))
+            index = np.arange(len(group.frames[0]))
+            self._reference = _Reference(coded, decoded, len(payload), len(group), 1, index)
+        return CodedGroup(payload, units, len(coded.source), True)
+
+    def _parents(self, group: Group) -> np.ndarray | None:
+        """[N] int, which Gaussian of the reference each one is, -1: none; None: nothing is known."""
+        if group.parents is None or self._reference is None:
+            return None
+        parents, before = np.asarray(group.parents), self._reference.index
+        count = len(group.frames[0])
+        known = parents[parents >= 0] if parents.shape == (count,) else parents
+        if parents.shape != (count,) or len(np.unique(known)) < len(known) or known.max(initial=-1) >= len(before):
+            raise CaptureError(
+                f"parents of a group: expected, for each of its {count} Gaussians, another one of the {len(before)} "
+                f"of the group before, or -1"
+            )
+        return np.where(parents >= 0, before[np.maximum(parents, 0)] if len(before) else -1, -1)

@@ -1,0 +1,162 @@
+"""A group as survivors, deaths and births of an independent one: the integers of what has changed.
+
+In: a group, its Gaussians' parents in the reference, the reference as it was coded. Out: the input of
+`_native.encode_group`. Survivors keep the canonical integers of the reference; nodes carry them from there, however far
+they have moved since, and coefficient 0 of their trajectories says what else has changed. Births are carried back to
+where the reference would have had them, so that the same nodes move them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gscodec import _native
+from gscodec.bitstream.quantization import error_for
+from gscodec.camera import Camera
+from gscodec.encode import rdo
+from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
+from gscodec.encode.group import (
+    PRUNE,
+    Coded,
+    Grid,
+    Stack,
+    align_axes,
+    canonical_appearance,
+    inside_unit_ball,
+    layer_of,
+    measure_stack,
+    motion_integers,
+    prominence,
+    stack_group,
+)
+from gscodec.encode.motion import NodeMotion, Nodes, carry, choose_nodes
+from gscodec.gaussians import Group
+
+REBIRTH = 8.0  # times PRUNE: what the reference left out must matter so much more to come back
+ROUNDS = 3  # of carrying births back
+
+
+def predict_group(
+    group: Group,
+    parents: np.ndarray,
+    back: int,
+    reference: Coded,
+    *,
+    quality: float,
+    keep_all: bool = False,
+    cameras: list[Camera] = (),
+) -> dict:
+    """Integers of a group that is predicted.
+
+    Args:
+        group: T >= 1 frames of N Gaussians.
+        parents: [N] int, index of each in the group that was coded as `reference`, -1: not there.
+        back: how many groups before this one that is.
+        quality, keep_all, cameras: as in `code_group`.
+    """
+    s = stack_group(group)
+    parent = _coded_parents(parents, reference.source)
+    alive, born = parent >= 0, parent < 0
+    measured = measure_stack(s, cameras)
+    if not keep_all and len(parent):
+        least = PRUNE * error_for(quality) / len(parent)
+        alive &= measured.removal > 0
+        born &= measured.removal >= np.where(parents < 0, least, REBIRTH * least)
+    survivors = np.flatnonzero(alive)
+    survivors = survivors[parent[survivors].argsort()]
+    births = np.flatnonzero(born)
+    known = parent[survivors]
+    old, new = s.take(survivors), s.take(births)
+
+    middle, steps, grid = len(s.means) // 2, reference.steps, reference.grid
+    positions = reference.integers["positions"][known]
+    old = align_axes(old, middle, reference.turn[known], reference.order[known])
+    x = grid.to_world(positions)
+    nodes = choose_nodes(positions, x, old.means, grid.step, reference.node_step, grid.to_world) if len(known) else None
+    motion = nodes and carry(nodes, positions, x, len(s.means))
+    places = _carry_back(new.means[middle], x, nodes, motion, middle, grid)
+    order = _native.morton_order(places)
+    places, births, new = places[order], births[order], new.take(order)
+    new_motion = nodes and carry(nodes, places, grid.to_world(places), len(s.means))
+    new, quats = _canonical_births(new, middle, new_motion)
+
+    values = canonical_appearance(new) | {"quats": quats}
+    before = reference.integers
+    channels = {n: _with_births(c, known, values[n], n) for n, c in before["channels"].items()}
+    s = _join(old, new)
+    layer = np.repeat(np.arange(len(before["layers"])), before["layers"])[known]
+    layer = np.concatenate([layer, layer_of(prominence(s), len(before["layers"]))[len(known) :]])
+    place = np.lexsort((np.arange(len(layer)) >= len(known), layer))  # in each layer survivors, then births
+    s, positions = s.take(place), np.concatenate([positions, places])[place]
+    measured = measured.take(np.concatenate([survivors, births])[place])
+    channels = {n: c | {"values": np.ascontiguousarray(c["values"][:, place])} for n, c in channels.items()}
+    if motion:
+        both = ((motion.carried, new_motion.carried), (motion.turned, new_motion.turned))
+        motion = NodeMotion(*(np.concatenate(pair, 1)[:, place] for pair in both))
+    out = before | {
+        "frames": len(s.means),
+        "reference": back,
+        "parents": np.concatenate([known, np.full(len(places), -1)])[place].astype(np.int32),
+        "layers": np.bincount(layer, minlength=len(before["layers"])).tolist(),
+        "positions": positions,
+        "channels": channels,
+        "nodes": None,
+        "lifetimes": None if s.lifetimes is None else s.lifetimes.astype(np.uint16),
+    }
+    price = rdo.bit_price(error_for(quality), max(len(positions), 1))
+    return out | motion_integers(s, channels, steps, measured, price, grid.to_world(positions), nodes, motion)
+
+
+def _coded_parents(parents: np.ndarray, source: np.ndarray) -> np.ndarray:
+    """[N] int, place among the integers of the reference of each Gaussian's parent, -1: it is not there."""
+    place = np.full(max(parents.max(initial=-1), source.max(initial=-1)) + 2, -1)  # the last one is that of -1
+    place[source] = np.arange(len(source))
+    return place[parents]
+
+
+def _carry_back(
+    means: np.ndarray, x: np.ndarray, nodes: Nodes | None, motion: NodeMotion | None, middle: int, grid: Grid
+) -> np.ndarray:
+    """[B, 3] u32, grid points from which the nodes carry births to `means` [B, 3] in frame `middle`.
+
+    The nearest survivor's motion is undone (x [N, 3] are the survivors' canonical positions), then the error is.
+    """
+    if nodes is None or not len(means):
+        return grid.to_integers(means)
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(motion.carried[middle]).query(means)[1]
+    turned, carried = motion.turned[middle, near], motion.carried[middle, near]
+    places = x[near]
+    for _ in range(ROUNDS):
+        places = places + rotate(quat_conjugate(turned), means - carried)
+        on_grid = grid.to_integers(places)
+        moved = carry(nodes, on_grid, grid.to_world(on_grid), len(motion.carried))
+        turned, carried = moved.turned[middle], moved.carried[middle]
+    return grid.to_integers(places)
+
+
+def _canonical_births(s: Stack, middle: int, motion: NodeMotion | None) -> tuple[Stack, np.ndarray]:
+    """Births with their axes in canonical form, and the vector part of their canonical quaternions, [B, 3]."""
+    quats = s.quats[middle]
+    if motion is not None:
+        quats = quat_multiply(quat_conjugate(motion.turned[middle]), quats)
+    turn, order = canonical_axes(quats, s.log_scales[middle])
+    quats = quat_multiply(quats.astype(np.float64), turn)
+    quats *= np.where(quats[:, :1] < 0, -1, 1)
+    return align_axes(s, middle, turn, order), quats[:, 1:]
+
+
+def _with_births(c: dict, known: np.ndarray, values: np.ndarray, name: str) -> dict:
+    """Channels of the survivors, those at `known` of the reference's, and of births with `values` [B, C]."""
+    steps, offsets = np.array(c["steps"], np.float32), np.array(c["offsets"], np.float32)
+    own = c | {"values": np.rint((values - offsets) / steps).astype(np.int32).T}
+    own = inside_unit_ball(own) if name == "quats" else own
+    return c | {"values": np.concatenate([c["values"][:, known], own["values"]], 1)}
+
+
+def _join(a: Stack, b: Stack) -> Stack:
+    """The Gaussians of `a`, then those of `b`."""
+    names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
+    lifetimes = None if a.lifetimes is None else np.concatenate([a.lifetimes, b.lifetimes])
+    return Stack(*(np.concatenate([getattr(a, n), getattr(b, n)], 1) for n in names), lifetimes)
