@@ -6,6 +6,8 @@
 use super::demux::{Demuxer, Entry};
 use crate::error::{Error, Result};
 
+/// Groups that are taken from the index: a file with more damage is no file of ours, and each costs a walk.
+const LOST_MAX: usize = 64;
 /// Bytes that the demuxer is shown at a time between the boxes that it passes over.
 const LOOK: usize = 4096;
 
@@ -30,6 +32,7 @@ pub fn read(data: &[u8], strict: bool) -> Result<(Demuxer, Vec<(usize, Error)>)>
         let short = walked.is_err() || demuxer.groups().len() < demuxer.index().len();
         match (walked, missing(&demuxer, data.len()).filter(|_| short && !strict)) {
             (walked, None) => return walked.map(|()| (demuxer, damage)),
+            (walked, Some(_)) if damage.len() >= LOST_MAX => return walked.map(|()| (demuxer, damage)),
             (walked, Some((next, _))) if tried == Some(next) => {
                 let lost = || Error::bitstream(at, format!("group {next}"), "the fragment that the index tells of");
                 damage.push((next, walked.err().unwrap_or_else(lost)));
