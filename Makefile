@@ -14,7 +14,7 @@ $(VENV)/.done: pyproject.toml $(NATIVE)
 	@command -v cargo >/dev/null || { echo "error: cargo was not found; install a Rust toolchain (rustup.rs) and run make again"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable '.[encode,dev]'
+	$(BIN)/python -m pip install --quiet --editable '.[encode,charts,dev]'
 	@touch $@
 
 demo: venv
@@ -24,7 +24,6 @@ demo: venv
 	$(BIN)/gscodec render $(DEMO)/lumberjack.gsv $(DEMO)/preview.mp4
 	@echo
 	@echo "The stream is $(DEMO)/lumberjack.gsv, a preview $(DEMO)/preview.mp4. To play and to go on:"
-	@echo "  $(BIN)/gscodec play $(DEMO)/lumberjack.gsv                           in the browser"
 	@echo "  $(BIN)/gscodec play $(DEMO)/lumberjack.gsv                           in the browser, from any side"
 	@echo "  $(BIN)/gscodec info $(DEMO)/lumberjack.gsv                           what is in it"
 	@echo "  $(BIN)/gscodec render $(DEMO)/lumberjack.gsv out.mp4 --camera cam20  another view of it"

@@ -1,81 +1,89 @@
-"""Speed of the rasterizer: a JSON list of scenes, sizes, instruction sets, threads and the milliseconds they take.
+"""Speed of the rasterizer: for each scene, size, instruction set and number of threads the milliseconds it takes.
 
-Keys: scene, gaussians, width, height, simd, threads, project_ms, forward_ms, backward_ms, step_ms.
-
-The scene is a person-sized capsule: points on its surface, splats of 0.6 x the mean spacing x U(0.5, 1.5) per axis,
-opacity U(0.15, 0.95), camera at 2.8 m, f = 1.4 x width. project_ms is projection, depth sort and binning; forward_ms
-blending of a X
-of `repeats` runs.
-
-    python bench/raster.py [--repeats N] [--simd avx512,avx2,scalar] [--threads 1,0] > bench/results/raster.json
+Keys of an entry: scene, gaussians, width, height, covered (share of the pixels with alpha > 0.02), simd, threads,
+project_ms (projection, depth sort and binning), forward_ms (blending), backward_ms (tiles, then Gaussians), step_ms (a
+whole training step: these, the image loss and Adam), memory_bytes (all buffers of a picture, without gradients). Times
+are medians of the runs, after two that warm up.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from gscodec.camera import Camera, look_at
+from gscodec.bench.scenes import DISTANCE, FILES, capsule, capsule_camera, file_scene
+from gscodec.camera import Camera
 from gscodec.gaussians import Gaussians
 from gscodec.render.image import render_image, render_rgba
 from gscodec.render.step import render_loss
-from gscodec.render.workspace import PARAMETERS, Workspace, simd_levels
+from gscodec.render.workspace import Workspace, simd_levels
+from gscodec.train.keyframe import RATES
+from gscodec.train.model import from_gaussians
 
-SIZES = ((20_000, 512), (50_000, 512), (100_000, 1024))  # Gaussians, width = height
-RADIUS, HEIGHT = 0.25, 1.8  # metres
-
-
-def capsule(n: int, seed: int = 0) -> Gaussians:
-    """N Gaussians evenly on the capsule, in random order."""
-    rng = np.random.default_rng(seed)
-    cylinder = HEIGHT - 2 * RADIUS
-    side, caps = 2 * np.pi * RADIUS * cylinder, 4 * np.pi * RADIUS**2
-    direction = rng.normal(size=(n, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    points = direction * RADIUS
-    points[:, 1] += np.sign(points[:, 1]) * cylinder / 2
-    on_side = rng.random(n) < side / (side + caps)
-    angle, y = rng.uniform(0, 2 * np.pi, n), rng.uniform(-0.5, 0.5, n) * cylinder
-    ring = np.stack([RADIUS * np.cos(angle), y, RADIUS * np.sin(angle)], 1)
-    points[on_side] = ring[on_side]
-    scales = 0.6 * np.sqrt((side + caps) / n) * rng.uniform(0.5, 1.5, (n, 3))
-    opacity = rng.uniform(0.15, 0.95, n)
-    arrays = (points, rng.normal(size=(n, 4)), np.log(scales), np.log(opacity / (1 - opacity)), rng.normal(size=(n, 3)))
-    return Gaussians(*(a.astype(np.float32) for a in arrays), np.zeros((n, 0, 3), np.float32)).validate("capsule")
+RATE = 1e-6  # of Adam: the scene must not change while it is measured
+BUDGET_S = 6.0  # an entry takes fewer repeats than asked for, at least 5, beyond that
 
 
-def camera(width: int) -> Camera:
-    K = np.array([[1.4 * width, 0, width / 2], [0, 1.4 * width, width / 2], [0, 0, 1.0]])
-    return Camera("bench", K, look_at([0, 0, 2.8], [0, 0, 0], [0, 1, 0]), width, width)
+@dataclass(frozen=True)
+class Case:
+    """One picture; `every` level and number of threads is measured, or only the fastest with all cores."""
+
+    scene: str
+    gaussians: int  # of a capsule
+    width: int
+    height: int
+    distance: float = DISTANCE
+    every: bool = False
+
+    def load(self, data: Path | None) -> tuple[Gaussians, Camera] | None:
+        """Gaussians and camera; None where the file is missing."""
+        if self.scene == "capsule":
+            return capsule(self.gaussians), capsule_camera(self.width, self.height, self.distance)
+        return file_scene(self.scene, data, self.width, self.height) if data else None
+
+
+ANCHORS = [Case("capsule", n, w, w, every=True) for n, w in ((20_000, 512), (50_000, 512), (100_000, 1024))]
+ANCHORS.append(Case("capsule", 30_000, 512, 512))  # the training step
+GROWTH = [Case("capsule", n, 1024, 1024) for n in (10_000, 30_000, 300_000, 1_000_000)]
+PIXELS = [Case("capsule", 100_000, w, h) for w, h in ((512, 512), (1920, 1080), (2048, 2048), (3840, 2160))]
+COVERED = [Case("capsule", 50_000, 1024, 1024, d) for d in (1.2, 2.8, 6.0)]
+SPLATS = [Case("statue", 0, 1280, 720), Case("playbot", 0, 1280, 720), Case("lumberjack", 0, 512, 512)]
+CASES = [*ANCHORS, *GROWTH, *PIXELS, *COVERED, *SPLATS]
+SCENES = ("capsule", *FILES)
 
 
 def measure(scene: str, gaussians: Gaussians, cam: Camera, simd: str, threads: int, repeats: int) -> dict:
-    """One entry of the list; `threads` 0 means all cores."""
+    """One entry of the list."""
     workspace = Workspace(threads, simd)
-    params = {name: getattr(gaussians, name) for name in PARAMETERS}
+    model = from_gaussians(gaussians)
     covered = render_rgba(gaussians, cam)[..., 3] > 0.02
     noise = np.random.default_rng(0).integers(-9, 9, (cam.height, cam.width, 3)) * covered[..., None]
     rgb = np.clip(render_image(gaussians, cam) + noise, 0, 255).astype(np.uint8)
     mask = covered.astype(np.uint8) * 255
+    rates = {name: RATE for name in ("means", *RATES)}
     parts, steps = [], []
-    for _ in range(repeats + 2):
+    begin = time.perf_counter()
+    while len(steps) < repeats + 2 and (len(steps) < 7 or time.perf_counter() - begin < BUDGET_S):
         start = time.perf_counter()
-        render_loss(params, cam, rgb, mask, (0.5, 0.5, 0.5), 0.2, 0.1, workspace)
+        result = render_loss(model.params, cam, rgb, mask, (0.5, 0.5, 0.5), 0.2, 0.1, workspace)
+        model.adam(result.grads, rates)
         steps.append(1e3 * (time.perf_counter() - start))
         t = workspace.timings
         parts.append((t["project"] + t["bin"], t["blend"], t["backward_tiles"] + t["backward_project"]))
-    project, forward, backward = np.median(parts[2:], axis=0)  # the first two warm up
+    project, forward, backward = np.median(parts[2:], axis=0)
     return {
         "scene": scene,
         "gaussians": len(gaussians),
         "width": cam.width,
         "height": cam.height,
+        "covered": round(float(covered.mean()), 4),
         "simd": simd,
-        "threads": threads or os.cpu_count(),
+        "threads": threads,
         "project_ms": round(float(project), 3),
         "forward_ms": round(float(forward), 3),
         "backward_ms": round(float(backward), 3),
@@ -83,25 +91,29 @@ def measure(scene: str, gaussians: Gaussians, cam: Camera, simd: str, threads: i
     }
 
 
-def run(simd: list[str] | None = None, threads: tuple[int, ...] = (1, 0), repeats: int = 15, sizes=SIZES) -> list[dict]:
-    """The whole list; `simd` None: every level of this machine."""
-    entries = []
-    for n, width in sizes:
-        gaussians, cam = capsule(n), camera(width)
-        for level in simd or simd_levels():
-            entries += [measure("capsule", gaussians, cam, level, t, repeats) for t in threads]
-    return entries
+def run(
+    scenes: tuple[str, ...] = SCENES,
+    simd: list[str] | None = None,
+    threads: list[int] | None = None,
+    repeats: int = 15,
+    data: Path | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Iterator[dict]:
+    """Yields the entries of all cases of `scenes`.
 
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--simd", help="comma-separated, default: all levels of this machine")
-    parser.add_argument("--threads", default="1,0", help="comma-separated, 0: all cores")
-    args = parser.parse_args()
-    simd = args.simd.split(",") if args.simd else None
-    print(json.dumps(run(simd, tuple(int(t) for t in args.threads.split(",")), args.repeats), indent=1))
-
-
-if __name__ == "__main__":
-    main()
+    Args:
+        simd: levels of every case; None: all levels for the anchors, the fastest for the others.
+        threads: numbers of threads of every case; None: 1 and all cores for the anchors, all cores for the others.
+        data: folder with the files of `scenes.FILES`; without it they are left out, which `say` is told.
+    """
+    cores = os.cpu_count() or 1
+    for case in CASES:
+        if case.scene not in scenes:
+            continue
+        loaded = case.load(data)
+        if loaded is None:
+            say(f"{case.scene}: left out, {FILES[case.scene][0]} is not in the data folder")
+            continue
+        for level in simd or simd_levels()[: None if case.every else 1]:
+            for count in threads or ([1, cores] if case.every and cores > 1 else [cores]):
+                yield measure(case.scene, *loaded, level, count, repeats)

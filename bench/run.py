@@ -10,31 +10,15 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-ROOT = Path(__file__).parent.parent
-RESULTS = ROOT / "bench" / "results"
+from gscodec.bench.machine import RESULTS, ROOT, write_result
+
 GSCODEC = [sys.executable, "-c", "from gscodec.cli import main; main()"]
-
-
-def machine() -> dict:
-    """What the figures were measured on."""
-    model = platform.processor()
-    if Path("/proc/cpuinfo").exists():
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        model = next((x.split(":")[1].strip() for x in lines if x.startswith("model name")), model)
-    return {"cpu": model, "cores": os.cpu_count(), "system": platform.system(), "python": platform.python_version()}
-
-
-def commit() -> str:
-    """Short hash of the checkout, "+" if it has changes."""
-    git = lambda *a: subprocess.run(["git", *a], cwd=ROOT, capture_output=True, text=True).stdout.strip()  # noqa: E731
-    return git("rev-parse", "--short", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
 
 
 def gscodec(*args) -> tuple[str, float]:
@@ -99,15 +83,13 @@ def main() -> None:
     if unknown:
         sys.exit(f"error: no such benchmark: {', '.join(unknown)}, expected {', '.join(CASES)}")
     data = os.environ.get("GSCODEC_DATA")
-    RESULTS.mkdir(parents=True, exist_ok=True)
     for name in named:
         if name != "demo" and not data:
             print(f"{name}: left out, GSCODEC_DATA is not set", file=sys.stderr)
             continue
         with tempfile.TemporaryDirectory() as folder:
             result = CASES[name](Path(data) if data else None, Path(folder))
-        result = {"machine": machine(), "commit": commit(), **result}
-        (RESULTS / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")
+        write_result(RESULTS / f"{name}.json", result)
         print(json.dumps(result, indent=1))
 
 

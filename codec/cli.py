@@ -217,6 +217,48 @@ def evaluate(
         _out.print(f"first {p['layers']} layers: {p['kb_per_frame']:.2f} kB/frame, {psnr:.2f} dB")
 
 
+bench = typer.Typer(help="Measurements, as JSON that charts are drawn from.", no_args_is_help=True)
+app.add_typer(bench, name="bench")
+
+
+@bench.command("raster")
+def bench_raster(
+    scenes: Annotated[str | None, typer.Option(help="Comma-separated: capsule, statue, playbot, lumberjack.")] = None,
+    simd: Annotated[str | None, typer.Option(help="Comma-separated instruction sets.")] = None,
+    threads: Annotated[str | None, typer.Option(help="Comma-separated numbers of threads.")] = None,
+    repeats: Annotated[int, typer.Option(help="Runs of which the median counts.")] = 15,
+    data: Annotated[Path | None, typer.Option(envvar="GSCODEC_DATA", help="Folder with the splats' files.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Also write machine, commit, settings and entries here.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Speed of the rasterizer and of a training step, by scene, size, instruction set and threads."""
+    from gscodec.commands import bench_raster as measure
+
+    entries = []
+    for e in measure(scenes, simd, threads, repeats=repeats, data=data, out=out):
+        entries.append(e)
+        if not as_json:
+            _out.print(
+                f"{e['scene']:<11}{e['gaussians']:>8} {e['width']:>4}x{e['height']:<5}{e['simd']:>8} x{e['threads']:<3}"
+                f"project {e['project_ms']:8.2f}  forward {e['forward_ms']:8.2f}  backward {e['backward_ms']:8.2f}  "
+                f"step {e['step_ms']:8.2f} ms"
+            )
+    if as_json:
+        print(json.dumps(entries, indent=1))
+
+
+@app.command()
+def chart(
+    results: Annotated[Path, typer.Argument(help="Folder of results.")] = Path("bench/results"),
+    charts: Annotated[Path, typer.Argument(help="Folder for the charts.")] = Path("bench/charts"),
+) -> None:
+    """Charts (.svg and .png) of all results that have one."""
+    from gscodec.metrics.charts import draw_charts
+
+    for path in draw_charts(results, charts):
+        _out.print(str(path))
+
+
 def _warn_if_cut(stream) -> None:
     if not stream.complete:
         print(

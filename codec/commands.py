@@ -1,11 +1,13 @@
 """What the studio's commands do: the joints between stages, one function a command, no arithmetic.
 
 encode: capture -> train -> encode, or splats -> encode        train: capture -> train -> .ply folder
-eval:   stream + capture or splats -> metrics
+eval:   stream + capture or splats -> metrics                       bench:  scenes -> figures
 """
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -205,3 +207,41 @@ def evaluate_stream(stream_path: Path, source: Path, *, split: str, frames: str 
         keys = ("bytes", "kb_per_frame", "gaussians", "psnr", "psnr_fg", "codec_psnr", "codec_psnr_fg")
         result["prefixes"].append({"layers": k + 1} | {name: found[name] for name in keys})
     return result
+
+
+def bench_raster(
+    scenes: str | None, simd: str | None, threads: str | None, *, repeats: int, data: Path | None, out: Path | None
+) -> Iterator[dict]:
+    """Yields what bench.raster measures (the lists are comma-separated, None: the usual ones), then writes it to `out`.
+
+    Raises:
+        UsageError: an unknown scene or instruction set, a number that is none, or torch is missing.
+    """
+    require("torch", "measuring training steps")
+    from gscodec.bench.machine import write_result
+    from gscodec.bench.raster import SCENES, run
+    from gscodec.render.workspace import simd_levels
+
+    chosen = {
+        "scenes": _names("--scenes", scenes, SCENES) or list(SCENES),
+        "simd": _names("--simd", simd, simd_levels()),
+        "threads": _names("--threads", threads, [str(n) for n in range(1, 257)]),
+        "repeats": repeats,
+    }
+    chosen["threads"] = [int(n) for n in chosen["threads"]] if chosen["threads"] else None
+    entries = []
+    for entry in run(**chosen, data=data, say=lambda text: print(text, file=sys.stderr)):
+        entries.append(entry)
+        yield entry
+    if out:
+        settings = {**chosen, "simd": chosen["simd"] or simd_levels()}
+        write_result(out, {"settings": settings, "entries": entries})
+
+
+def _names(option: str, text: str | None, known) -> list[str] | None:
+    """ "a,b" -> ["a", "b"], all of them known; None stays None."""
+    names = text.split(",") if text else None
+    for name in names or []:
+        if name not in known:
+            raise UsageError(f"{option} {name} is not known here, expected some of {', '.join(known)}")
+    return names

@@ -27,12 +27,13 @@ class UsageError(GscodecError):
     """An argument or a combination of arguments makes no sense, or an extra has to be installed first."""
 
 
-def require(module: str, purpose: str) -> ModuleType:
+def require(module: str, purpose: str, extra: str = "encode") -> ModuleType:
     """The optional module `module`, imported when it is needed, since the player's side installs without it.
 
     Args:
         module: import name, e.g. "cv2".
         purpose: what needs it, the start of the message, e.g. "reading a video".
+        extra: the extra of the package that has it.
 
     Raises:
         UsageError: it is not installed; names the extra that has it.
@@ -40,4 +41,4 @@ def require(module: str, purpose: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as e:
-        raise UsageError(f"{purpose} needs {module}; install it with: pip install 'gscodec[encode]'") from e
+        raise UsageError(f"{purpose} needs {module}; install it with: pip install 'gscodec[{extra}]'") from e

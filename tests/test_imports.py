@@ -6,12 +6,14 @@ from pathlib import Path
 import pytest
 
 import gscodec
+import gscodec.bench
 import gscodec.player
 
 ROOT = Path(gscodec.__file__).parent
-PLAYER = Path(gscodec.player.__file__).parent
+FOLDERS = {"bench": Path(gscodec.bench.__file__).parent, "player": Path(gscodec.player.__file__).parent}
 BASE = {"errors", "gaussians", "camera", "frames", "_native"}
 ALLOWED = {
+    "bench": BASE | {"capture", "decode", "render", "splats", "train"},
     "bitstream": BASE,
     "capture": BASE,
     "splats": BASE | {"capture"},
@@ -40,7 +42,7 @@ def imports(path: Path, *, top_level: bool = False) -> set[str]:
 
 @pytest.mark.parametrize("package", sorted(ALLOWED))
 def test_packages_import_one_way(package):
-    files = list((PLAYER if package == "player" else ROOT / package).glob("*.py"))
+    files = list(FOLDERS.get(package, ROOT / package).glob("*.py"))
     assert files, f"{package} has no modules"
     for path in files:
         for name in imports(path):
@@ -59,7 +61,7 @@ def test_training_takes_only_facts_from_the_bitstream():
 def test_the_players_side_needs_no_extra_to_import():
     files = [ROOT / n for n in ("cli.py", "frames.py", "gaussians.py", "camera.py", "errors.py", "progress.py")]
     files += [*(ROOT / "decode").glob("*.py"), *(ROOT / "bitstream").glob("*.py"), ROOT / "splats" / "ply.py"]
-    files += PLAYER.glob("*.py")
+    files += FOLDERS["player"].glob("*.py")
     files += [ROOT / "render" / n for n in ("__init__.py", "image.py", "movie.py", "png.py")]
     for path in files:
         heavy = {n.split(".")[0] for n in imports(path, top_level=True)} & STUDIO

@@ -1,0 +1,38 @@
+"""Charts from results: every .json in a folder that has a chart becomes NAME.svg and NAME.png. matplotlib draws."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from gscodec.errors import UsageError, require
+from gscodec.metrics.speed_chart import speed_chart
+
+CHARTS = {"raster": speed_chart}  # result file without .json -> function(result) that returns a matplotlib Figure
+
+
+def draw_charts(results: Path, charts: Path) -> list[Path]:
+    """Draws the charts of the results in a folder; returns the files written.
+
+    Raises:
+        UsageError: there is nothing to draw, or matplotlib is not installed.
+    """
+    require("matplotlib", "drawing charts", "charts")
+    from matplotlib import rc_context
+
+    found = [p for p in sorted(Path(results).glob("*.json")) if p.stem in CHARTS]
+    if not found:
+        names = ", ".join(f"{n}.json" for n in CHARTS)
+        raise UsageError(f"{results}: no results that have a chart, expected one of {names}")
+    Path(charts).mkdir(parents=True, exist_ok=True)
+    written = []
+    for path in found:
+        # a fixed salt and no date: the same results give the same bytes
+        with rc_context(
+            {"svg.hashsalt": path.stem, "font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
+        ):
+            figure = CHARTS[path.stem](json.loads(path.read_text()))
+            for suffix, options in ((".svg", {"metadata": {"Date": None}}), (".png", {"dpi": 110})):
+                written.append(Path(charts) / (path.stem + suffix))
+                figure.savefig(written[-1], bbox_inches="tight", **options)
+    return written

@@ -1,0 +1,55 @@
+"""Benchmarks write what the charts read; scripts rely on the keys."""
+
+import json
+
+import pytest
+
+pytest.importorskip("torch")
+
+from gscodec.bench.machine import write_result
+from gscodec.bench.raster import measure, run
+from gscodec.bench.scenes import capsule, capsule_camera
+from gscodec.errors import UsageError
+from gscodec.metrics.charts import draw_charts
+
+KEYS = {
+    "scene",
+    "gaussians",
+    "width",
+    "height",
+    "simd",
+    "threads",
+    "project_ms",
+    "forward_ms",
+    "backward_ms",
+    "step_ms",
+}
+
+
+def entries():
+    made = [measure("capsule", capsule(200), capsule_camera(32, 24), "scalar", t, 1) for t in (1, 2)]
+    return [
+        {**e, "gaussians": n, "width": w, "height": w}
+        for e in made
+        for n, w in ((50_000, 512), (100_000, 512), (100_000, 1024))
+    ]
+
+
+def test_charts_are_drawn_from_the_results_alone(tmp_path):
+    pytest.importorskip("matplotlib")
+    made = entries()
+    assert set(made[0]) >= KEYS
+    assert 0.05 < made[0]["covered"] < 0.5
+    write_result(tmp_path / "raster.json", {"settings": {"simd": ["scalar"]}, "entries": made})
+    assert {"machine", "commit", "settings"} <= set(json.loads((tmp_path / "raster.json").read_text()))
+    first = [p.read_bytes() for p in draw_charts(tmp_path, tmp_path / "charts")]
+    assert [p.read_bytes() for p in draw_charts(tmp_path, tmp_path / "charts")] == first
+    assert len(first) == 2
+    with pytest.raises(UsageError, match="no results that have a chart"):
+        draw_charts(tmp_path / "charts", tmp_path)
+
+
+def test_a_missing_file_is_said(tmp_path):
+    said = []
+    assert list(run(("statue",), data=tmp_path, say=said.append)) == []
+    assert said == ["statue: left out, splats/statue.ply is not in the data folder"]
