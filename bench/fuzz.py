@@ -14,7 +14,7 @@ import re
 import subprocess
 import sys
 
-from run import RESULTS, ROOT, commit, machine
+from gscodec.bench.machine import RESULTS, ROOT, write_result
 
 FUZZ = ROOT / "codec" / "native" / "fuzz"
 TARGETS = ("demux", "group", "units")
@@ -47,9 +47,9 @@ def main() -> None:
         result = {"source": source, "executions": dict.fromkeys(TARGETS, 0)}
     for target in TARGETS:
         result["executions"][target] += fuzz(target, seconds)
-    result |= {"machine": machine(), "commit": commit(), "all": sum(result["executions"].values()), "findings": 0}
-    path.write_text(json.dumps(result, indent=1) + "\n")
-    print(json.dumps(result, indent=1))
+    counts = {"source": source, "executions": result["executions"], "all": sum(result["executions"].values())}
+    write_result(path, counts | {"findings": 0})
+    print(path.read_text())
 
 
 if __name__ == "__main__":

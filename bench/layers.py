@@ -7,16 +7,15 @@ For each prefix also the best of a few corrections of scale and opacity (spec, "
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
-from run import RESULTS, commit, machine
 
 from gscodec import _native
+from gscodec.bench.machine import RESULTS, write_result
 from gscodec.encode.group import code_group
 from gscodec.gaussians import Gaussians, Group
 from gscodec.metrics.codec_cameras import codec_cameras
@@ -53,8 +52,7 @@ def main() -> None:
                 row["with_best_correction"] = {"codec_psnr": max(tried), **tried[max(tried)]}
             rows.append(row)
             print(row, flush=True)
-    result = {"machine": machine(), "commit": commit(), "scene": "statue, 101,275 Gaussians, quality 50", "rows": rows}
-    (RESULTS / "layers.json").write_text(json.dumps(result, indent=1) + "\n")
+    write_result(RESULTS / "layers.json", {"scene": "statue, 101,275 Gaussians, quality 50", "rows": rows})
 
 
 if __name__ == "__main__":
