@@ -1,6 +1,5 @@
 """Clauses 3 to 5 of gsv.md for the reference decoder: units, group header, levels."""
 
-import struct
 import zlib
 from dataclasses import dataclass
 
@@ -9,7 +8,7 @@ from reference_container import LEVELS, PAIRS, LimitError, Reader, require
 # ---- 3. Group payload -----------------------------------------------------------------------------------------------
 
 GROUP_HEADER, POSITIONS, CHANNELS, LIFETIMES, NODE_POSITIONS, NODE_TRAJECTORIES, TRAJECTORIES = range(7)
-STEP_CLASSES, DEATHS, LAYER_CORRECTION, UNIT_SIZES = range(7, 11)
+STEP_CLASSES, DEATHS, LAYER_CORRECTION = range(7, 10)
 MUST_DEPEND_ON = {
     CHANNELS: (POSITIONS,),
     LIFETIMES: (POSITIONS, DEATHS),
@@ -55,18 +54,16 @@ def read_units(payload, layers=256):
         body = reader.take(length)
         require(zlib.crc32(covered + body) == crc, f"unit {index} at byte {start}: wrong CRC, the unit is damaged")
         size = reader.position - start
-        wrong = f"unit {index}: {size} bytes, but unit_sizes says {sizes[index] if index < len(sizes) else 0}"
+        wrong = f"unit {index}: {size} bytes, but the header says {sizes[index] if index < len(sizes) else 0}"
         require(index >= len(sizes) or sizes[index] == size, wrong)
         increasing = dependencies == sorted({d for d in dependencies if d < index})
         require(increasing, f"unit {index}: dependencies {dependencies} are not increasing indices below {index}")
         require(not units or units[-1].layer <= layer, f"unit {index}: layer {layer} after a higher one")
         unit = Unit(unit_type, layer, attribute, dependencies, body)
-        known = unit_type < UNIT_SIZES or (unit_type == UNIT_SIZES and index == 1)
-        second = known and any(unit.key() == u.key() for u in units)
+        second = unit_type <= LAYER_CORRECTION and any(unit.key() == u.key() for u in units)
         require(not second, f"unit {index}: second unit of (type, layer, attribute) {unit.key()}")
-        if known and unit_type == UNIT_SIZES:
-            require(length % 4 == 0, f"unit_sizes: {length} bytes, expected a multiple of 4")
-            sizes = [0, 0, *struct.unpack(f">{length // 4}I", body)]
+        if index == 0 and unit_type == GROUP_HEADER:
+            sizes = [size, *read_opening(Reader(body, 0, len(body), "group_header"))[3]]
         units.append(unit)
     require(units and units[0].key() == (GROUP_HEADER, 0, 0), "unit 0 is not the group header")
     return units
@@ -74,7 +71,7 @@ def read_units(payload, layers=256):
 
 def check_units(units, header, layers):
     """Clause 3.1: all that the header announces is there, and nothing else -> {(type, layer, attribute): payload}."""
-    required, optional = {(GROUP_HEADER, 0, 0)}, {(UNIT_SIZES, 0, 0)}
+    required, optional = {(GROUP_HEADER, 0, 0)}, set()
     required |= {(NODE_POSITIONS, 0, 0), (NODE_TRAJECTORIES, 0, 0)} if header.node_count else set()
     for k, layer in enumerate(header.layers[:layers]):
         if not header.reference or layer.births:
@@ -85,7 +82,7 @@ def check_units(units, header, layers):
     found = {}
     for index, unit in enumerate(units):
         require(unit.unit_type != STEP_CLASSES, f"unit {index}: unsupported tool step_classes")
-        if unit.unit_type > UNIT_SIZES or (unit.unit_type == UNIT_SIZES and index != 1):
+        if unit.unit_type > LAYER_CORRECTION:
             continue  # unknown: skipped
         announced = unit.key() in required | optional
         require(announced, f"unit {index}: (type, layer, attribute) {unit.key()} is not announced by the header")
@@ -127,13 +124,20 @@ class Header:
     translation_step: float = 0.0
 
 
+def read_opening(r):
+    """Clause 4: frames, flags, reference (0: independent) and the sizes of the units behind the header, if it tells."""
+    frames, flags = r.u16(), r.u8()
+    require(frames >= 1, "group_header: frames is 0")
+    require(flags < 8, f"group_header: flags are {flags:#x}, bits 3 to 7 must be 0")
+    require(not flags & 2, "group_header: unsupported tool step_classes")
+    reference = r.u16() if flags & 1 else 0
+    require(reference or not flags & 1, "group_header: reference is 0, expected >= 1")
+    return frames, flags, reference, [r.u32() for _ in range(r.u8() if flags & 4 else 0)]
+
+
 def read_reference(payload):
     """Clause 4: how many groups back a group refers, 0: it is independent."""
-    r = Reader(payload, 0, len(payload), "group_header")
-    r.u16()
-    reference = r.u16() if r.u8() & 1 else None
-    require(reference != 0, "group_header: reference is 0, expected >= 1")
-    return reference or 0
+    return read_opening(Reader(payload, 0, len(payload), "group_header"))[2]
 
 
 def read_grid(r):
@@ -192,14 +196,8 @@ def expected_map_width_log2(count):
 def read_group_header(payload, reference=None):
     """Clause 4. `reference`: the Header of the group that a predicted one refers to."""
     r = Reader(payload, 0, len(payload), "group_header")
-    frames, flags = r.u16(), r.u8()
-    require(frames >= 1, "group_header: frames is 0")
-    require(flags < 4, f"group_header: flags are {flags:#x}, bits 2 to 7 must be 0")
-    require(not flags & 2, "group_header: unsupported tool step_classes")
-    back = 0
-    if flags & 1:
-        back = r.u16()
-        require(back >= 1, "group_header: reference is 0, expected >= 1")
+    frames, _, back, _ = read_opening(r)
+    if back:
         require(reference is not None and not reference.reference, "group_header: no independent group to refer to")
         layers, channels = read_layers(r, reference), reference.channels
         grid = reference.origin, reference.grid_step, reference.grid_bits, reference.sh_degree

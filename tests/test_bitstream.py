@@ -11,7 +11,7 @@ import pytest
 from gscodec import _native
 from gscodec.bitstream import attributes
 from gscodec.bitstream.levels import LEVELS, smallest_level
-from gscodec.decode import open_stream
+from gscodec.decode import Stream, open_stream
 from gscodec.errors import BitstreamError, LimitError
 
 CAMERA = {"name": "cam00", "K": [[500, 0, 320], [0, 510, 240], [0, 0, 1]], "viewmat": np.eye(4)}
@@ -319,6 +319,37 @@ def test_streams_tell_of_damage(tmp_path):
     assert (damage["group"], damage["unit"], damage["type"], damage["attribute"]) == (1, unit, "trajectories", "means")
     with pytest.raises(IndexError):
         stream.frame(4 * frames)
+
+
+def test_damage_anywhere_behind_the_index_costs_one_group_and_its_followers():
+    """Every byte of boxes, some of the payloads: all other groups are as before, and the damage is told."""
+    group = moving_group(30)
+    known = _native.DecodedGroup(_native.encode_group(group)[0], 1)
+    later = {**known.integers(), "reference": 2, "parents": np.arange(30, dtype=np.int32)}
+    alone = _native.encode_group(group)[0]
+    payloads = [alone, alone, _native.encode_group(later, known)[0], alone]
+    config = {**CONFIG, "sh_degree": 3}
+    fragments = [_native.fragment(p, i + 1, 8 * i, 8, i != 2, config) for i, p in enumerate(payloads)]
+    index = [(len(f), 8, i != 2, []) for i, f in enumerate(fragments)]
+    head = _native.finish(_native.init_segment(config), index)
+    data = head + b"".join(fragments)
+    ends = len(head) + np.cumsum([len(f) for f in fragments])
+    want = known.frame(3)["means"]
+    for at in range(len(head), len(data)):
+        hit = int(np.searchsorted(ends, at, side="right"))
+        if ends[hit] - len(payloads[hit]) <= at and at % 13:
+            continue
+        bad = bytearray(data)
+        bad[at] ^= 0x55
+        stream = Stream(bad, strict=False)
+        assert [g["frames"] for i, g in enumerate(stream.groups) if i != hit] == [8] * 3, at
+        for i in {0, 1, 2, 3} - {hit} - ({2} if hit == 0 else set()):
+            np.testing.assert_array_equal(stream.group(i).frame(3)["means"], want, err_msg=f"byte {at}, group {i}")
+        try:
+            same = np.array_equal(stream.group(hit).frame(3)["means"], want)
+        except BitstreamError:
+            continue
+        assert same or stream.damage, at
 
 
 def test_levels_are_caps():

@@ -73,6 +73,23 @@ def test_info_writes_two_dimensional_maps(folder, tmp_path):
     assert height > 8
 
 
+def test_eval_gives_the_quality_of_every_prefix(tmp_path):
+    frames, same = turning(300, frames=6).groups[0].frames, np.arange(300, dtype=np.int32)
+    groups = [Group(frames[t : t + 2], parents=same if t else None) for t in (0, 2, 4)]
+    write_sequence(GaussianSequence(25, groups), tmp_path / "plys")
+    done = run("encode", tmp_path / "plys", tmp_path / "l.gsv", "--layers", "3", "--random-access", "4")
+    assert done.returncode == 0, done.stderr
+    info = run("info", tmp_path / "l.gsv", "--json")
+    facts = json.loads(info.stdout)
+    assert [g["reference"] for g in facts["per_group"]] == [None, 0, None]
+    assert len(facts["layers"]) == 3
+    result = json.loads(run("eval", tmp_path / "l.gsv", tmp_path / "plys", "--frames", "2:3", "--json").stdout)
+    prefixes = [*result["prefixes"], result]
+    for key in ("codec_psnr", "bytes", "gaussians"):
+        assert sorted(p[key] for p in prefixes) == [p[key] for p in prefixes], key
+    assert result["codec_psnr"] > 3 + prefixes[0]["codec_psnr"]
+
+
 def test_decode_and_encode_again(folder, tmp_path):
     assert run("decode", folder / "a.gsv", tmp_path / "plys").returncode == 0
     assert len(list((tmp_path / "plys").glob("*.ply"))) == 5

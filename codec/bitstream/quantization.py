@@ -12,7 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 QUALITY_DEFAULT = 50.0
-QUALITY_HALVES = 12.0  # so many points of quality halve every step (about 5 dB)
+QUALITY_HALVES = 12.0  # so many points of quality halve every step (6 dB)
+PSNR_DEFAULT = 41.0  # against the input, at QUALITY_DEFAULT
+MODEL = 2.4  # measured error over what independent small errors would add up to
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,11 @@ def steps_for(quality: float, radius: float) -> Steps:
         shN=0.125 * f,
         node_translation=means,
     )
+
+
+def error_for(quality: float) -> float:
+    """Mean squared error of the picture (pixels 0 to 1) that `quality` stands for, as sensitivities predict it."""
+    return 10 ** (-PSNR_DEFAULT / 10) / MODEL * 4.0 ** ((QUALITY_DEFAULT - quality) / QUALITY_HALVES)
 
 
 def trajectory_step(step: float, frames: int) -> float:

@@ -36,10 +36,11 @@ class Stream:
 
     def __init__(self, data, name: str = "stream", *, strict: bool = True, layers: int | None = None):
         self.name, self._data, self.strict, self.layers = name, data, strict, layers
-        index = _native.demux(data)
+        index = _native.demux(data, strict)
         self.config, self.groups, self.complete = index["config"], index["groups"], index["complete"]
         self._held: OrderedDict[int, object] = OrderedDict()
-        self._damage: dict[int, list[dict]] = {}
+        blank = {"unit": None, "type": "fragment", "layer": 0, "attribute": None}
+        self._damage: dict[int, list[dict]] = {i: [blank | {"message": m}] for i, m in index["damage"]}
         self._ends: list[int] = list(accumulate(g["frames"] for g in self.groups))  # frames up to and with each group
 
     @property
@@ -59,7 +60,8 @@ class Stream:
 
         Damaged trajectories stand still, and a damaged attribute has its offsets everywhere. `unit` is None where a
         unit is missing because one before it is damaged. Groups that refer to a damaged one show its damage, which is
-        listed once, for that one. A group without sound header and positions stays an error.
+        listed once, for that one. A group without sound header and positions stays an error, and so does one whose
+        boxes are damaged (type: fragment), which does not cost the groups behind it if the file has an index.
         """
         return [{"group": i, **d} for i, found in sorted(self._damage.items()) for d in found]
 
@@ -91,6 +93,8 @@ class Stream:
         if i not in self._held:
             where = f"{self.name}: group {i} (frames {self._span(i)})"
             try:
+                if i in self._damage and self._damage[i][0]["type"] == "fragment":
+                    raise BitstreamError(self._damage[i][0]["message"])
                 payload = self.payload(i)
                 reference = self._reference(i, _native.reference_of(payload))
                 options = {"reference": reference} | ({} if self.layers is None else {"layers": self.layers})

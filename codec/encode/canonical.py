@@ -33,6 +33,12 @@ def quat_conjugate(q: np.ndarray) -> np.ndarray:
     return q * np.array([1, -1, -1, -1], q.dtype)
 
 
+def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Vectors [..., 3] turned by unit quaternions [..., 4]."""
+    u, w = q[..., 1:], q[..., :1]
+    return v + 2 * np.cross(u, np.cross(u, v) + w * v)
+
+
 def _permutation_quat(order: tuple[int, ...]) -> np.ndarray:
     """Quaternion of the rotation whose column j is +-axis order[j]."""
     R = np.zeros((3, 3))

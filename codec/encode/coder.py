@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gscodec import _native
+from gscodec.camera import Camera
 from gscodec.encode.group import Coded, code_group
 from gscodec.encode.predicted import predict_group
 from gscodec.errors import CaptureError
@@ -42,12 +43,13 @@ class GroupCoder:
     """Codes groups in their order.
 
     Args:
-        quality, keep_all, layers: as in `code_group`.
+        quality, keep_all, layers, cameras: as in `code_group`.
         random_access: frames from one independent group to the next at most; 0 or 1: every group is independent.
     """
 
-    def __init__(self, *, quality: float, keep_all: bool, layers: int, random_access: int):
-        self._options = {"quality": quality, "keep_all": keep_all, "layers": layers}
+    def __init__(self, *, quality: float, keep_all: bool, layers: int, random_access: int, cameras: list[Camera] = ()):
+        self._options = {"quality": quality, "keep_all": keep_all, "cameras": cameras}
+        self._layers = layers
         self._random_access, self._reference = random_access, None
 
     def code(self, group: Group) -> CodedGroup:
@@ -55,7 +57,7 @@ class GroupCoder:
         parents, r = self._parents(group), self._reference
         if parents is None or r.frames + len(group) > self._random_access:
             return self._independent(group)
-        integers = predict_group(group, parents, r.back, r.coded, keep_all=self._options["keep_all"])
+        integers = predict_group(group, parents, r.back, r.coded, **self._options)
         payload, units = _native.encode_group(integers, r.decoded)
         if len(payload) > DOUBT * r.bytes:
             other = self._independent(group)
@@ -66,7 +68,7 @@ class GroupCoder:
         return CodedGroup(payload, units, len(integers["positions"]), False)
 
     def _independent(self, group: Group) -> CodedGroup:
-        coded = code_group(group, **self._options)
+        coded = code_group(group, layers=self._layers, **self._options)
         payload, units = _native.encode_group(coded.integers)
         if self._random_access > len(group):
             decoded = _native.DecodedGroup(payload, len(_native.levels()))

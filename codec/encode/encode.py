@@ -129,6 +129,10 @@ def encode_groups(
         keep_all=settings.keep_all,
         layers=settings.layers,
         random_access=settings.random_access,
+        cameras=[
+            Camera(c["name"], np.array(c["K"]), np.array(c["viewmat"]), c["width"], c["height"])
+            for c in config["cameras"]
+        ],
     )
     report = EncodeReport(seconds={"input": 0.0, "code": 0.0})
     clock = time.perf_counter

@@ -12,17 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from gscodec import _native
-from gscodec.bitstream.color import STEP_WEIGHTS, decorrelate
-from gscodec.bitstream.quantization import Steps, steps_for, subject_radius, trajectory_step
-from gscodec.bitstream.transform import dct_basis
-from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply
-from gscodec.encode.motion import NEIGHBORS, NodeMotion, choose_nodes, quantize_trajectory, trim
-from gscodec.gaussians import Group
+from gscodec.bitstream.color import decorrelate
+from gscodec.bitstream.quantization import Steps, error_for, steps_for, subject_radius, trajectory_step
+from gscodec.camera import Camera
+from gscodec.encode import rdo
+from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
+from gscodec.encode.importance import Importance, measure, steps_for_error
+from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes
+from gscodec.gaussians import Gaussians, Group
 
 GRID_BITS_MAX = 21
-ALPHA_MIN = 1 / 255  # what the renderer does not draw (spec: "The picture")
-PRUNE_SHARE = 5e-4  # share of opacity x area that may go; 8 % of the statue's Gaussians hold less
-DEAD_ZONE = 0.6  # in steps; jitter of a trainer stays below it
+PRUNE = 0.3  # a Gaussian goes if the picture without it errs by less than this share of the error per coded Gaussian
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,11 @@ class Stack:
         arrays = (self.means, self.quats, self.log_scales, self.logit_opacities, self.sh0, self.shN)
         return Stack(*(a[:, index] for a in arrays), None if self.lifetimes is None else self.lifetimes[index])
 
+    def frame(self, t: int) -> Gaussians:
+        """All Gaussians as they are at frame `t`."""
+        arrays = (self.means, self.quats, self.log_scales, self.logit_opacities, self.sh0, self.shN)
+        return Gaussians(*(a[t] for a in arrays))
+
 
 def stack_group(group: Group) -> Stack:
     """Loads all frames of `group` (f32)."""
@@ -55,28 +60,6 @@ def stack_group(group: Group) -> Stack:
     return Stack(*arrays, life)
 
 
-def importance(s: Stack) -> np.ndarray:
-    """[N] f64, opacity times the area of the two longest axes, in the frame where it is largest."""
-    opacity = 1 / (1 + np.exp(-s.logit_opacities))
-    largest_two = s.log_scales.sum(2) - s.log_scales.min(2)
-    return (opacity * np.exp(largest_two)).max(0).astype(np.float64)
-
-
-def ever_drawn(s: Stack) -> np.ndarray:
-    """[N] bool: in some frame opaque enough for the renderer."""
-    return 1 / (1 + np.exp(-s.logit_opacities.max(0))) >= ALPHA_MIN
-
-
-def visible_enough(s: Stack, share: float = PRUNE_SHARE) -> np.ndarray:
-    """[N] bool: false for Gaussians that are never drawn, and for the least important that together hold `share`."""
-    weight = importance(s)
-    order = weight.argsort()
-    spent = np.cumsum(weight[order])
-    keep = np.empty(len(order), bool)
-    keep[order] = spent > share * spent[-1] if len(order) else True
-    return keep & ever_drawn(s)
-
-
 def align_axes(s: Stack, middle: int, turn: np.ndarray, order: np.ndarray) -> Stack:
     """Every Gaussian in the form that `canonical_axes` chose, in all frames, quaternions continuous in time."""
     quats = quat_multiply(s.quats, turn[None].astype(np.float32))
@@ -88,20 +71,15 @@ def align_axes(s: Stack, middle: int, turn: np.ndarray, order: np.ndarray) -> St
     return Stack(s.means, quats, scales, s.logit_opacities, s.sh0, s.shN, s.lifetimes)
 
 
-def channel_steps(name: str, steps: Steps, channels: int) -> np.ndarray:
-    """[C] f32 step of each channel of an attribute."""
-    step = np.full(channels, getattr(steps, name))
-    if name in ("sh0", "shN"):
-        step *= np.tile(STEP_WEIGHTS, channels // 3)
-    return step.astype(np.float32)
-
-
-def quantize_channels(values: np.ndarray, steps: np.ndarray) -> dict:
+def quantize_channels(
+    values: np.ndarray, steps: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float
+) -> dict:
     """[N, C] floats -> channels of `encode_group`; offsets are the medians, so that small integers are common."""
     offsets = np.median(values, axis=0) if len(values) else np.zeros(values.shape[1])
     offsets = offsets.astype(np.float32)
-    q = np.rint((values - offsets) / steps).astype(np.int32)
-    return {"values": np.ascontiguousarray(q.T), "steps": steps.tolist(), "offsets": offsets.tolist()}
+    x = (values - offsets) / steps
+    q = [rdo.keyframe(x[:, c], weights[:, c] * steps[c] ** 2, near, price) for c in range(len(steps))]
+    return {"values": np.array(q).astype(np.int32), "steps": steps.tolist(), "offsets": offsets.tolist()}
 
 
 def dequantize_channels(channels: dict) -> np.ndarray:
@@ -144,32 +122,20 @@ def _appearance(s: Stack) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _rotation_residual(quats: np.ndarray, canonical: np.ndarray, motion: NodeMotion | None) -> np.ndarray:
-    """[T, N, 3] f32, vector part of what is left after nodes and canonical: dq = q(t) (q_blend(t) q_canonical)^-1."""
-    dq = quat_multiply(quats, quat_conjugate(canonical[None].astype(np.float32)))
+def _residual(s: Stack, channels: dict, x: np.ndarray, motion: NodeMotion | None) -> dict[str, np.ndarray]:
+    """[T, N, C] f32 of each attribute: what canonical values and nodes leave over."""
+    v = dequantize_channels(channels["quats"])
+    canonical = np.concatenate([np.sqrt(np.maximum(0, 1 - (v**2).sum(1, keepdims=True))), v], 1)
+    dq = quat_multiply(s.quats, quat_conjugate(canonical[None].astype(np.float32)))
     if motion is not None:
         dq = quat_multiply(dq, quat_conjugate(motion.turned))
-    return np.copysign(1, dq[..., :1]) * dq[..., 1:]
-
-
-def _trajectories(s: Stack, channels: dict, steps: Steps, x: np.ndarray, motion: NodeMotion | None) -> dict:
-    basis = dct_basis(len(s.means))
-    canonical_v = dequantize_channels(channels["quats"])
-    w = np.sqrt(np.maximum(0, 1 - (canonical_v**2).sum(1, keepdims=True)))
-    canonical = np.concatenate([w, canonical_v], 1)
     residual = {
         "means": s.means - (x[None].astype(np.float32) if motion is None else motion.carried),
-        "quats": _rotation_residual(s.quats, canonical, motion),
+        "quats": np.copysign(1, dq[..., :1]) * dq[..., 1:],
     }
     for name, values in _appearance(s).items():
         residual[name] = values - dequantize_channels(channels[name])[None].astype(np.float32)
-    out = {}
-    for name, values in residual.items():
-        size = trajectory_step(channel_steps(name, steps, values.shape[2])[0], len(basis))
-        c = trim(quantize_trajectory(values, basis, size, DEAD_ZONE)).transpose(0, 2, 1)  # [K, C, N]
-        if c.any():
-            out[name] = {"coefficients": np.ascontiguousarray(c), "step": size}
-    return out
+    return residual
 
 
 @dataclass(frozen=True)
@@ -180,6 +146,7 @@ class Coded:
         integers: the input of `_native.encode_group`.
         source: [N] int, index in the group of each Gaussian that is coded, in the order of the integers.
         turn, order: [N, 4], [N, 3], the form of each (`canonical_axes`).
+        steps: attribute -> [C] f32; node_step: of the nodes' translations, world units.
     """
 
     integers: dict
@@ -187,11 +154,12 @@ class Coded:
     turn: np.ndarray
     order: np.ndarray
     grid: Grid
-    steps: Steps
+    steps: dict[str, np.ndarray]
+    node_step: float
 
 
 def code_group(
-    group: Group, quality: float, *, keep_all: bool = False, steps: Steps | None = None, layers: int = 1
+    group: Group, quality: float, *, keep_all: bool = False, layers: int = 1, cameras: list[Camera] = ()
 ) -> Coded:
     """An independent group in integers.
 
@@ -199,30 +167,32 @@ def code_group(
         group: T >= 1 frames of N Gaussians.
         quality: 0 to 100.
         keep_all: code every Gaussian, also the invisible ones.
-        steps: instead of those that follow from `quality`.
         layers: number of layers of falling importance, each as large as all before it together.
+        cameras: from which the subject was captured, if it was.
     """
     s = stack_group(group)
-    kept = np.arange(len(s.means[0]))
-    if not keep_all and len(kept):
-        kept = np.flatnonzero(visible_enough(s))
-        s = s.take(kept)
-    middle = len(s.means) // 2
-    steps = steps or steps_for(quality, subject_radius(s.means[middle]))
-    grid = Grid(s.means[middle], steps.means)
-    positions = grid.to_integers(s.means[middle])
-    order = _native.morton_order(positions)
-    layer = layer_of(importance(s)[order], layers)
-    order = order[layer.argsort(kind="stable")]
-    positions, s = positions[order], s.take(order)
+    frames, middle = len(s.means), len(s.means) // 2
     turn, axes = canonical_axes(s.quats[middle], s.log_scales[middle])
     s = align_axes(s, middle, turn, axes)
-    values = canonical_appearance(s)
-    values["quats"] = s.quats[middle, :, 1:]
-    channels = {n: quantize_channels(v, channel_steps(n, steps, v.shape[1])) for n, v in values.items()}
+    measured, error = measure_stack(s, cameras), error_for(quality)
+    source = np.arange(len(turn)) if keep_all else np.flatnonzero(measured.removal >= PRUNE * error / max(len(turn), 1))
+    nominal = steps_for(quality, subject_radius(s.means[middle]))
+    steps = _steps(s.take(source), measured.take(source), error, nominal)
+    grid = Grid(s.means[middle, source], float(steps["means"][0]))
+    source = source[_native.morton_order(grid.to_integers(s.means[middle, source]))]
+    nodes, x, quats = _rest_pose(s.take(source), middle, grid, nominal.node_translation)
+    positions = grid.to_integers(x)
+    order = _native.morton_order(positions)
+    layer = layer_of(prominence(s.take(source[order])), layers)
+    order = order[layer.argsort(kind="stable")]
+    positions, quats, source = positions[order], quats[order], source[order]
+    s, measured = s.take(source), measured.take(source)
+    near, price = rdo.neighbours(positions), rdo.bit_price(error, max(len(source), 1))
+    values = canonical_appearance(s) | {"quats": quats[:, 1:]}
+    channels = {n: quantize_channels(v, steps[n], measured.weights[n], near, price) for n, v in values.items()}
     channels["quats"] = inside_unit_ball(channels["quats"])
     out = {
-        "frames": len(s.means),
+        "frames": frames,
         "origin": grid.origin.tolist(),
         "grid_step": grid.step,
         "grid_bits": grid.bits,
@@ -233,15 +203,22 @@ def code_group(
     }
     if s.lifetimes is not None:
         out["lifetimes"] = s.lifetimes.astype(np.uint16)
-    if len(s.means) > 1 and len(positions):
+    if frames > 1 and len(positions):
         x = grid.to_world(positions)
-        out |= motion_integers(s, channels, steps, x, choose_nodes(positions, x, s.means, steps, grid.to_world))
-    return Coded(out, kept[order], turn, axes, grid, steps)
+        motion = nodes and carry(nodes, positions, x, frames)
+        out |= motion_integers(s, channels, steps, measured, price, x, nodes, motion)
+    return Coded(out, source, turn[source], axes[source], grid, steps, nominal.node_translation)
 
 
 def group_integers(group: Group, quality: float, **options) -> dict:
     """The integers of `code_group`."""
     return code_group(group, quality, **options).integers
+
+
+def prominence(s: Stack) -> np.ndarray:
+    """[N] f32, opacity times the area of the two longest axes, in the frame where it is largest."""
+    largest_two = s.log_scales.sum(2) - s.log_scales.min(2)
+    return (np.exp(largest_two) / (1 + np.exp(-s.logit_opacities))).max(0)
 
 
 def layer_of(weight: np.ndarray, layers: int) -> np.ndarray:
@@ -256,16 +233,59 @@ def canonical_appearance(s: Stack) -> dict[str, np.ndarray]:
     return {n: v.mean(0, dtype=np.float64) for n, v in _appearance(s).items()}
 
 
-def motion_integers(s: Stack, channels: dict, steps: Steps, x: np.ndarray, motion: NodeMotion | None) -> dict:
-    """ "nodes" and "trajectories" of a group with canonical positions x [N, 3] and channels."""
-    out = {"trajectories": _trajectories(s, channels, steps, x, motion)}
-    if motion is not None:
+def measure_stack(s: Stack, cameras: list[Camera] = ()) -> Importance:
+    """What each Gaussian of a group matters, from its first, middle and last frame."""
+    frames, count = s.means.shape[:2]
+    if not count:
+        sizes = {"means": 3, "quats": 3} | {n: v.shape[2] for n, v in _appearance(s).items()}
+        return Importance({n: np.zeros((0, c)) for n, c in sizes.items()}, np.zeros(0))
+    return measure([s.frame(t) for t in sorted({0, frames // 2, frames - 1})], cameras)
+
+
+def _steps(s: Stack, measured: Importance, error: float, nominal: Steps) -> dict[str, np.ndarray]:
+    """[C] f32 step of each channel of each attribute."""
+    if not len(measured.removal):
+        return {n: np.full(w.shape[1], getattr(nominal, n), np.float32) for n, w in measured.weights.items()}
+    middle = len(s.means) // 2
+    values = {n: v[middle] for n, v in _appearance(s).items()}
+    values |= {"means": s.means[middle], "quats": s.quats[middle, :, 1:]}
+    return steps_for_error(measured.weights, values, error, subject_radius(s.means[middle]))
+
+
+def _rest_pose(s: Stack, middle: int, grid: Grid, node_step: float) -> tuple[Nodes | None, np.ndarray, np.ndarray]:
+    """Nodes, and the means [N, 3] and quaternions [N, 4] that they carry nearest to all frames: what jitters in the
+    middle frame, which is in Morton order, is not the canonical of all."""
+    positions = grid.to_integers(s.means[middle])
+    x, frames = grid.to_world(positions), len(s.means)
+    if frames == 1 or not len(x):
+        return None, s.means[middle], s.quats[middle]
+    nodes = choose_nodes(positions, x, s.means, grid.step, node_step, grid.to_world)
+    if nodes is None:
+        means, quats = s.means.mean(0, dtype=np.float64), s.quats.mean(0)
+    else:
+        motion = carry(nodes, positions, x, frames)
+        back = quat_conjugate(motion.turned)
+        means = x + rotate(back, s.means - motion.carried).mean(0)
+        quats = quat_multiply(back, s.quats).mean(0)
+    return nodes, means, quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
+
+
+def motion_integers(s: Stack, channels, steps, measured: Importance, price: float, x, nodes, motion) -> dict:
+    """ "nodes" and "trajectories" of a group with canonical positions x [N, 3] and channels, which `nodes` carry as
+    `motion` says (both None: not at all)."""
+    out = {"trajectories": {}}
+    for name, values in _residual(s, channels, x, motion).items():
+        step = trajectory_step(1 / np.sqrt((1 / steps[name].astype(np.float64) ** 2).mean()), len(s.means))
+        coefficients = rdo.trajectory(values, measured.weights[name], step, price)
+        if coefficients.any():
+            out["trajectories"][name] = {"coefficients": coefficients, "step": step}
+    if nodes is not None:
         out["nodes"] = {
-            "positions": motion.nodes.positions,
-            "coefficients": motion.nodes.coefficients,
-            "rotation_step": motion.nodes.rotation_step,
-            "translation_step": motion.nodes.translation_step,
-            "neighbors": min(NEIGHBORS, len(motion.nodes.positions)),
+            "positions": nodes.positions,
+            "coefficients": nodes.coefficients,
+            "rotation_step": nodes.rotation_step,
+            "translation_step": nodes.translation_step,
+            "neighbors": min(NEIGHBORS, len(nodes.positions)),
         }
     return out
 

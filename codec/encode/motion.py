@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gscodec import _native
-from gscodec.bitstream.quantization import Steps, trajectory_step
+from gscodec.bitstream.quantization import trajectory_step
 from gscodec.bitstream.transform import dct_basis
 
 NEIGHBORS = 4  # nodes that a Gaussian blends
@@ -50,10 +50,9 @@ class Nodes:
 
 @dataclass(frozen=True)
 class NodeMotion:
-    """Nodes and what they do to the Gaussians: `carried` [T, N, 3] f32, means after blending; `turned` [T, N, 4] f32,
+    """What nodes do to the Gaussians: `carried` [T, N, 3] f32, means after blending; `turned` [T, N, 4] f32,
     blended rotation of each Gaussian, wxyz."""
 
-    nodes: Nodes
     carried: np.ndarray
     turned: np.ndarray
 
@@ -146,13 +145,13 @@ def _fit_frame(blend: Blend, transposed, mass, x, nodes, y, near) -> tuple[np.nd
     return matrix_to_rotvec(R, near), cy - np.einsum("mij,mj->mi", R, cx - nodes) - nodes
 
 
-def fit_nodes(grid_positions: np.ndarray, x: np.ndarray, means: np.ndarray, seeds: np.ndarray, steps: Steps, to_world):
+def fit_nodes(grid_positions: np.ndarray, x: np.ndarray, means: np.ndarray, seeds: np.ndarray, step: float, to_world):
     """Fits a node at each of the grid points `seeds` [M, 3] and quantizes them.
 
     Args:
         grid_positions: [N, 3] u32, canonical integers; x: [N, 3] f64, their world positions.
         means: [T, N, 3] targets.
-        to_world: grid integers -> world positions.
+        step: of the translations, world units; to_world: grid integers -> world positions.
 
     Returns:
         Nodes and [T, N, 3], where they carry x.
@@ -169,7 +168,7 @@ def fit_nodes(grid_positions: np.ndarray, x: np.ndarray, means: np.ndarray, seed
     frames, m = len(means), len(nodes)
     # An error of one rotation step at the usual distance from a node moves a Gaussian by one translation step.
     lever = np.sqrt(((x - nodes[blend.index[:, 0]]) ** 2).sum(1).mean())
-    rotation_step = float(np.float32(min(steps.node_translation / max(lever, 1e-12), 0.1)))
+    rotation_step = float(np.float32(min(step / max(lever, 1e-12), 0.1)))
     rotations, translations = np.zeros((2, frames, m, 3))
     near = np.zeros((m, 3))
     for t in range(frames):
@@ -185,10 +184,10 @@ def fit_nodes(grid_positions: np.ndarray, x: np.ndarray, means: np.ndarray, seed
     ridge = identity(m, format="csc").multiply(RIDGE * mass).tocsc()
     solved = splu((transposed @ blend.matrix).tocsc() + ridge).solve(transposed @ left)
     translations += np.moveaxis(solved.reshape(m, frames, 3), 1, 0)
-    q_translations = quantize_trajectory(translations, basis, steps.node_translation)
+    q_translations = quantize_trajectory(translations, basis, step)
     coefficients = np.concatenate([q_rotations, q_translations], 2).transpose(0, 2, 1)  # [K, 6, M]
-    fitted = Nodes(node_grid, nodes, trim(coefficients), rotation_step, steps.node_translation)
-    translations = flat(np.tensordot(basis.T, q_translations * steps.node_translation, 1))
+    fitted = Nodes(node_grid, nodes, trim(coefficients), rotation_step, step)
+    translations = flat(np.tensordot(basis.T, q_translations * step, 1))
     moved = (blend.matrix @ translations).reshape(-1, frames, 3)
     return fitted, rotated + np.moveaxis(moved, 1, 0)
 
@@ -203,16 +202,12 @@ def carry(nodes: Nodes, grid_positions: np.ndarray, x: np.ndarray, frames: int) 
         R = rotvec_to_matrix(r)
         carried[t] = blend.rotate(x, nodes.places, R) + blend.matrix @ shift.astype(np.float32)
         turned[t] = blend.turn(rotvec_to_quat(r))
-    return NodeMotion(nodes, carried, turned)
+    return NodeMotion(carried, turned)
 
 
-def quantize_trajectory(values: np.ndarray, basis: np.ndarray, step: float, dead_zone: float = 0.5) -> np.ndarray:
-    """[T, ...] floats -> [T, ...] i32 coefficients; |coefficient| < dead_zone * step becomes 0."""
-    frames = len(values)
-    c = (basis / step).astype(values.dtype) @ values.reshape(frames, -1)
-    near = np.rint(c)
-    near[np.abs(c) < dead_zone] = 0
-    return near.astype(np.int32).reshape(values.shape)
+def quantize_trajectory(values: np.ndarray, basis: np.ndarray, step: float) -> np.ndarray:
+    """[T, ...] floats -> [T, ...] i32 coefficients."""
+    return np.rint(np.tensordot(basis, values, 1) / step).astype(np.int32)
 
 
 def trim(coefficients: np.ndarray) -> np.ndarray:
@@ -221,7 +216,7 @@ def trim(coefficients: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(coefficients[: (used[-1] + 1 if len(used) else 1)])
 
 
-def choose_nodes(grid_positions, x, means, steps: Steps, to_world) -> NodeMotion | None:
+def choose_nodes(grid_positions, x, means, step: float, node_step: float, to_world) -> Nodes | None:
     """The number of nodes at which one more costs what it saves; None when the group hardly moves.
 
     The residual that nodes leave costs about log2(1 + error / step) bits a coefficient, a node `NODE_BITS`.
@@ -230,21 +225,21 @@ def choose_nodes(grid_positions, x, means, steps: Steps, to_world) -> NodeMotion
     grid_some, x_some, targets = grid_positions[some], x[some], means[:, some].astype(np.float64)
     counts = [m for m in NODE_COUNTS if m == 1 or 8 * m <= len(x_some)]
     seeds = grid_some[farthest_points(x_some, counts[-1])]
-    best, best_bits = 0, _residual_bits(targets - x_some, steps)
+    best, best_bits = 0, _residual_bits(targets - x_some, step)
     for count in counts:
-        nodes, carried = fit_nodes(grid_some, x_some, targets, seeds[:count], steps, to_world)
-        bits = _residual_bits(targets - carried, steps) + NODE_BITS * len(nodes.positions) * len(x_some) / len(x)
+        nodes, carried = fit_nodes(grid_some, x_some, targets, seeds[:count], node_step, to_world)
+        bits = _residual_bits(targets - carried, step) + NODE_BITS * len(nodes.positions) * len(x_some) / len(x)
         if bits < best_bits:
             best, best_bits = count, bits
         elif best:
             break
     if not best:
         return None
-    return carry(fit_nodes(grid_positions, x, means, seeds[:best], steps, to_world)[0], grid_positions, x, len(means))
+    return fit_nodes(grid_positions, x, means, seeds[:best], node_step, to_world)[0]
 
 
-def _residual_bits(residual: np.ndarray, steps: Steps) -> float:
+def _residual_bits(residual: np.ndarray, step: float) -> float:
     """Estimated bits of the residual trajectories [T, N, 3]."""
     frames = len(residual)
-    c = np.abs(dct_basis(frames) @ residual.reshape(frames, -1)) / trajectory_step(steps.means, frames)
+    c = np.abs(dct_basis(frames) @ residual.reshape(frames, -1)) / trajectory_step(step, frames)
     return float(np.log2(1 + c[c >= 0.6]).sum() * 2.5)

@@ -11,43 +11,57 @@ from __future__ import annotations
 import numpy as np
 
 from gscodec import _native
-from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply
+from gscodec.bitstream.quantization import error_for
+from gscodec.camera import Camera
+from gscodec.encode import rdo
+from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
 from gscodec.encode.group import (
-    PRUNE_SHARE,
+    PRUNE,
     Coded,
     Grid,
     Stack,
     align_axes,
     canonical_appearance,
-    ever_drawn,
-    importance,
     inside_unit_ball,
     layer_of,
+    measure_stack,
     motion_integers,
+    prominence,
     stack_group,
-    visible_enough,
 )
-from gscodec.encode.motion import NodeMotion, carry, choose_nodes
+from gscodec.encode.motion import NodeMotion, Nodes, carry, choose_nodes
 from gscodec.gaussians import Group
 
-REBIRTH = 8.0  # times PRUNE_SHARE: what the reference left out must matter so much more to come back
+REBIRTH = 8.0  # times PRUNE: what the reference left out must matter so much more to come back
 ROUNDS = 3  # of carrying births back
 
 
-def predict_group(group: Group, parents: np.ndarray, back: int, reference: Coded, *, keep_all: bool = False) -> dict:
+def predict_group(
+    group: Group,
+    parents: np.ndarray,
+    back: int,
+    reference: Coded,
+    *,
+    quality: float,
+    keep_all: bool = False,
+    cameras: list[Camera] = (),
+) -> dict:
     """Integers of a group that is predicted.
 
     Args:
         group: T >= 1 frames of N Gaussians.
         parents: [N] int, index of each in the group that was coded as `reference`, -1: not there.
         back: how many groups before this one that is.
+        quality, keep_all, cameras: as in `code_group`.
     """
     s = stack_group(group)
     parent = _coded_parents(parents, reference.source)
     alive, born = parent >= 0, parent < 0
+    measured = measure_stack(s, cameras)
     if not keep_all and len(parent):
-        alive &= ever_drawn(s)
-        born &= visible_enough(s, PRUNE_SHARE) & ((parents < 0) | visible_enough(s, REBIRTH * PRUNE_SHARE))
+        least = PRUNE * error_for(quality) / len(parent)
+        alive &= measured.removal > 0
+        born &= measured.removal >= np.where(parents < 0, least, REBIRTH * least)
     survivors = np.flatnonzero(alive)
     survivors = survivors[parent[survivors].argsort()]
     births = np.flatnonzero(born)
@@ -58,11 +72,12 @@ def predict_group(group: Group, parents: np.ndarray, back: int, reference: Coded
     positions = reference.integers["positions"][known]
     old = align_axes(old, middle, reference.turn[known], reference.order[known])
     x = grid.to_world(positions)
-    motion = choose_nodes(positions, x, old.means, steps, grid.to_world) if len(known) else None
-    places = _carry_back(new.means[middle], x, motion, middle, grid)
+    nodes = choose_nodes(positions, x, old.means, grid.step, reference.node_step, grid.to_world) if len(known) else None
+    motion = nodes and carry(nodes, positions, x, len(s.means))
+    places = _carry_back(new.means[middle], x, nodes, motion, middle, grid)
     order = _native.morton_order(places)
-    places, new = places[order], new.take(order)
-    new_motion = carry(motion.nodes, places, grid.to_world(places), len(s.means)) if motion else None
+    places, births, new = places[order], births[order], new.take(order)
+    new_motion = nodes and carry(nodes, places, grid.to_world(places), len(s.means))
     new, quats = _canonical_births(new, middle, new_motion)
 
     values = canonical_appearance(new) | {"quats": quats}
@@ -70,13 +85,14 @@ def predict_group(group: Group, parents: np.ndarray, back: int, reference: Coded
     channels = {n: _with_births(c, known, values[n], n) for n, c in before["channels"].items()}
     s = _join(old, new)
     layer = np.repeat(np.arange(len(before["layers"])), before["layers"])[known]
-    layer = np.concatenate([layer, layer_of(importance(s), len(before["layers"]))[len(known) :]])
+    layer = np.concatenate([layer, layer_of(prominence(s), len(before["layers"]))[len(known) :]])
     place = np.lexsort((np.arange(len(layer)) >= len(known), layer))  # in each layer survivors, then births
     s, positions = s.take(place), np.concatenate([positions, places])[place]
+    measured = measured.take(np.concatenate([survivors, births])[place])
     channels = {n: c | {"values": np.ascontiguousarray(c["values"][:, place])} for n, c in channels.items()}
     if motion:
         both = ((motion.carried, new_motion.carried), (motion.turned, new_motion.turned))
-        motion = NodeMotion(motion.nodes, *(np.concatenate(pair, 1)[:, place] for pair in both))
+        motion = NodeMotion(*(np.concatenate(pair, 1)[:, place] for pair in both))
     out = before | {
         "frames": len(s.means),
         "reference": back,
@@ -87,7 +103,8 @@ def predict_group(group: Group, parents: np.ndarray, back: int, reference: Coded
         "nodes": None,
         "lifetimes": None if s.lifetimes is None else s.lifetimes.astype(np.uint16),
     }
-    return out | motion_integers(s, channels, steps, grid.to_world(positions), motion)
+    price = rdo.bit_price(error_for(quality), max(len(positions), 1))
+    return out | motion_integers(s, channels, steps, measured, price, grid.to_world(positions), nodes, motion)
 
 
 def _coded_parents(parents: np.ndarray, source: np.ndarray) -> np.ndarray:
@@ -97,12 +114,14 @@ def _coded_parents(parents: np.ndarray, source: np.ndarray) -> np.ndarray:
     return place[parents]
 
 
-def _carry_back(means: np.ndarray, x: np.ndarray, motion: NodeMotion | None, middle: int, grid: Grid) -> np.ndarray:
+def _carry_back(
+    means: np.ndarray, x: np.ndarray, nodes: Nodes | None, motion: NodeMotion | None, middle: int, grid: Grid
+) -> np.ndarray:
     """[B, 3] u32, grid points from which the nodes carry births to `means` [B, 3] in frame `middle`.
 
     The nearest survivor's motion is undone (x [N, 3] are the survivors' canonical positions), then the error is.
     """
-    if motion is None or not len(means):
+    if nodes is None or not len(means):
         return grid.to_integers(means)
     from scipy.spatial import cKDTree
 
@@ -110,10 +129,9 @@ def _carry_back(means: np.ndarray, x: np.ndarray, motion: NodeMotion | None, mid
     turned, carried = motion.turned[middle, near], motion.carried[middle, near]
     places = x[near]
     for _ in range(ROUNDS):
-        places = places + _rotate(quat_conjugate(turned), means - carried)
-        moved = carry(
-            motion.nodes, grid.to_integers(places), grid.to_world(grid.to_integers(places)), len(motion.carried)
-        )
+        places = places + rotate(quat_conjugate(turned), means - carried)
+        on_grid = grid.to_integers(places)
+        moved = carry(nodes, on_grid, grid.to_world(on_grid), len(motion.carried))
         turned, carried = moved.turned[middle], moved.carried[middle]
     return grid.to_integers(places)
 
@@ -142,9 +160,3 @@ def _join(a: Stack, b: Stack) -> Stack:
     names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
     lifetimes = None if a.lifetimes is None else np.concatenate([a.lifetimes, b.lifetimes])
     return Stack(*(np.concatenate([getattr(a, n), getattr(b, n)], 1) for n in names), lifetimes)
-
-
-def _rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Unit quaternions [N, 4] applied to vectors [N, 3]."""
-    u, w = q[:, 1:], q[:, :1]
-    return v + 2 * np.cross(u, np.cross(u, v) + w * v)

@@ -388,8 +388,10 @@ def join_units(units):
 
 
 def without_sizes(units):
-    """Removes unit_sizes, as draft 2 had it, so that units may change their size."""
-    drop(units, units[1])
+    """Removes unit_sizes from the header, as draft 2 had it, so that units may change their size."""
+    head = units[0]["payload"]
+    at = 5 if head[2] & 1 else 3
+    units[0]["payload"] = head[:2] + bytes([head[2] & ~4]) + head[3:at] + head[at + 1 + 4 * head[at] :]
     return units
 
 
@@ -430,9 +432,9 @@ def deaths_of_others():
 
 
 def sizes_file(edit):
-    """The base group with its unit_sizes edited."""
+    """The base group with its header, which has unit_sizes from byte 3 on, edited."""
     units = split_units(encode(base_group()))
-    units[1]["payload"] = edit(units[1]["payload"])
+    units[0]["payload"] = edit(units[0]["payload"])
     return make_file([(join_units(units), 4)])
 
 
@@ -444,11 +446,6 @@ def payload_file(edit):
 def unit_dict(unit_type, layer=0, attribute=0, dependencies=(), payload=b""):
     names = ("unit_type", "layer", "attribute", "dependencies", "payload")
     return dict(zip(names, (unit_type, layer, attribute, list(dependencies), payload), strict=True))
-
-
-def late_sizes(units):
-    """A unit of type 10 that is not unit 1 is unknown."""
-    units.append(unit_dict(10, payload=b"no sizes"))
 
 
 def add_unknown_units(units):

@@ -1,7 +1,8 @@
-//! The demuxer: no panic, and the same result whole, in pieces and with media data skipped.
+//! The demuxer: no panic, and the same result whole, in pieces and with media data skipped; and what is saved of a damaged file.
 #![no_main]
 
 use gsv::container::demux::Demuxer;
+use gsv::container::whole;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|input: (u8, &[u8])| {
@@ -26,4 +27,8 @@ fuzz_target!(|input: (u8, &[u8])| {
         rest = &rest[n..];
     }
     assert_eq!(whole.groups(), skipping.groups());
+    let strict = whole::read(data, true).map(|(d, _)| d.groups().len());
+    if let Ok((saved, damage)) = whole::read(data, false) {
+        assert!(strict.is_ok_and(|n| n <= saved.groups().len()) || !damage.is_empty() || !saved.index().is_empty());
+    }
 });

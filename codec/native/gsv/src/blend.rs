@@ -1,6 +1,6 @@
 //! Which nodes move a Gaussian, and how much (spec 13.2): exact integers, so that encoder and decoder agree.
 
-use crate::node_tree::{NodeTree, Search};
+use crate::node_search::NodeSearch;
 use rayon::prelude::*;
 
 /// Neighbours a Gaussian may have (spec 4).
@@ -21,23 +21,28 @@ impl Blend {
         if per == 0 {
             return Blend::default();
         }
-        let tree = NodeTree::new(nodes);
+        let search = NodeSearch::new(nodes, per + 1);
         let mut index = vec![0; positions.len() * per];
         let mut weight = vec![0.0; positions.len() * per];
         let rows = index.par_chunks_mut(RUN * per).zip(weight.par_chunks_mut(RUN * per));
-        positions.par_chunks(RUN).zip(rows).for_each(|(run, (index, weight))| {
-            let mut search = Search::new(&tree, per + 1);
-            let rows = index.chunks_exact_mut(per).zip(weight.chunks_exact_mut(per));
-            for (p, (i, w)) in run.iter().zip(rows) {
-                weights(search.nearest(*p), nodes.len(), i, w);
-            }
-        });
+        positions
+            .par_chunks(RUN)
+            .zip(rows)
+            .with_min_len(32)
+            .for_each(|(run, (index, weight))| {
+                let mut rows = index.chunks_exact_mut(per).zip(weight.chunks_exact_mut(per));
+                search.run(run, |found| {
+                    if let Some((i, w)) = rows.next() {
+                        weights(found, nodes.len(), i, w);
+                    }
+                });
+            });
         Blend { per, index, weight }
     }
 }
 
-/// Gaussians that are searched one after the other.
-const RUN: usize = 1024;
+/// Gaussians that share a search.
+const RUN: usize = 32;
 
 /// Weights of spec 13.2 from one more neighbour than there are weights.
 fn weights(found: &[(u64, u32)], nodes: usize, index: &mut [u32], weight: &mut [f32]) {

@@ -4,12 +4,12 @@
 //! the header announces and the level allows, and trajectories grow against what is left of the level's symbols.
 //! Damage (spec 3) is an error, or what is not affected is decoded and the rest stands still or takes its offsets.
 
-use crate::attributes::Attribute;
+use crate::assemble::{LayerPoints, Part, Slot, append, assemble};
 use crate::channels;
 use crate::deaths;
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader};
-use crate::group::{BIRTH, Group};
+use crate::group::Group;
 use crate::header::{Header, LayerHeader, NodeHeader};
 use crate::inventory::{self, Damage};
 use crate::levels::Level;
@@ -44,14 +44,6 @@ impl<'a> Decoding<'a> {
     }
 }
 
-/// What a unit decodes to, besides points.
-enum Part {
-    Channels(Vec<i32>),
-    Lifetimes(Vec<[u16; 2]>),
-    Trajectories(Trajectories),
-    Correction(f32),
-}
-
 /// Decodes a group payload under the caps of `how.level`.
 ///
 /// # Errors
@@ -83,7 +75,8 @@ pub fn decode_units(units: &[Unit], how: &Decoding) -> Result<Group> {
 /// `Error::Bitstream`: the header is damaged.
 pub fn reference_of(payload: &[u8]) -> Result<u16> {
     let first = unit::first(payload)?;
-    Header::reference_of(first.payload).map_err(|e| e.at(first.payload_offset, &first.label(0)))
+    let opened = Header::open(first.payload).map_err(|e| e.at(first.payload_offset, &first.label(0)));
+    opened.map(|(reference, _)| reference)
 }
 
 fn decode(units: &[Unit], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
@@ -101,7 +94,8 @@ fn decode(units: &[Unit], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
         level: how.level,
         symbols: AtomicU64::new(known),
     };
-    let count = header.layers.len().min(how.layers);
+    let known_layers = decoder.reference.map_or(header.layers.len(), |r| r.layers.len()); // a prefix refers to a prefix
+    let count = known_layers.min(how.layers);
     let points = |k: usize| decoder.points_of_layer(k);
     let (layers, node_positions) = rayon::join(
         || (0..count).into_par_iter().map(points).collect::<Result<Vec<_>>>(),
@@ -136,104 +130,6 @@ fn decode(units: &[Unit], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
         group.node_trajectories = Trajectories::still(6, group.node_positions.len());
     }
     Ok((group, damage))
-}
-
-/// Points of a layer, before anything else of it is decoded.
-struct LayerPoints {
-    header: LayerHeader,
-    /// As many as the header tells: the layer, and that of the reference, are not damaged.
-    whole: bool,
-    /// Indices in the reference.
-    survivors: Vec<u32>,
-    positions: Vec<[u32; 3]>,
-    contexts: Contexts,
-}
-
-/// What the other units of a layer hold.
-struct Slot {
-    channels: Vec<Vec<i32>>, // of births
-    trajectories: Vec<Option<Trajectories>>,
-    lifetimes: Option<Vec<[u16; 2]>>,
-    correction: [f32; 2],
-}
-
-impl Slot {
-    fn new(h: &Header) -> Slot {
-        Slot {
-            channels: vec![Vec::new(); h.attributes().len()],
-            trajectories: vec![None; h.trajectories.len()],
-            lifetimes: None,
-            correction: [0.0; 2],
-        }
-    }
-
-    fn place(&mut self, h: &Header, attribute: Option<Attribute>, part: Part) {
-        match part {
-            Part::Lifetimes(l) => self.lifetimes = Some(l),
-            Part::Correction(v) => self.correction[usize::from(attribute == Some(Attribute::LogitOpacities))] = v,
-            Part::Channels(v) => {
-                let at = h.attributes().iter().position(|a| Some(*a) == attribute);
-                if let Some(slot) = at.and_then(|k| self.channels.get_mut(k)) {
-                    *slot = v;
-                }
-            }
-            Part::Trajectories(t) => {
-                let at = h.trajectories.iter().position(|h| Some(h.attribute) == attribute);
-                if let Some(slot) = at.and_then(|k| self.trajectories.get_mut(k)) {
-                    *slot = Some(t);
-                }
-            }
-        }
-    }
-}
-
-/// The layers one after the other; 0 and stillness stand in for what is damaged.
-fn assemble(layers: Vec<LayerPoints>, slots: Vec<Slot>, reference: Option<&Group>, h: &Header) -> Group {
-    let mut group = Group {
-        channels: vec![Vec::new(); h.scales.len()],
-        trajectories: vec![Trajectories::default(); h.trajectories.len()],
-        parents: reference.map(|_| Vec::new()),
-        ..Group::default()
-    };
-    let cut = slots.iter().any(|s| s.lifetimes.is_some());
-    let mut lifetimes = Vec::new();
-    for (layer, slot) in layers.into_iter().zip(slots) {
-        let (n, births) = (layer.positions.len(), layer.header.births as usize);
-        for (k, (own, mut values)) in group.channels.iter_mut().zip(slot.channels).enumerate() {
-            let c = h.scales.get(k).map_or(0, |s| s.steps.len());
-            values.resize(births * c, 0);
-            let before = reference.and_then(|r| r.channels.get(k)).map_or(&[][..], Vec::as_slice);
-            let rows = layer.survivors.iter().map(|p| *p as usize);
-            own.extend(rows.flat_map(|p| before.get(p * c..(p + 1) * c).unwrap_or(&[])));
-            append(own, values);
-        }
-        for ((own, head), t) in group
-            .trajectories
-            .iter_mut()
-            .zip(&h.trajectories)
-            .zip(slot.trajectories)
-        {
-            let none = || Trajectories::still(head.attribute.channels(h.sh_degree), n);
-            own.append(t.unwrap_or_else(none));
-        }
-        if let Some(parents) = &mut group.parents {
-            parents.extend(&layer.survivors);
-            parents.extend((0..births).map(|_| BIRTH));
-        }
-        if cut {
-            lifetimes.extend(slot.lifetimes.unwrap_or_else(|| vec![[0, h.frames]; n]));
-        }
-        append(&mut group.positions, layer.positions);
-        group.corrections.push(slot.correction);
-        group.layers.push(layer.header);
-    }
-    group.lifetimes = cut.then_some(lifetimes);
-    group
-}
-
-/// `extend` that takes over the first.
-fn append<T>(to: &mut Vec<T>, more: Vec<T>) {
-    if to.is_empty() { *to = more } else { to.extend(more) }
 }
 
 struct GroupDecoder<'a> {

@@ -52,12 +52,7 @@ pub fn encode_group(group: &Group, reference: Option<&Group>) -> Result<Vec<u8>>
         }
     }
     let payloads: Vec<Vec<u8>> = units.par_iter().map(|u| (u.code)()).collect();
-    let mut header = Writer::default();
-    h.clone().fields(&mut header, reference.map(|r| &r.header))?;
-    let mut out = Vec::new();
-    unit::write(&mut out, [UnitType::GroupHeader as u8, 0, 0], &[], &header.0)?;
-    let mut body = Vec::new();
-    let mut sizes = Vec::new();
+    let (mut body, mut sizes) = (Vec::new(), Vec::new());
     for (u, payload) in units.iter().zip(&payloads) {
         let attribute = u.attribute.map_or(0, |a| a as u8);
         let start = body.len();
@@ -67,17 +62,21 @@ pub fn encode_group(group: &Group, reference: Option<&Group>) -> Result<Vec<u8>>
             &dependencies(u, &units),
             payload,
         )?;
-        sizes.extend(((body.len() - start) as u32).to_be_bytes());
+        sizes.push((body.len() - start) as u32);
     }
-    unit::write(&mut out, [UnitType::UnitSizes as u8, 0, 0], &[], &sizes)?;
+    let mut header = Writer::default();
+    h.clone()
+        .fields(&mut header, &mut sizes, reference.map(|r| &r.header))?;
+    let mut out = Vec::new();
+    unit::write(&mut out, [UnitType::GroupHeader as u8, 0, 0], &[], &header.0)?;
     out.extend(body);
     Ok(out)
 }
 
-/// Indices of the units that `u` needs; the header and unit_sizes come before all of them.
+/// Indices of the units that `u` needs; the header comes before all of them.
 fn dependencies(u: &Pending, units: &[Pending]) -> Vec<u8> {
     let needed = |d: &Pending| d.layer == u.layer && u.kind.needs().contains(&d.kind);
-    let found = units.iter().zip(2..).filter(|(d, _)| needed(d));
+    let found = units.iter().zip(1..).filter(|(d, _)| needed(d));
     found.map(|(_, i)| i).collect()
 }
 

@@ -112,17 +112,24 @@ impl Evaluator {
         if self.blend.per > 0 {
             self.move_with_nodes(&basis, frame);
         }
-        for m in &self.motions {
-            let add = |values: &mut [f32], channels: usize| m.add(&basis, values, channels);
-            match m.attribute {
-                Attribute::Means => add(frame.means.as_flattened_mut(), 3),
-                Attribute::LogScales => add(&mut frame.log_scales, 3),
-                Attribute::LogitOpacities => add(&mut frame.logit_opacities, 1),
-                Attribute::Sh0 => add(&mut frame.sh0, 3),
-                Attribute::ShN => add(&mut frame.sh_n, m.coefficients.channels),
-                Attribute::Quats => m.turn(&basis, &mut frame.quats),
+        let mut values = [
+            (Attribute::Means, frame.means.as_flattened_mut()),
+            (Attribute::LogScales, &mut frame.log_scales),
+            (Attribute::LogitOpacities, &mut frame.logit_opacities),
+            (Attribute::Quats, frame.quats.as_flattened_mut()),
+            (Attribute::Sh0, &mut frame.sh0),
+            (Attribute::ShN, &mut frame.sh_n),
+        ];
+        values.par_iter_mut().for_each(|(attribute, values)| {
+            let Some(m) = self.motions.iter().find(|m| m.attribute == *attribute) else {
+                return;
+            };
+            if *attribute == Attribute::Quats {
+                m.turn(&basis, values.as_chunks_mut().0);
+            } else {
+                m.add(&basis, values, m.coefficients.channels);
             }
-        }
+        });
     }
 
     /// Spec 13.3.
@@ -134,6 +141,7 @@ impl Evaluator {
             pose(q, *n, [tx, ty, tz].map(|v| v * h.translation_step))
         };
         let poses: Vec<Pose> = self.nodes.iter().enumerate().map(pose).collect();
+        let aligned = poses.iter().all(|p| p[12] > std::f32::consts::FRAC_1_SQRT_2); // each within 45 degrees of 1 (in 4D)
         let (per, origin, step) = (self.blend.per, self.group.header.origin, self.group.header.grid_step);
         let near = self.blend.index.par_chunks(per).zip(self.blend.weight.par_chunks(per));
         let out = frame.means.par_iter_mut().zip(&mut frame.quats);
@@ -141,7 +149,7 @@ impl Evaluator {
         out.zip(rest)
             .with_min_len(2048)
             .for_each(|((x, q), ((index, weight), p))| {
-                let (moved, turn) = blended(p.map(|v| step * v as f32), &poses, index, weight);
+                let (moved, turn) = blended(p.map(|v| step * v as f32), &poses, aligned, index, weight);
                 *x = std::array::from_fn(|a| origin[a] + moved[a]);
                 *q = multiply(turn, *q);
             });
@@ -191,28 +199,29 @@ fn pose(q: Quat, centre: [f32; 3], shift: [f32; 3]) -> Pose {
     p
 }
 
-fn blended(x: [f32; 3], poses: &[Pose], index: &[u32], weight: &[f32]) -> ([f32; 3], Quat) {
+/// `aligned`: no two quaternions of `poses` are more than a right angle apart.
+#[inline]
+fn blended(x: [f32; 3], poses: &[Pose], aligned: bool, index: &[u32], weight: &[f32]) -> ([f32; 3], Quat) {
     let first = index.first().and_then(|j| poses.get(*j as usize));
     let Some(first) = first else {
         return (x, [1.0, 0.0, 0.0, 0.0]);
     };
     let mut sum = [0.0; 16];
     for (p, w) in index.iter().filter_map(|j| poses.get(*j as usize)).zip(weight) {
-        let dot: f32 = (12..16).map(|a| p[a] * first[a]).sum();
-        let s = if dot < 0.0 { -w } else { *w };
-        (0..12).for_each(|a| sum[a] += w * p[a]);
-        (12..16).for_each(|a| sum[a] += s * p[a]);
+        (0..16).for_each(|a| sum[a] += w * p[a]);
+        if !aligned && (12..16).map(|a| p[a] * first[a]).sum::<f32>() < 0.0 {
+            (12..16).for_each(|a| sum[a] -= 2.0 * w * p[a]);
+        }
     }
     let moved =
         std::array::from_fn(|a| sum[4 * a] * x[0] + sum[4 * a + 1] * x[1] + sum[4 * a + 2] * x[2] + sum[4 * a + 3]);
-    let q: Quat = std::array::from_fn(|a| sum[12 + a]);
-    let length = q.iter().map(|v| v * v).sum::<f32>().sqrt();
-    let q = if length < 1e-12 {
-        std::array::from_fn(|a| first[12 + a])
+    let length = (12..16).map(|a| sum[a] * sum[a]).sum::<f32>().sqrt();
+    let (from, scale) = if length < 1e-12 {
+        (first, 1.0)
     } else {
-        q.map(|v| v / length)
+        (&sum, 1.0 / length)
     };
-    (moved, q)
+    (moved, std::array::from_fn(|a| scale * from[12 + a]))
 }
 
 /// offset + step * integer, C per Gaussian; empty if the group lacks the attribute.

@@ -45,7 +45,7 @@ impl Group {
     pub fn validate(&self, reference: Option<&Group>) -> Result<()> {
         let h = &self.header;
         let before = reference.map(|r| &r.header);
-        h.clone().fields(&mut Writer::default(), before)?;
+        h.clone().fields(&mut Writer::default(), &mut Vec::new(), before)?;
         let top = LEVELS[LEVELS.len() - 1];
         h.check(&top, before).map_err(|e| Error::Input(e.to_string()))?;
         let n = self.range(0..self.layers.len()).len();

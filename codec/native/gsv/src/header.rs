@@ -12,6 +12,7 @@ use crate::map;
 
 const FLAG_PREDICTED: u8 = 1;
 const FLAG_STEP_CLASSES: u8 = 2;
+const FLAG_UNIT_SIZES: u8 = 4;
 /// Layers of a group.
 pub const LAYERS_MAX: usize = 16;
 
@@ -80,7 +81,7 @@ impl Header {
     pub fn read(payload: &[u8], reference: Option<&Header>) -> Result<Header> {
         let mut h = Header::default();
         let mut r = Reader::new(payload);
-        h.fields(&mut r, reference)?;
+        h.fields(&mut r, &mut Vec::new(), reference)?;
         let rest = r.rest();
         r.must(rest == 0, || {
             format!("the end of the group header, found {rest} more bytes")
@@ -88,11 +89,11 @@ impl Header {
         Ok(h)
     }
 
-    /// How many groups back the group of this header refers; 0: it is independent.
-    pub fn reference_of(payload: &[u8]) -> Result<u16> {
-        let mut h = Header::default();
-        h.opening(&mut Reader::new(payload))?;
-        Ok(h.reference)
+    /// What a header opens with: how many groups back it refers, 0 for an independent one, and sizes of the units behind it.
+    pub fn open(payload: &[u8]) -> Result<(u16, Vec<u32>)> {
+        let (mut h, mut sizes) = (Header::default(), Vec::new());
+        h.opening(&mut Reader::new(payload), &mut sizes)?;
+        Ok((h.reference, sizes))
     }
 
     /// Gaussians in all layers.
@@ -100,9 +101,9 @@ impl Header {
         self.layers.iter().map(|l| u64::from(l.count)).sum()
     }
 
-    /// Reads or writes all fields, and checks them.
-    pub fn fields<F: Fields>(&mut self, f: &mut F, reference: Option<&Header>) -> Result<()> {
-        self.opening(f)?;
+    /// Reads or writes all fields, and checks them. `sizes`: of the units behind the header, none if they are not told.
+    pub fn fields<F: Fields>(&mut self, f: &mut F, sizes: &mut Vec<u32>, reference: Option<&Header>) -> Result<()> {
+        self.opening(f, sizes)?;
         if self.reference > 0 {
             let Some(r) = reference.filter(|r| r.reference == 0) else {
                 return f.fail("the independent group that this predicted one refers to".into());
@@ -125,20 +126,29 @@ impl Header {
         self.nodes(f)
     }
 
-    fn opening<F: Fields>(&mut self, f: &mut F) -> Result<()> {
+    fn opening<F: Fields>(&mut self, f: &mut F, sizes: &mut Vec<u32>) -> Result<()> {
         f.u16(&mut self.frames)?;
         f.must(self.frames > 0, || "frames >= 1, found 0".into())?;
         let mut flags = if self.reference > 0 { FLAG_PREDICTED } else { 0 };
+        if !sizes.is_empty() {
+            flags |= FLAG_UNIT_SIZES;
+        }
         f.u8(&mut flags)?;
         f.must(flags & FLAG_STEP_CLASSES == 0, || {
             "a group without step classes: not yet supported by this version".into()
         })?;
-        f.must(flags & !FLAG_PREDICTED == 0, || {
+        f.must(flags & !(FLAG_PREDICTED | FLAG_UNIT_SIZES) == 0, || {
             format!("reserved flags to be 0, found {flags:#04x}")
         })?;
         if flags & FLAG_PREDICTED != 0 {
             f.u16(&mut self.reference)?;
             f.must(self.reference > 0, || "a reference >= 1, found 0".into())?;
+        }
+        if flags & FLAG_UNIT_SIZES != 0 {
+            let mut count = sizes.len() as u8;
+            f.u8(&mut count)?;
+            sizes.resize(usize::from(count), 0);
+            sizes.iter_mut().try_for_each(|size| f.u32(size))?;
         }
         Ok(())
     }

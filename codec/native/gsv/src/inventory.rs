@@ -105,7 +105,7 @@ fn claimed((i, u): (usize, &Unit)) -> Option<Damage> {
 /// Units that must be there, and those that may.
 fn announced(h: &Header, reference: Option<&Header>, layers: usize) -> (Vec<Key>, Vec<Key>) {
     let mut required = vec![(UnitType::GroupHeader, 0, None)];
-    let mut optional = vec![(UnitType::UnitSizes, 0, None)];
+    let mut optional = Vec::new();
     if h.nodes.count > 0 {
         required.extend([
             (UnitType::NodePositions, 0, None),

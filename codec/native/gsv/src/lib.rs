@@ -3,6 +3,7 @@
 //! No I/O, no unsafe, no panic on input. Clause numbers in comments are those of spec/gsv.md.
 #![forbid(unsafe_code)]
 
+mod assemble;
 pub mod attributes;
 pub mod blend;
 pub mod channels;
@@ -23,7 +24,7 @@ pub mod map;
 mod model;
 pub mod morton;
 pub mod neighbors;
-mod node_tree;
+mod node_search;
 pub mod positions;
 pub mod range_coder;
 pub mod trajectories;

@@ -4,6 +4,7 @@ use crate::attributes::Attribute;
 use crate::crc::crc32;
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader, Writer};
+use crate::header::Header;
 
 /// Known unit types (spec 3.1).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -19,13 +20,12 @@ pub enum UnitType {
     StepClasses = 7,
     Deaths = 8,
     LayerCorrection = 9,
-    UnitSizes = 10,
 }
 
 use UnitType::*;
 
 impl UnitType {
-    const ALL: [UnitType; 11] = [
+    const ALL: [UnitType; 10] = [
         GroupHeader,
         Positions,
         Channels,
@@ -36,7 +36,6 @@ impl UnitType {
         StepClasses,
         Deaths,
         LayerCorrection,
-        UnitSizes,
     ];
 
     pub fn from_number(n: u8) -> Option<UnitType> {
@@ -55,7 +54,6 @@ impl UnitType {
             StepClasses => "step_classes",
             Deaths => "deaths",
             LayerCorrection => "layer_correction",
-            UnitSizes => "unit_sizes",
         }
     }
 
@@ -117,7 +115,7 @@ pub fn split(payload: &[u8], layers: usize) -> Result<Vec<Unit<'_>>> {
 }
 
 /// Splits a group payload and marks damaged units (spec 3): those with a wrong CRC, those that name them, what the payload
-/// ends in, and what breaks a rule behind a damaged unit whose length may be false (where no unit_sizes tells).
+/// ends in, and what breaks a rule behind a damaged unit whose length may be false (where the header does not tell it).
 ///
 /// Units of the first `layers` layers only: the payload may end anywhere behind them.
 ///
@@ -125,10 +123,15 @@ pub fn split(payload: &[u8], layers: usize) -> Result<Vec<Unit<'_>>> {
 /// Unit 0 is damaged, or sound bytes break a rule.
 pub fn scan(payload: &[u8], layers: usize) -> Result<Vec<Unit<'_>>> {
     let mut units: Vec<Unit> = Vec::new();
-    let (mut offset, mut damaged, mut sizes) = (0, false, Sizes::default());
+    let (mut offset, mut damaged, mut sizes) = (0, false, Vec::new().into_iter());
     while (offset < payload.len() && units.len() <= UNITS_MAX) || units.is_empty() {
         let index = units.len();
-        let mut unit = read(&payload[offset..], offset, index, sizes.next());
+        let mut unit = read(
+            &payload[offset..],
+            offset,
+            index,
+            sizes.next().map(|size| size as usize),
+        );
         if unit.damage.is_none() && usize::from(unit.layer) >= layers {
             break;
         }
@@ -144,8 +147,9 @@ pub fn scan(payload: &[u8], layers: usize) -> Result<Vec<Unit<'_>>> {
         {
             return Err(e);
         }
-        if unit.kind == Some(UnitSizes) && unit.damage.is_none() {
-            sizes = Sizes::new(&unit)?;
+        if index == 0 {
+            let told = Header::open(unit.payload).map_or(Vec::new(), |(_, sizes)| sizes);
+            sizes = told.into_iter(); // a header that breaks a rule is an error of who reads all of it
         }
         damaged |= unit.damage.is_some();
         offset += unit.size;
@@ -164,37 +168,13 @@ pub fn first(payload: &[u8]) -> Result<Unit<'_>> {
     }
 }
 
-/// What a unit_sizes unit tells of the units behind it.
-#[derive(Default)]
-struct Sizes<'a>(&'a [[u8; 4]]);
-
-impl<'a> Sizes<'a> {
-    fn new(unit: &Unit<'a>) -> Result<Sizes<'a>> {
-        let (sizes, rest) = unit.payload.as_chunks();
-        if rest.is_empty() {
-            return Ok(Sizes(sizes));
-        }
-        Err(Error::bitstream(
-            unit.payload_offset,
-            unit.label(1),
-            "sizes of four bytes each",
-        ))
-    }
-
-    fn next(&mut self) -> Option<usize> {
-        let (first, rest) = self.0.split_first()?;
-        self.0 = rest;
-        Some(u32::from_be_bytes(*first) as usize)
-    }
-}
-
-/// The unit that `data` starts with, of the size that unit_sizes tells; the rest of the data if it ends in the unit.
+/// The unit that `data` starts with, of the size that the header tells; the rest of the data if it ends in the unit.
 fn read(data: &[u8], offset: usize, index: usize, told: Option<usize>) -> Unit<'_> {
     let data = told.and_then(|size| data.get(..size)).unwrap_or(data);
     let mut h = [0u8; 4];
     h.iter_mut().zip(data).for_each(|(h, b)| *h = *b);
     let [number, layer, attribute, dependency_count] = h;
-    let kind = UnitType::from_number(number).filter(|k| *k != UnitSizes || index == 1);
+    let kind = UnitType::from_number(number);
     let mut unit = Unit {
         number,
         kind,
@@ -214,7 +194,7 @@ fn read(data: &[u8], offset: usize, index: usize, told: Option<usize>) -> Unit<'
     }
     if told.is_some_and(|size| size != unit.size) || (told.is_some() && unit.damage.is_some()) {
         unit.size = data.len();
-        let differ = || Error::bitstream(offset, format!("unit {index}"), "the size that unit_sizes tells");
+        let differ = || Error::bitstream(offset, format!("unit {index}"), "the size that the header tells");
         unit.damage = unit.damage.or_else(|| Some(differ()));
     }
     unit

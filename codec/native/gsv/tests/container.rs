@@ -244,6 +244,9 @@ fn layers_can_be_found() {
         d.push(head).unwrap();
         d.layers().to_vec()
     };
+    let mut d = Demuxer::default();
+    d.push(&head).unwrap();
+    assert_eq!(d.index()[0].offset, head.len() as u64);
     assert_eq!(read(&head), [vec![300, 300, 900], vec![50], vec![7, large]]);
     let at = head.windows(4).position(|w| w == b"ssix").unwrap();
     for (offset, byte) in [(8, 1), (11, 9), (15, 200), (19, 3)] {

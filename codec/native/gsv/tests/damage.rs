@@ -120,7 +120,7 @@ fn limits_come_before_memory() {
 
 fn header_only(g: &gsv::group::Group) -> Vec<u8> {
     let mut w = gsv::fields::Writer::default();
-    g.header.clone().fields(&mut w, None).unwrap();
+    g.header.clone().fields(&mut w, &mut Vec::new(), None).unwrap();
     let mut out = Vec::new();
     unit::write(&mut out, [0; 3], &[], &w.0).unwrap();
     out
@@ -151,9 +151,9 @@ fn later_versions() {
     for (flags, part) in [
         (1, "refers to"),
         (2, "step classes: not yet supported"),
-        (4, "reserved flags"),
+        (8, "reserved flags"),
     ] {
-        header[2] = flags;
+        header[2] = flags | header[2] & 4;
         let mut bad = Vec::new();
         unit::write(&mut bad, [0; 3], &[], &header).unwrap();
         let message = decode_group(&bad, &Decoding::at(&level())).unwrap_err().to_string();
@@ -175,7 +175,7 @@ fn broken_units() {
     let payload = encode_group(&small(), None).unwrap();
     let first = unit::split(&payload, ALL_LAYERS).unwrap()[0].size;
     let with = |number, attribute, dependencies: &[u8], part: &str| {
-        let mut bad = payload[..first].to_vec();
+        let mut bad = header_only(&small());
         unit::write(&mut bad, [number, 0, attribute], dependencies, b"").unwrap();
         let message = decode_group(&bad, &Decoding::at(&level())).unwrap_err().to_string();
         assert!(message.contains(part), "{message}");

@@ -164,11 +164,12 @@ fn broken_rules_stay_errors() {
     assert!(message.contains("not yet supported"), "{message}");
 }
 
-/// What a unit holds, as it is in a group; None where the layer is not the same.
-fn content(g: &Group, sound: &Group, u: &Unit) -> Option<Vec<i32>> {
+/// What a unit holds, as it is in a group.
+fn content(g: &Group, u: &Unit) -> Option<Vec<i32>> {
     let k = usize::from(u.layer);
-    if g.layers.get(k) != sound.layers.get(k) && u.kind != Some(UnitType::Channels) {
-        return None;
+    if u.kind == Some(UnitType::LayerCorrection) {
+        let at = usize::from(u.attribute == Some(Attribute::LogitOpacities));
+        return Some(vec![g.corrections[k][at].to_bits() as i32]);
     }
     let range = g.range(k..k + 1);
     let births = range.end - g.layers[k].births as usize..range.end;
@@ -183,6 +184,10 @@ fn content(g: &Group, sound: &Group, u: &Unit) -> Option<Vec<i32>> {
             let at = g.header.trajectories.iter().position(|t| t.attribute == a)?;
             moving(&g.trajectories[at], range)
         }
+        (UnitType::Deaths, _) => g.parents.as_ref()?[range.start..births.start]
+            .iter()
+            .map(|p| *p as i32)
+            .collect(),
         (UnitType::NodeTrajectories, _) => moving(&g.node_trajectories, 0..g.node_positions.len()),
         (UnitType::NodePositions, _) => g.node_positions.as_flattened().iter().map(|v| *v as i32).collect(),
         (UnitType::Lifetimes, _) => {
@@ -221,8 +226,8 @@ fn a_damaged_byte_costs_its_unit_and_those_that_name_it() {
             let names = |u: &Unit| u.dependencies.contains(&(hit as u8));
             for (i, u) in units.iter().enumerate().filter(|(i, u)| *i != hit && !names(u)) {
                 assert_eq!(
-                    content(&group, sound, u),
-                    content(sound, sound, u),
+                    content(&group, u),
+                    content(sound, u),
                     "byte {at} of unit {hit}, unit {i}"
                 );
             }

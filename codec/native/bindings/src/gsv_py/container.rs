@@ -3,8 +3,8 @@
 use super::values::{bytes_of, invalid, item, optional, raise, value};
 use gsv::container::config::{COLOR_SPACES, Camera, Config, SH_FRAMES, UP_AXES, rate};
 use gsv::container::demux::Demuxer;
+use gsv::container::whole;
 use gsv::container::write::{self, Reference};
-use gsv::error::Error;
 use gsv::levels::Level;
 use numpy::{IntoPyArray, PyArrayMethods};
 use pyo3::exceptions::PyValueError;
@@ -163,34 +163,15 @@ pub fn finish<'py>(
     Ok(PyBytes::new(py, &out))
 }
 
-/// Bytes that the demuxer is shown at a time between the boxes that it passes over.
-const LOOK: usize = 4096;
-
-/// Config and groups of a file in any object with the buffer protocol; only headers are read.
+/// Config and groups of a file in any object with the buffer protocol; only headers are read. Not strict: what an index can
+/// save of a file with damaged headers; `damage` lists group and message.
 #[pyfunction]
-pub fn demux<'py>(py: Python<'py>, buffer: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyDict>> {
+#[pyo3(signature = (buffer, strict = true))]
+pub fn demux<'py>(py: Python<'py>, buffer: &Bound<'py, PyAny>, strict: bool) -> PyResult<Bound<'py, PyDict>> {
     let data = bytes_of(buffer)?;
-    let data = data.as_slice()?;
-    let mut demuxer = Demuxer::default();
-    let mut at = 0;
-    while at < data.len() {
-        let skip = usize::try_from(demuxer.skippable())
-            .unwrap_or(usize::MAX)
-            .min(data.len() - at);
-        if skip > 0 {
-            demuxer.skip(skip as u64);
-            at += skip;
-            continue;
-        }
-        let to = data.len().min(at + LOOK);
-        demuxer.push(&data[at..to]).map_err(|e| raise(py, e))?;
-        at = to;
-    }
+    let (demuxer, damage) = whole::read(data.as_slice()?, strict).map_err(|e| raise(py, e))?;
     let Some(config) = demuxer.config() else {
-        return Err(raise(
-            py,
-            Error::bitstream(at, "file", "a moov box, found the end of the data"),
-        ));
+        return invalid("expected a config".into());
     };
     let d = PyDict::new(py);
     d.set_item("config", config_into(py, config)?)?;
@@ -206,5 +187,7 @@ pub fn demux<'py>(py: Python<'py>, buffer: &Bound<'py, PyAny>) -> PyResult<Bound
     }
     d.set_item("groups", groups)?;
     d.set_item("complete", demuxer.complete())?;
+    let damage: Vec<(usize, String)> = damage.into_iter().map(|(i, e)| (i, e.to_string())).collect();
+    d.set_item("damage", damage)?;
     Ok(d)
 }

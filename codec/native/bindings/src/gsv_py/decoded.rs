@@ -156,27 +156,31 @@ impl DecodedGroup {
         Ok(list)
     }
 
-    /// Attribute maps (spec 7.2): name of the channel -> [H, W] i32; cells without a Gaussian are 0.
+    /// Attribute maps (spec 7.2): name of the channel, behind that of the layer if there are several -> [H, W] i32; cells
+    /// without a Gaussian are 0.
     fn maps<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let group = self.evaluator.group();
-        let map = Map::new(group.positions.len());
+        let group = self.group();
         let d = PyDict::new(py);
-        for a in 0..3 {
-            d.set_item(
-                format!("means_{a}"),
-                map.arrange(|i| group.positions[i][a] as i32)
-                    .into_pyarray(py)
-                    .reshape([map.height, map.width])?,
-            )?;
-        }
-        for (a, values) in group.header.attributes().iter().zip(&group.channels) {
-            let channels = a.channels(group.header.sh_degree);
-            for c in 0..channels {
-                let cells = map.arrange(|i| values[i * channels + c]);
-                d.set_item(
-                    format!("{}_{c}", a.name()),
-                    cells.into_pyarray(py).reshape([map.height, map.width])?,
-                )?;
+        for k in 0..group.layers.len() {
+            let range = group.range(k..k + 1);
+            let map = Map::new(range.len());
+            let layer = if group.layers.len() > 1 {
+                format!("layer{k}_")
+            } else {
+                String::new()
+            };
+            let set = |name: String, value: &dyn Fn(usize) -> i32| {
+                let cells = map.arrange(|i| value(range.start + i)).into_pyarray(py);
+                d.set_item(layer.clone() + &name, cells.reshape([map.height, map.width])?)
+            };
+            for a in 0..3 {
+                set(format!("means_{a}"), &|i| group.positions[i][a] as i32)?;
+            }
+            for (a, values) in group.header.attributes().iter().zip(&group.channels) {
+                let channels = a.channels(group.header.sh_degree);
+                for c in 0..channels {
+                    set(format!("{}_{c}", a.name()), &|i| values[i * channels + c])?;
+                }
             }
         }
         Ok(d)

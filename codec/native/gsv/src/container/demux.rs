@@ -130,6 +130,17 @@ impl Demuxer {
         &self.layers
     }
 
+    /// Takes group `i` from the index, its fragment in place of its sample: what is in it cannot be told.
+    pub fn replace_by_index(&mut self, i: usize) {
+        self.forget(i);
+        self.groups.extend(self.index.get(i).copied());
+    }
+
+    /// Drops the groups from the i-th on.
+    pub fn forget(&mut self, i: usize) {
+        self.groups.truncate(i);
+    }
+
     /// Goes on at the fragment that starts at `position`: what is pushed next is taken to come from there.
     pub fn seek(&mut self, position: u64) {
         self.state = State::Head;

@@ -5,4 +5,5 @@
 pub mod config;
 pub mod demux;
 mod movie;
+pub mod whole;
 pub mod write;

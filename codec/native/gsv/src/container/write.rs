@@ -151,19 +151,18 @@ pub fn finish(init: &[u8], config: &Config, groups: &[Reference]) -> Result<Vec<
         };
         references.extend(words(&[size as u32, duration, sap]));
     }
+    let layered = per == 1 && groups.iter().any(|g| g.layers.len() > 1);
+    let ssix = if layered { layer_index(groups) } else { Vec::new() };
     let count = (references.len() / 12) as u16;
     let head = [
         words(&[TRACK_ID, config.timescale]),
-        vec![0; 16],
+        vec![0; 8], // earliest presentation time
+        (ssix.len() as u64).to_be_bytes().to_vec(),
         vec![0; 2],
         count.to_be_bytes().to_vec(),
     ]
     .concat();
-    let mut out = [init, &full(b"sidx", 1, 0, &[&head, &references])].concat();
-    if per == 1 && groups.iter().any(|g| g.layers.len() > 1) {
-        out.extend(layer_index(groups));
-    }
-    Ok(out)
+    Ok([init, &full(b"sidx", 1, 0, &[&head, &references]), &ssix].concat())
 }
 
 /// Spec 2.6.

@@ -1,0 +1,59 @@
+"""What layers cost, and what their prefixes are worth: one frame of the statue in 1 to 4 layers.
+
+usage: GSCODEC_DATA=... python bench/layers.py        writes bench/results/layers.json
+
+For each prefix also the best of a few corrections of scale and opacity (spec, "Layer correction").
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from gscodec import _native
+from gscodec.bench.machine import RESULTS, write_result
+from gscodec.encode.group import code_group
+from gscodec.gaussians import Gaussians, Group
+from gscodec.metrics.codec_cameras import codec_cameras
+from gscodec.metrics.image import psnr
+from gscodec.render.image import render_image
+from gscodec.splats import read_splat
+
+SCALES, OPACITIES = (0.0, 0.15, 0.3), (0.0, 0.3, 0.7)
+LEVEL = 4
+
+
+def main() -> None:
+    """Writes the results."""
+    original = read_splat(Path(os.environ["GSCODEC_DATA"]) / "splats" / "statue.ply")
+    cameras = codec_cameras([original])[::2]
+    images = [render_image(original, c) for c in cameras]
+
+    def quality(g: Gaussians) -> float:
+        return round(float(np.mean([psnr(i, render_image(g, c)) for i, c in zip(images, cameras, strict=True)])), 2)
+
+    rows = []
+    for layers in range(1, 5):
+        payload, units = _native.encode_group(code_group(Group([original]), 50, layers=layers).integers)
+        for k in range(1, layers + 1):
+            g = Gaussians(**_native.DecodedGroup(payload, LEVEL, layers=k).frame(0))
+            size = sum(u["bytes"] for u in units if u["layer"] < k)
+            row = {"layers": layers, "prefix": k, "gaussians": len(g), "bytes": size, "codec_psnr": quality(g)}
+            if k < layers:
+                tried = {}
+                for s, o in product(SCALES, OPACITIES):
+                    shift = {"log_scales": g.log_scales + np.float32(s)}
+                    shift["logit_opacities"] = g.logit_opacities + np.float32(o)
+                    tried[quality(replace(g, **shift))] = {"log_scales": s, "logit_opacities": o}
+                row["with_best_correction"] = {"codec_psnr": max(tried), **tried[max(tried)]}
+            rows.append(row)
+            print(row, flush=True)
+    write_result(RESULTS / "layers.json", {"scene": "statue, 101,275 Gaussians, quality 50", "rows": rows})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,123 @@
+"""What the picture hears of each Gaussian: rendered sensitivity, and the quantization steps that follow from it.
+
+If the parameters of a picture carry independent errors e, its mean squared error is the sum of W * e^2, where W is
+the mean over pixels and views of the squared derivative. A backward pass whose pixel gradients are random signs
+estimates all W at once, without bias (Hutchinson's estimator of a diagonal). Views stand on a sphere around the
+subject; those by which `gscodec eval` judges are others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gscodec.bitstream.color import TO_RGB
+from gscodec.camera import Camera, look_at
+from gscodec.gaussians import Gaussians
+from gscodec.render.workspace import PARAMETERS, Workspace, call
+
+VIEWS, SIZE, FOCAL = 24, 512, 1.2
+GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+# Beyond these steps the derivative says too little; means are in radii of the subject.
+COARSEST = {"means": 0.02, "log_scales": 1.0, "quats": 0.25, "logit_opacities": 2.0, "sh0": 1.0, "shN": 1.0}
+
+
+@dataclass(frozen=True)
+class Importance:
+    """Sensitivities in the units of the coded channels; pixels are 0 to 1.
+
+    Attributes:
+        weights: attribute -> [N, C] f64, W of each channel.
+        removal: [N] f64, mean squared error of the picture without this Gaussian.
+    """
+
+    weights: dict[str, np.ndarray]
+    removal: np.ndarray
+
+    def take(self, index: np.ndarray) -> Importance:
+        """The Gaussians at `index`."""
+        return Importance({n: w[index] for n, w in self.weights.items()}, self.removal[index])
+
+
+def sensitivity_cameras(means: np.ndarray, given: list[Camera] = ()) -> list[Camera]:
+    """Cameras on a Fibonacci sphere around the 1-99 % box of `means`, every other one at half the distance; up to half
+    of them are those of the capture, if they are `given`: they may stand within the scene."""
+    taken = [given[i] for i in np.linspace(0, len(given) - 1, min(len(given), VIEWS // 2)).round().astype(int)]
+    fitted = [c.resized(SIZE, max(1, round(SIZE * c.height / c.width))) for c in taken]
+    return fitted + _sphere(means, VIEWS - len(taken))
+
+
+def _sphere(means: np.ndarray, count: int) -> list[Camera]:
+    low, high = np.percentile(means, (1, 99), axis=0)
+    center, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    f = FOCAL * SIZE
+    distance = radius / np.sin(np.arctan(0.5 * SIZE / f))
+    K = np.array([[f, 0, SIZE / 2], [0, f, SIZE / 2], [0, 0, 1]])
+    cameras = []
+    for i in range(count):
+        z, turn = 1 - (2 * i + 1) / count, i * GOLDEN_ANGLE + 1.3
+        direction = np.array([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z])
+        eye = center + direction * distance * (0.5 if i % 2 else 1)
+        cameras.append(Camera(f"sensitivity{i:02}", K, look_at(eye, center, (0, 0, 1)), SIZE, SIZE))
+    return cameras
+
+
+def measure(frames: list[Gaussians], cameras: list[Camera] = ()) -> Importance:
+    """Sensitivity over `frames` (the same N >= 1 Gaussians), which share the views. `cameras`: those of the capture."""
+    signs = np.random.default_rng(0)
+    workspace = Workspace()
+    cameras = sensitivity_cameras(np.concatenate([g.means for g in frames]), cameras)
+    total, removal = {}, np.zeros(len(frames[0]))
+    for i, camera in enumerate(cameras):
+        g = frames[i % len(frames)]
+        arrays = tuple(np.ascontiguousarray(getattr(g, name), np.float32) for name in PARAMETERS)
+        workspace.forward(arrays, camera, (0.5, 0.5, 0.5), training=True)
+        shape = (camera.height, camera.width)
+        probe = (2.0 * signs.integers(0, 2, (*shape, 3)) - 1).astype(np.float32)
+        grads, statistics = workspace.gradients(arrays)
+        for a in grads + statistics:
+            a.fill(0)
+        call(workspace.native.backward, arrays, probe, np.zeros(shape, np.float32), (grads, statistics))
+        share = 1 / (len(cameras) * probe.size)
+        for name, d in _derivatives(g, dict(zip(PARAMETERS, grads, strict=True))).items():
+            total[name] = total.get(name, 0) + share * d * d
+            if name == "logit_opacities":
+                transparency = np.maximum(1 / (1 + np.exp(g.logit_opacities)), 1e-6)
+                removal += share * (d[:, 0] / transparency) ** 2
+    return Importance({n: w.astype(np.float64) for n, w in total.items()}, removal)
+
+
+def _derivatives(g: Gaussians, grads: dict) -> dict[str, np.ndarray]:
+    """[N, C] derivatives by the channels that are coded; by a turn about the Gaussian's own axes for quats."""
+    w, x, y, z = g.quats.T
+    turns = np.stack([[-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])  # q i, q j, q k: [3, 4, N]
+    derivatives = {
+        "means": grads["means"],
+        "log_scales": grads["log_scales"],
+        "quats": np.einsum("kcn,nc->nk", turns, grads["quats"]),
+        "logit_opacities": grads["logit_opacities"][:, None],
+        "sh0": grads["sh0"] @ TO_RGB.astype(np.float32),
+        "shN": (grads["shN"] @ TO_RGB.astype(np.float32)).reshape(len(g), -1),
+    }
+    return {n: d for n, d in derivatives.items() if d.shape[1]}
+
+
+def steps_for_error(weights: dict, values: dict, error: float, radius: float) -> dict[str, np.ndarray]:
+    """Steps [C] of each attribute at which the picture's mean squared error is `error`, at the fewest bits.
+
+    Every channel takes the same share of the error, or all of its energy where that is less (reverse water-filling:
+    Cover and Thomas, 10.3.3).
+
+    Args:
+        weights: of Importance. values: attribute -> [N, C], what is to be quantized; means: all axes have one step.
+    """
+    sums = {n: np.maximum(w.sum(0), 1e-30) for n, w in weights.items()}
+    sums["means"] = np.full(3, sums["means"].mean())
+    energy = np.concatenate([(weights[n] * (v - np.median(v, 0)) ** 2).sum(0) for n, v in values.items()])
+    low, high = 0.0, error
+    for _ in range(50):
+        share = (low + high) / 2
+        low, high = (share, high) if np.minimum(share, energy).sum() < error else (low, share)
+    caps = {**COARSEST, "means": COARSEST["means"] * radius}
+    return {n: np.minimum(np.sqrt(12 * high / s), caps[n]).astype(np.float32) for n, s in sums.items()}

@@ -1,0 +1,79 @@
+//! A whole file in memory -> its groups: the demuxer over data that is there, and what an index can save of a damaged one.
+//!
+//! Where the boxes of a fragment are damaged, the walk from box to box ends; with an index (spec 2.5) that agrees so far it
+//! goes on at the next fragment.
+
+use super::demux::{Demuxer, Entry};
+use crate::error::{Error, Result};
+
+/// Groups that are taken from the index: a file with more damage is no file of ours, and each costs a walk.
+const LOST_MAX: usize = 64;
+/// Bytes that the demuxer is shown at a time between the boxes that it passes over.
+const LOOK: usize = 4096;
+
+/// Reads the headers of a file. Strict: damage is an error. Otherwise groups that only the index tells of are in their places,
+/// with the bytes of their fragment, and the errors come with the number of the group.
+///
+/// # Errors
+/// There is no moov, or boxes are damaged and no index helps.
+pub fn read(data: &[u8], strict: bool) -> Result<(Demuxer, Vec<(usize, Error)>)> {
+    let mut demuxer = Demuxer::default();
+    let (mut at, mut tried, mut damage) = (0, None, Vec::new());
+    loop {
+        let walked = walk(&mut demuxer, data, at);
+        if demuxer.config().is_none() {
+            walked?;
+            return Err(Error::bitstream(
+                data.len(),
+                "file",
+                "a moov box, found the end of the data",
+            ));
+        }
+        let short = walked.is_err() || demuxer.groups().len() < demuxer.index().len();
+        match (walked, missing(&demuxer, data.len()).filter(|_| short && !strict)) {
+            (walked, None) => return walked.map(|()| (demuxer, damage)),
+            (walked, Some(_)) if damage.len() >= LOST_MAX => return walked.map(|()| (demuxer, damage)),
+            (walked, Some((next, _))) if tried == Some(next) => {
+                let lost = || Error::bitstream(at, format!("group {next}"), "the fragment that the index tells of");
+                damage.push((next, walked.err().unwrap_or_else(lost)));
+                demuxer.replace_by_index(next);
+            }
+            (_, Some((next, _))) => demuxer.forget(next),
+        }
+        let Some((next, entry)) = missing(&demuxer, data.len()) else {
+            return Ok((demuxer, damage));
+        };
+        tried = Some(next);
+        at = entry.offset as usize;
+        demuxer.seek(entry.offset);
+    }
+}
+
+/// The first group that is not as the index tells, and its fragment, if the data has that.
+fn missing(demuxer: &Demuxer, size: usize) -> Option<(usize, Entry)> {
+    let differ = |(a, b): (&Entry, &Entry)| (a.start_frame, a.frames) != (b.start_frame, b.frames);
+    let groups = demuxer.groups();
+    let next = groups
+        .iter()
+        .zip(demuxer.index())
+        .position(differ)
+        .unwrap_or(groups.len());
+    let entry = demuxer.index().get(next)?;
+    (entry.offset.saturating_add(entry.size) <= size as u64).then_some((next, *entry))
+}
+
+fn walk(demuxer: &mut Demuxer, data: &[u8], mut at: usize) -> Result<()> {
+    while at < data.len() {
+        let left = data.len() - at;
+        let skip = usize::try_from(demuxer.skippable()).unwrap_or(usize::MAX).min(left);
+        if skip > 0 {
+            demuxer.skip(skip as u64);
+            at += skip;
+        } else {
+            let to = at + left.min(LOOK);
+            demuxer.push(&data[at..to])?;
+            at = to;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,141 @@
+//! The nodes nearest to points (spec 13.2), exactly: a run of points shares the few nodes that can be near any of them.
+//!
+//! Gaussians come in Morton order, so runs are compact. A node is of interest to a run if it is no farther from the box around
+//! it than enough nodes are from every point of the box. Where a hostile file makes boxes useless (all nodes on a sphere, all
+//! Gaussians around its centre) that is all nodes for all points, which the level caps (spec 5).
+//! Coordinates are below 2^21: sums of squares of their differences are exact in f64, which vectorizes.
+
+use crate::blend::NEIGHBORS_MAX;
+
+pub type Key = (u64, u32); // squared distance, index of the node
+const FAR: Key = (u64::MAX, u32::MAX);
+/// Most neighbours that are asked for: one more than there are weights.
+const NEAREST_MAX: usize = NEIGHBORS_MAX + 1;
+
+/// Coordinates of nodes, axis by axis.
+#[derive(Default)]
+struct Nodes([Vec<f64>; 3]);
+
+impl Nodes {
+    fn new(nodes: impl Iterator<Item = [f64; 3]>) -> Nodes {
+        let mut out = Nodes::default();
+        for n in nodes {
+            out.0.iter_mut().zip(n).for_each(|(axis, v)| axis.push(v));
+        }
+        out
+    }
+
+    fn get(&self, j: usize) -> [f64; 3] {
+        [0, 1, 2].map(|a| self.0[a][j])
+    }
+
+    /// Sums over the axes of the squares of `f` into `out`.
+    #[inline]
+    fn sums(&self, out: &mut Vec<f64>, f: impl Fn(usize, f64) -> f64) {
+        out.clear();
+        out.resize(self.0[0].len(), 0.0);
+        for (a, axis) in self.0.iter().enumerate() {
+            for (sum, v) in out.iter_mut().zip(axis) {
+                let d = f(a, *v);
+                *sum += d * d;
+            }
+        }
+    }
+}
+
+pub struct NodeSearch {
+    nodes: Nodes,
+    count: usize,
+}
+
+impl NodeSearch {
+    /// For the `count` nearest, 1 to `NEIGHBORS_MAX + 1`.
+    pub fn new(nodes: &[[u32; 3]], count: usize) -> Self {
+        NodeSearch {
+            nodes: Nodes::new(nodes.iter().map(|n| n.map(f64::from))),
+            count: count.clamp(1, NEAREST_MAX),
+        }
+    }
+
+    /// Calls `found` with the nearest nodes of each point by (squared distance, index); places beyond the number of nodes hold
+    /// the maximum.
+    pub fn run(&self, points: &[[u32; 3]], mut found: impl FnMut(&[Key])) {
+        let bounds = |a: usize| {
+            points
+                .iter()
+                .fold((u32::MAX, 0), |(l, h), p| (l.min(p[a]), h.max(p[a])))
+        };
+        let box_ = [0, 1, 2].map(bounds).map(|(l, h)| (f64::from(l), f64::from(h)));
+        let mut d = Vec::new();
+        self.nodes
+            .sums(&mut d, |a, v| (v - box_[a].0).abs().max((v - box_[a].1).abs()));
+        let mut farthest = [f64::INFINITY; NEAREST_MAX];
+        for d in &d {
+            insert(&mut farthest[..self.count], *d);
+        }
+        let reach = farthest[self.count - 1];
+        self.nodes
+            .sums(&mut d, |a, v| (box_[a].0 - v).max(v - box_[a].1).max(0.0));
+        let near: Vec<u32> = (0u32..).zip(&d).filter(|(_, d)| **d <= reach).map(|(j, _)| j).collect();
+        let few = Nodes::new(near.iter().map(|j| self.nodes.get(*j as usize)));
+        for p in points {
+            let p = p.map(f64::from);
+            few.sums(&mut d, |a, v| v - p[a]);
+            let mut best = [FAR; NEAREST_MAX];
+            for (d, j) in d.iter().zip(&near) {
+                if *d < best[self.count - 1].0 as f64 {
+                    insert(&mut best[..self.count], (*d as u64, *j));
+                }
+            }
+            found(&best[..self.count]);
+        }
+    }
+}
+
+/// Into a sorted list, whose last item goes.
+#[inline]
+fn insert<T: PartialOrd>(list: &mut [T], mut new: T) {
+    for item in list {
+        if new < *item {
+            std::mem::swap(&mut new, item);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::neighbors::distance;
+    use proptest::prelude::*;
+
+    /// Spec 13.2 as written.
+    fn brute_force(p: [u32; 3], nodes: &[[u32; 3]], count: usize) -> Vec<Key> {
+        let mut all: Vec<Key> = nodes.iter().map(|n| distance(p, *n)).zip(0..).collect();
+        all.sort_unstable();
+        all.resize(all.len().max(count), FAR);
+        all.truncate(count);
+        all
+    }
+
+    fn cloud(most: usize) -> impl Strategy<Value = Vec<[u32; 3]>> {
+        // crowded grids have ties and nodes on one point
+        prop_oneof![Just(2u32), Just(7), Just(100), Just(1 << 21)]
+            .prop_flat_map(move |side| proptest::collection::vec([0..side, 0..side, 0..side], 1..most))
+    }
+
+    proptest! {
+        #[test]
+        fn as_by_brute_force(nodes in cloud(1200), mut points in cloud(60), sorted: bool, count in 1..=NEAREST_MAX) {
+            points.extend(nodes.iter().step_by(100));
+            if sorted {
+                points.sort_by_key(|n| crate::morton::encode(*n));
+            }
+            let search = NodeSearch::new(&nodes, count);
+            for run in points.chunks(16) {
+                let mut wanted = run.iter().map(|p| brute_force(*p, &nodes, count));
+                search.run(run, |found| assert_eq!(Some(found.to_vec()), wanted.next()));
+                prop_assert!(wanted.next().is_none());
+            }
+        }
+    }
+}
