@@ -19,7 +19,7 @@ from gscodec.metrics.image import psnr
 from gscodec.render.image import render_image, render_rgba
 from gscodec.train.carve import carve, meeting_point, project
 from gscodec.train.finetune import GroupModel, laplace_bits
-from gscodec.train.graph import NodeGraph, quat_to_matrix, rotvec_to_quat
+from gscodec.train.graph import NodeGraph, Pose, quat_to_matrix, rotvec_to_quat
 from gscodec.train.keyframe import Statistics, grow, prune, train_keyframe
 from gscodec.train.model import from_gaussians
 from gscodec.train.motion import Tracker
@@ -144,13 +144,14 @@ def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
     graph = NodeGraph(x, 1.0, count=32)
     turn = rotvec_to_quat(torch.tensor([[0.3, -0.2, 0.5]])).repeat(len(graph), 1)
     R = quat_to_matrix(turn)
-    move = torch.einsum("nij,nj->ni", R, graph.nodes) + 1 - graph.nodes
-    means, turned = graph.carry(x, graph.nodes, turn, move)
+    nodes = torch.einsum("nij,nj->ni", R, graph.nodes) + 1
+    pose = dataclasses.replace(Pose.rest(graph), nodes=nodes, turned=turn)
+    means, turned = graph.carry(x, pose)
     np.testing.assert_allclose(means, x @ R[0].T + 1, atol=1e-5)
     np.testing.assert_allclose(turned, turn[:1].expand(200, 4), atol=1e-5)
-    assert graph.rigidity(graph.nodes, turn, move) < 1e-5
-    still = rotvec_to_quat(torch.zeros(len(graph), 3))
-    assert graph.rigidity(graph.nodes, still, 0.2 * graph.nodes) > 0.01
+    assert graph.rigidity(pose) < 1e-5
+    stretched = dataclasses.replace(Pose.rest(graph), nodes=1.2 * graph.nodes)
+    assert graph.rigidity(stretched) > 0.01
 
 
 def test_laplace_bits_are_code_lengths():

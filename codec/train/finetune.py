@@ -21,9 +21,8 @@ from gscodec.bitstream.transform import dct_basis
 from gscodec.gaussians import Gaussians
 from gscodec.render.workspace import Workspace
 from gscodec.train import keyframe
-from gscodec.train.graph import NodeGraph, quat_conjugate, quat_multiply
+from gscodec.train.graph import NodeGraph, Pose, quat_conjugate, quat_multiply
 from gscodec.train.model import Model
-from gscodec.train.motion import Pose
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, compare
 
@@ -80,8 +79,7 @@ class GroupModel:
         }
 
     def _carry(self, pose: Pose) -> tuple[torch.Tensor, torch.Tensor]:
-        nodes = self.graph.nodes
-        return self.graph.carry(self.key.params["means"], nodes, pose.turned, pose.nodes - nodes)
+        return self.graph.carry(self.key.params["means"], pose)
 
     def _project(self, tracked: list[Model]) -> dict[str, torch.Tensor]:
         """The tracked frames' lowest frequencies, minus what the nodes carry."""
@@ -146,7 +144,7 @@ def _mean_of(graph: NodeGraph, tracked: list[Model], poses: list[Pose]) -> Model
     mean = {n: torch.stack([m.params[n] for m in tracked]).mean(0) for n in first}
     total = torch.zeros_like(first["quats"])
     for model, pose in zip(tracked, poses, strict=True):
-        _, turned = graph.carry(first["means"], graph.nodes, pose.turned, pose.nodes - graph.nodes)
+        _, turned = graph.carry(first["means"], pose)
         back = quat_multiply(quat_conjugate(turned), model.params["quats"])
         total += back * torch.where((back * first["quats"]).sum(1, keepdim=True) < 0, -1.0, 1.0)
     quats = torch.nn.functional.normalize(total, dim=1)

@@ -6,6 +6,8 @@ tracking optimises the nodes, so a smooth motion is smooth by construction and c
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 
@@ -46,6 +48,22 @@ def quat_to_matrix(q: torch.Tensor) -> torch.Tensor:
     return torch.stack(rows, 1).view(-1, 3, 3)
 
 
+@dataclass
+class Pose:
+    """Where the nodes are (`nodes` [M, 3]), how far they `turned` since the keyframe ([M, 4]), and their last step."""
+
+    nodes: torch.Tensor
+    turned: torch.Tensor
+    turn: torch.Tensor  # [M, 3] rotation vector of the last step
+    move: torch.Tensor  # [M, 3]
+
+    @staticmethod
+    def rest(graph: NodeGraph) -> Pose:
+        """The keyframe's."""
+        zero = torch.zeros_like(graph.nodes)
+        return Pose(graph.nodes, rotvec_to_quat(zero), zero, zero)
+
+
 class NodeGraph:
     """Nodes of a keyframe and the weights by which they carry its Gaussians.
 
@@ -79,30 +97,30 @@ class NodeGraph:
     def __len__(self) -> int:
         return len(self.nodes)
 
-    def carry(self, x: torch.Tensor, nodes: torch.Tensor, turn: torch.Tensor, move: torch.Tensor):
-        """Points moved by the nodes' rigid motions, blended (spec 13.3).
+    def carry(self, x: torch.Tensor, pose: Pose) -> tuple[torch.Tensor, torch.Tensor]:
+        """Points of the keyframe moved by the nodes' rigid motions, blended (spec 13.3).
 
         Args:
-            x: [N, 3] where the Gaussians are; nodes: [M, 3] where the nodes are.
-            turn: [M, 4] unit wxyz and move: [M, 3], the motion of each node about itself.
+            x: [N, 3], in the keyframe.
 
         Returns:
             means [N, 3] and the blended rotation [N, 4] unit wxyz.
         """
-        R = quat_to_matrix(turn)
-        offset = nodes + move - torch.einsum("mij,mj->mi", R, nodes)
-        rows = torch.cat([R.flatten(1), offset, turn], 1)
+        R = quat_to_matrix(pose.turned)
+        offset = pose.nodes - torch.einsum("mij,mj->mi", R, self.nodes)
+        rows = torch.cat([R.flatten(1), offset, pose.turned], 1)
         blend = (rows[self.index] * self.weight).sum(1)
         means = torch.einsum("nij,nj->ni", blend[:, :9].view(-1, 3, 3), x) + blend[:, 9:12]
         return means, torch.nn.functional.normalize(blend[:, 12:], dim=1)
 
-    def rigidity(self, nodes: torch.Tensor, turn: torch.Tensor, move: torch.Tensor) -> torch.Tensor:
+    def rigidity(self, pose: Pose) -> torch.Tensor:
         """Mean weighted length by which the edges between nodes miss their rotated selves (Sorkine and Alexa 2007)."""
         if self._edges.numel() == 0:
-            return move.sum() * 0
-        edge = nodes[self._edges] - nodes[:, None]
-        meant = torch.einsum("mij,mkj->mki", quat_to_matrix(turn), edge) + move[:, None]
-        return (self._hold * (meant - edge - move[self._edges])).square().sum(2).add(1e-12).sqrt().mean()
+            return pose.nodes.sum() * 0
+        edge = self.nodes[self._edges] - self.nodes[:, None]
+        turned = torch.einsum("mij,mkj->mki", quat_to_matrix(pose.turned), edge)
+        missed = turned - (pose.nodes[self._edges] - pose.nodes[:, None])
+        return (self._hold * missed).square().sum(2).add(1e-12).sqrt().mean()
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:

@@ -12,13 +12,13 @@ there is none: the nodes are what the stream can carry.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 import torch
 
 from gscodec.render.workspace import Workspace
-from gscodec.train.graph import NodeGraph, quat_conjugate, quat_multiply, rotvec_to_quat
+from gscodec.train.graph import NodeGraph, Pose, quat_conjugate, quat_multiply, rotvec_to_quat
 from gscodec.train.model import NAMES, Model
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, compare
@@ -33,28 +33,16 @@ RATES = {"quats": 6e-4, "log_scales": 6e-3, "logit_opacities": 2e-2, "sh0": 5e-2
 MEANS_RATE = 3e-4  # radii
 
 
-@dataclass
-class Pose:
-    """Where the nodes are (`nodes` [M, 3]), how far they `turned` since the keyframe ([M, 4]), and their last step."""
-
-    nodes: torch.Tensor
-    turned: torch.Tensor
-    turn: torch.Tensor  # [M, 3] rotation vector of the last step
-    move: torch.Tensor  # [M, 3]
-
-    @staticmethod
-    def rest(graph: NodeGraph) -> Pose:
-        """The keyframe's."""
-        zero = torch.zeros_like(graph.nodes)
-        return Pose(graph.nodes, rotvec_to_quat(zero), zero, zero)
-
-
 class Tracker:
     """Follows the Gaussians of a keyframe through the frames after it.
 
     Args:
         key: the keyframe's Gaussians.
         radius: of the subject, world units.
+
+    Attributes:
+        own: the Gaussians as they would be in the keyframe's pose; `means` is what they moved besides the nodes.
+        pose: the nodes in the last frame.
     """
 
     def __init__(self, key: Model, views: Views, settings: TrainSettings, radius: float):
@@ -62,8 +50,19 @@ class Tracker:
         self.settings = replace(settings, mask_lambda=MASK_LAMBDA * settings.mask_lambda)
         self.graph = NodeGraph(key.params["means"], radius)
         self.pose = Pose.rest(self.graph)
-        self.model = Model(key.params)
-        self._workspace = Workspace()
+        self.own = Model({**key.params, "means": torch.zeros_like(key.params["means"])})
+        self.workspace = Workspace()
+
+    def carried(self, own: Model, pose: Pose) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """Attributes in the frame of `pose`, and how far the nodes have turned each Gaussian, [N, 4]."""
+        means, turned = self.graph.carry(self.graph.means, pose)
+        quats = quat_multiply(turned, own.params["quats"])
+        return {**own.params, "means": means + own.params["means"], "quats": quats}, turned
+
+    @property
+    def model(self) -> Model:
+        """The Gaussians in the last frame."""
+        return Model(self.carried(self.own, self.pose)[0])
 
     def advance(self, frame: int, on_step: Callable[[int, float], None] | None = None) -> float:
         """Moves model and pose on to `frame`, the next one; returns the image loss at the end, without the mask's."""
@@ -76,32 +75,36 @@ class Tracker:
             losses.append(fit.step(self.views.draw(frame, scale), 0.1 ** (step / steps)))
             if on_step:
                 on_step(step, losses[-1])
-        self.model, self.pose = fit.result()
+        self.own, self.pose = fit.result()
         return float(np.mean(losses[-LOSS_WINDOW:]))
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays, for a checkpoint."""
-        model = {f"tracked.{n}": p.numpy() for n, p in self.model.params.items()}
+        own = {f"own.{n}": p.numpy() for n, p in self.own.params.items()}
         pose = {f"pose.{f.name}": getattr(self.pose, f.name).numpy() for f in fields(Pose)}
-        return {"radius": np.array(self.radius), "key_means": self.graph.means.numpy(), **model, **pose}
+        return {"radius": np.array(self.radius), "key_means": self.graph.means.numpy(), **own, **pose}
 
     @staticmethod
     def restored(state: dict[str, np.ndarray], views: Views, settings: TrainSettings) -> Tracker:
         """Inverse of `state`."""
-        model = Model({n: torch.from_numpy(state[f"tracked.{n}"]) for n in NAMES})
+        own = Model({n: torch.from_numpy(state[f"own.{n}"]) for n in NAMES})
         tracker = Tracker(
-            Model({**model.params, "means": torch.from_numpy(state["key_means"])}),
+            Model({**own.params, "means": torch.from_numpy(state["key_means"])}),
             views,
             settings,
             float(state["radius"]),
         )
-        tracker.model = model
+        tracker.own = own
         tracker.pose = Pose(*(torch.from_numpy(state[f"pose.{f.name}"]) for f in fields(Pose)))
         return tracker
 
 
 class _Fit:
-    """The optimisation of one frame, from constant velocity."""
+    """The optimisation of one frame, from constant velocity.
+
+    Means are always the keyframe's, carried by the whole motion since, plus what each Gaussian moved besides: what the
+    stream can say with nodes is said with nodes, and does not creep into the Gaussians step by step.
+    """
 
     def __init__(self, tracker: Tracker, rng: np.random.Generator):
         self.t, self.rng = tracker, rng
@@ -109,44 +112,34 @@ class _Fit:
         self.move = tracker.pose.move.clone().requires_grad_()
         rates = [(self.turn, TURN_RATE), (self.move, MOVE_RATE * tracker.radius)]
         self.optimizer = torch.optim.Adam([{"params": [p], "base": r} for p, r in rates], betas=(0.9, 0.99), fused=True)
-        self.own = Model(tracker.model.params)  # the Gaussians' own attributes, before they are carried
-        self.place = Model({**tracker.model.params, "means": torch.zeros_like(tracker.model.params["means"])})
+        self.own = Model(tracker.own.params)
 
-    def _carried(self):
-        means, turned = self.t.graph.carry(
-            self.t.model.params["means"], self.t.pose.nodes, rotvec_to_quat(self.turn), self.move
-        )
-        return means + self.place.params["means"], turned
+    def _pose(self) -> Pose:
+        pose, turn = self.t.pose, rotvec_to_quat(self.turn)
+        turned = torch.nn.functional.normalize(quat_multiply(turn, pose.turned), dim=1)
+        return Pose(pose.nodes + self.move, turned, self.turn, self.move)
 
     def step(self, target, fade: float) -> float:
         """One view; rates times `fade`."""
-        t, graph = self.t, self.t.graph
-        means, turned = self._carried()
-        quats = quat_multiply(turned, self.own.params["quats"])
-        params = {**self.own.params, "means": means, "quats": quats}
-        result = compare(params, target, t.settings, self.rng, t._workspace)
+        t, pose = self.t, self._pose()
+        params, turned = t.carried(self.own, pose)
+        result = compare(params, target, t.settings, self.rng, t.workspace)
         grads = result.grads
-        rigid = t.settings.rigidity * graph.rigidity(t.pose.nodes, rotvec_to_quat(self.turn), self.move)
+        rigid = t.settings.rigidity * t.graph.rigidity(pose)
         for g in self.optimizer.param_groups:
             g["lr"] = g["base"] * fade
         self.optimizer.zero_grad()
-        torch.autograd.backward([means, quats, rigid], [grads["means"], grads["quats"], torch.ones(())])
+        heads, seeds = [params["means"], params["quats"], rigid], [grads["means"], grads["quats"], torch.ones(())]
+        torch.autograd.backward(heads, seeds)
         self.optimizer.step()
         back = quat_multiply(quat_conjugate(turned.detach()), grads["quats"])
-        self.own.adam({**grads, "quats": back}, {n: r * fade for n, r in RATES.items()})
-        self.place.adam(grads, {"means": MEANS_RATE * t.radius * fade})
+        rates = {"means": MEANS_RATE * t.radius, **RATES}
+        self.own.adam({**grads, "quats": back}, {n: r * fade for n, r in rates.items()})
         return result.loss - t.settings.mask_lambda * result.mask
 
     @torch.no_grad()
     def result(self) -> tuple[Model, Pose]:
-        """The moved Gaussians and nodes."""
-        means, turned = self._carried()
-        quats = quat_multiply(turned, torch.nn.functional.normalize(self.own.params["quats"], dim=1))
-        pose, turn = self.t.pose, self.turn.detach()
-        moved = Pose(
-            pose.nodes + self.move.detach(),
-            torch.nn.functional.normalize(quat_multiply(rotvec_to_quat(turn), pose.turned), dim=1),
-            turn,
-            self.move.detach(),
-        )
-        return Model({**self.own.params, "means": means, "quats": quats}), moved
+        """The Gaussians' own attributes and the nodes."""
+        quats = torch.nn.functional.normalize(self.own.params["quats"], dim=1)
+        pose = self._pose()
+        return Model({**self.own.params, "quats": quats}), Pose(*(getattr(pose, f.name).detach() for f in fields(Pose)))

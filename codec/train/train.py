@@ -20,9 +20,10 @@ from gscodec.errors import CaptureError
 from gscodec.gaussians import Group
 from gscodec.train.carve import carve, random_box
 from gscodec.train.finetune import GroupModel, finetune
+from gscodec.train.graph import Pose
 from gscodec.train.keyframe import train_keyframe
 from gscodec.train.model import NAMES, Model, from_points
-from gscodec.train.motion import Pose, Tracker
+from gscodec.train.motion import Tracker
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views
 
@@ -199,7 +200,7 @@ class _Run:
         track = _Track([], [])
         if self.subject is not None:
             self._follow(frames, track)
-        parents = np.arange(len(self.subject.tracker.model), dtype=np.int32) if track.models else None
+        parents = np.arange(len(self.subject.tracker.own), dtype=np.int32) if track.models else None
         if not track.models:  # nothing to follow, or lost at once
             self.subject = self._keyframe(frames[0])
             track.add(self.subject.tracker)
