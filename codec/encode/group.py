@@ -18,8 +18,9 @@ from gscodec.camera import Camera
 from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
 from gscodec.encode.importance import Importance, measure, steps_for_error
-from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes
+from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes, rebase
 from gscodec.gaussians import Gaussians, Group
+from gscodec.gaussians import Nodes as GivenNodes
 
 GRID_BITS_MAX = 21
 PRUNE = 0.3  # a Gaussian goes if the picture without it errs by less than this share of the error per coded Gaussian
@@ -178,9 +179,10 @@ def code_group(
     source = np.arange(len(turn)) if keep_all else np.flatnonzero(measured.removal >= PRUNE * error / max(len(turn), 1))
     nominal = steps_for(quality, subject_radius(s.means[middle]))
     steps = _steps(s.take(source), measured.take(source), error, nominal)
-    grid = Grid(s.means[middle, source], float(steps["means"][0]))
-    source = source[_native.morton_order(grid.to_integers(s.means[middle, source]))]
-    nodes, x, quats = _rest_pose(s.take(source), middle, grid, nominal.node_translation)
+    rest = middle if group.nodes is None else 0
+    grid = Grid(s.means[rest, source], float(steps["means"][0]))
+    source = source[_native.morton_order(grid.to_integers(s.means[rest, source]))]
+    nodes, x, quats = _rest_pose(s.take(source), rest, grid, nominal.node_translation, group.nodes)
     positions = grid.to_integers(x)
     order = _native.morton_order(positions)
     layer = layer_of(prominence(s.take(source[order])), layers)
@@ -252,14 +254,19 @@ def _steps(s: Stack, measured: Importance, error: float, nominal: Steps) -> dict
     return steps_for_error(measured.weights, values, error, subject_radius(s.means[middle]))
 
 
-def _rest_pose(s: Stack, middle: int, grid: Grid, node_step: float) -> tuple[Nodes | None, np.ndarray, np.ndarray]:
-    """Nodes, and the means [N, 3] and quaternions [N, 4] that they carry nearest to all frames: what jitters in the
-    middle frame, which is in Morton order, is not the canonical of all."""
-    positions = grid.to_integers(s.means[middle])
+def _rest_pose(
+    s: Stack, rest: int, grid: Grid, node_step: float, given: GivenNodes | None
+) -> tuple[Nodes | None, np.ndarray, np.ndarray]:
+    """Nodes, and the means [N, 3] and quaternions [N, 4] that they carry nearest to all frames: what jitters in frame
+    `rest`, which is in Morton order, is not the canonical of all. Nodes that are `given` rest in the first frame."""
+    positions = grid.to_integers(s.means[rest])
     x, frames = grid.to_world(positions), len(s.means)
     if frames == 1 or not len(x):
-        return None, s.means[middle], s.quats[middle]
-    nodes = choose_nodes(positions, x, s.means, grid.step, node_step, grid.to_world)
+        return None, s.means[rest], s.quats[rest]
+    if given is None:
+        nodes = choose_nodes(positions, x, s.means, grid.step, node_step, grid.to_world)
+    else:
+        nodes = given_nodes(rebase(given), x, node_step, grid)
     if nodes is None:
         means, quats = s.means.mean(0, dtype=np.float64), s.quats.mean(0)
     else:

@@ -16,6 +16,7 @@ import numpy as np
 from gscodec import _native
 from gscodec.bitstream.quantization import trajectory_step
 from gscodec.bitstream.transform import dct_basis
+from gscodec.gaussians import Nodes as GivenNodes
 
 NEIGHBORS = 4  # nodes that a Gaussian blends
 NODE_COUNTS = (1, 16, 64, 256, 1024)
@@ -166,9 +167,7 @@ def fit_nodes(grid_positions: np.ndarray, x: np.ndarray, means: np.ndarray, seed
     transposed = blend.matrix.T.tocsr()
     mass = np.asarray(transposed.sum(1)).ravel() + 1e-9
     frames, m = len(means), len(nodes)
-    # An error of one rotation step at the usual distance from a node moves a Gaussian by one translation step.
-    lever = np.sqrt(((x - nodes[blend.index[:, 0]]) ** 2).sum(1).mean())
-    rotation_step = float(np.float32(min(step / max(lever, 1e-12), 0.1)))
+    rotation_step = _rotation_step(step, np.linalg.norm(x - nodes[blend.index[:, 0]], axis=1))
     rotations, translations = np.zeros((2, frames, m, 3))
     near = np.zeros((m, 3))
     for t in range(frames):
@@ -190,6 +189,47 @@ def fit_nodes(grid_positions: np.ndarray, x: np.ndarray, means: np.ndarray, seed
     translations = flat(np.tensordot(basis.T, q_translations * step, 1))
     moved = (blend.matrix @ translations).reshape(-1, frames, 3)
     return fitted, rotated + np.moveaxis(moved, 1, 0)
+
+
+def given_nodes(given: GivenNodes, x: np.ndarray, step: float, grid) -> Nodes:
+    """The nodes that a trainer knows, quantized.
+
+    Args:
+        x: [N, 3], world positions of the Gaussians in the pose in which the nodes rest.
+        step: of the translations, world units; grid: the lattice of positions.
+    """
+    from scipy.spatial import cKDTree
+
+    positions, first = np.unique(grid.to_integers(given.positions), axis=0, return_index=True)
+    order = _native.morton_order(positions)
+    positions, first = positions[order], first[order]
+    places = grid.to_world(positions)
+    rotation_step = _rotation_step(step, cKDTree(places).query(x)[0])
+    basis = dct_basis(len(given.rotations))
+    moved = given.translations[:, first] + (given.positions[first] - places)  # the node is at rest on the grid
+    coefficients = (
+        quantize_trajectory(given.rotations[:, first], basis, rotation_step),
+        quantize_trajectory(moved, basis, step),
+    )
+    return Nodes(positions, places, trim(np.concatenate(coefficients, 2).transpose(0, 2, 1)), rotation_step, step)
+
+
+def _rotation_step(step: float, distance: np.ndarray) -> float:
+    """Radians: an error of one rotation step at the usual distance from a node moves a Gaussian by one `step`."""
+    lever = np.sqrt((distance**2).mean()) if len(distance) else 0.0
+    return float(np.float32(min(step / max(lever, 1e-12), 0.1)))
+
+
+def rebase(given: GivenNodes) -> GivenNodes:
+    """The same motions with nodes that rest in the first frame."""
+    from scipy.spatial.transform import Rotation
+
+    back = Rotation.from_rotvec(given.rotations[0]).inv()
+    rotations, near = np.zeros_like(given.rotations), np.zeros_like(given.rotations[0])
+    for t, r in enumerate(given.rotations):
+        near = rotations[t] = matrix_to_rotvec((Rotation.from_rotvec(r) * back).as_matrix(), near)
+    first = given.translations[:1]
+    return GivenNodes(given.positions + first[0], rotations, given.translations - first)
 
 
 def carry(nodes: Nodes, grid_positions: np.ndarray, x: np.ndarray, frames: int) -> NodeMotion:

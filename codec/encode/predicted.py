@@ -29,7 +29,7 @@ from gscodec.encode.group import (
     prominence,
     stack_group,
 )
-from gscodec.encode.motion import NodeMotion, Nodes, carry, choose_nodes
+from gscodec.encode.motion import NodeMotion, Nodes, carry, choose_nodes, given_nodes
 from gscodec.gaussians import Group
 
 REBIRTH = 8.0  # times PRUNE: what the reference left out must matter so much more to come back
@@ -72,7 +72,7 @@ def predict_group(
     positions = reference.integers["positions"][known]
     old = align_axes(old, middle, reference.turn[known], reference.order[known])
     x = grid.to_world(positions)
-    nodes = choose_nodes(positions, x, old.means, grid.step, reference.node_step, grid.to_world) if len(known) else None
+    nodes = _nodes(group, positions, x, old.means, reference) if len(known) else None
     motion = nodes and carry(nodes, positions, x, len(s.means))
     places = _carry_back(new.means[middle], x, nodes, motion, middle, grid)
     order = _native.morton_order(places)
@@ -105,6 +105,14 @@ def predict_group(
     }
     price = rdo.bit_price(error_for(quality), max(len(positions), 1))
     return out | motion_integers(s, channels, steps, measured, price, grid.to_world(positions), nodes, motion)
+
+
+def _nodes(group: Group, positions, x: np.ndarray, means: np.ndarray, reference: Coded) -> Nodes | None:
+    """The trainer's nodes, which rest where the reference does, or what fits the means [T, N, 3]."""
+    if group.nodes is not None:
+        return given_nodes(group.nodes, x, reference.node_step, reference.grid)
+    grid = reference.grid
+    return choose_nodes(positions, x, means, grid.step, reference.node_step, grid.to_world)
 
 
 def _coded_parents(parents: np.ndarray, source: np.ndarray) -> np.ndarray:

@@ -18,10 +18,10 @@ import torch
 from gscodec.bitstream.color import STEP_WEIGHTS
 from gscodec.bitstream.quantization import Steps, trajectory_step
 from gscodec.bitstream.transform import dct_basis
-from gscodec.gaussians import Gaussians
+from gscodec.gaussians import Gaussians, Nodes
 from gscodec.render.workspace import Workspace
 from gscodec.train import keyframe
-from gscodec.train.graph import NodeGraph, Pose, quat_conjugate, quat_multiply
+from gscodec.train.graph import NodeGraph, Pose, quat_conjugate, quat_multiply, quat_to_rotvec
 from gscodec.train.model import Model
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, compare
@@ -70,6 +70,7 @@ class GroupModel:
         self.fixed = key is not None
         self.key = key or _mean_of(graph, tracked, poses)
         self.basis = torch.from_numpy(dct_basis(len(tracked))).float()  # [T, T]
+        self.canonical_steps = {n: getattr(steps, n) for n in ("log_scales", "quats", "logit_opacities", "sh0")}
         self.unit = {name: trajectory_step(getattr(steps, name), len(tracked)) for name in FREQUENCIES}
         self.unit["sh0"] *= float(STEP_WEIGHTS[0])  # Y, Co, Cg share one step; RGB errors add up over them
         self.means, self.turned = zip(*(self._carry(p) for p in poses), strict=True)
@@ -105,9 +106,16 @@ class GroupModel:
         c = rounded(self.coefficients[name])
         return self.unit[name] * torch.einsum("k,knc->nc", self.basis[: len(c), t], c)
 
-    def frame(self, t: int) -> dict[str, torch.Tensor]:
-        """Attributes of frame `t`; differentiable in the coefficients."""
+    def _relaxed(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
+        """Canonical attributes with uniform noise in place of their quantization."""
+        noise = lambda p: torch.rand(p.shape, generator=generator) - 0.5  # noqa: E731
         p = self.key.params
+        return p | {n: p[n] + step * noise(p[n]) for n, step in self.canonical_steps.items()}
+
+    def frame(self, t: int, generator: torch.Generator | None = None) -> dict[str, torch.Tensor]:
+        """Attributes of frame `t`, with noise on the canonical ones if there is a generator; differentiable in the
+        coefficients."""
+        p = self.key.params if generator is None or self.fixed else self._relaxed(generator)
         means = self.means[t] if self.fixed else self._carry(self.poses[t])[0]
         dq = self.residual("quats", t)
         w = (1 - dq.square().sum(1, keepdim=True)).clamp(min=1e-6).sqrt()
@@ -132,6 +140,16 @@ class GroupModel:
     def model(self, t: int) -> Model:
         """Frame `t` as a model."""
         return Model(self.frame(t))
+
+    def nodes(self) -> Nodes:
+        """The carrying motion, for the encoder."""
+        rotations, near = [], None
+        for pose in self.poses:
+            near = quat_to_rotvec(pose.turned, near)
+            rotations.append(near)
+        translations = [pose.nodes - self.graph.nodes for pose in self.poses]
+        arrays = (self.graph.nodes, torch.stack(rotations), torch.stack(translations))
+        return Nodes(*(a.numpy().astype(np.float32) for a in arrays))
 
     def gaussians(self, t: int) -> Gaussians:
         """Frame `t` in numpy."""
@@ -170,7 +188,7 @@ class _Finetuner:
         for g in self.optimizer.param_groups:
             g["lr"] = g["base"] * fade
         group, names = self.group, list(self.group.coefficients)
-        params = group.frame(t)
+        params = group.frame(t, self.noise)
         target = self.views.draw(self.frames[t])
         result = compare(params, target, self.settings, self.rng, self.workspace)
         heads, seeds = [params[n] for n in names], [result.grads[n] for n in names]

@@ -37,6 +37,17 @@ def rotvec_to_quat(v: torch.Tensor) -> torch.Tensor:
     return torch.cat([torch.cos(half), v * 0.5 * torch.sinc(half / torch.pi)], 1)
 
 
+def quat_to_rotvec(q: torch.Tensor, near: torch.Tensor | None = None) -> torch.Tensor:
+    """[N, 4] unit wxyz -> [N, 3] radians, of the equal ones the nearest to `near` (no jumps over time)."""
+    q = q * torch.where(q[:, :1] < 0, -1.0, 1.0)
+    sine = q[:, 1:].norm(dim=1, keepdim=True)
+    axis = q[:, 1:] / sine.clamp(min=1e-12)
+    angle = 2 * torch.atan2(sine, q[:, :1])
+    if near is not None:
+        angle = angle + 2 * torch.pi * torch.round(((near * axis).sum(1, keepdim=True) - angle) / (2 * torch.pi))
+    return axis * angle
+
+
 def quat_to_matrix(q: torch.Tensor) -> torch.Tensor:
     """[N, 4] unit wxyz -> [N, 3, 3]."""
     w, x, y, z = q.unbind(1)

@@ -30,7 +30,7 @@ TURN_RATE, MOVE_RATE = 2e-2, 3e-3  # of the nodes: radians, radii
 MASK_LAMBDA = 3.0  # the silhouette counts more than in a keyframe: it does not depend on light
 # The Gaussians' own: what light changes is quick, place and shape are slow, so that the nodes take the motion.
 RATES = {"quats": 6e-4, "log_scales": 6e-3, "logit_opacities": 2e-2, "sh0": 5e-2, "shN": 2.5e-3}
-MEANS_RATE = 3e-4  # radii
+MEANS_RATE = 3e-5  # radii
 
 
 class Tracker:

@@ -213,7 +213,7 @@ class _Run:
             return Group([subject.canonical.gaussians()])
         model = self._finetuned(subject, done, track)
         subject.canonical = model.key
-        return Group([model.gaussians(t) for t in range(len(done))], parents=parents)
+        return Group([model.gaussians(t) for t in range(len(done))], nodes=model.nodes(), parents=parents)
 
     def _keyframe(self, frame: int) -> Subject:
         s = self.settings
