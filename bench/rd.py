@@ -1,8 +1,8 @@
 """Size, quality and time of gscodec and its peers on the same sequences: bench/results/rd.json, entry by entry.
 
 The size is all that decoding needs, side information and container included; the quality is the codec PSNR of
-`gscodec eval` on every fifth frame; times are of one run on frames in memory, encoding without training and decoding
-to float attributes. A peer's order of Gaussians is made once for its whole curve and not timed, in its favour.
+`gscodec eval` on every fifth frame. Times are of frames in memory: encoding without training (one run), decoding to
+float attributes (median of 3). The order of Gaussians that a peer makes once for its whole curve is not timed.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from gscodec.bench.baselines import BASELINES
 from gscodec.bench.machine import commit, write_result
@@ -24,10 +26,12 @@ from gscodec.metrics import bd_rate, evaluate_splats, rising
 from gscodec.metrics.bd_rate import shared_psnr
 
 OURS = "gscodec"
-QUALITIES = (20, 30, 40, 50, 60, 70, 80, 90)
+QUALITIES = (20, 30, 40, 50, 60, 70, 80, 90, 100)
 CODECS = (OURS, *BASELINES)
+DECODE_RUNS = 3
 EVERY = 5  # frames between those whose PSNR is measured
 ANCHORS = {"videogs": (39, 45), "videogs-raw": (39, 45), "x265": (39, 52)}  # and the PSNR over which BD-rate is taken
+ONE_POINT = ("sog", "spz")
 VIDEO = ("videogs", "videogs-raw", "x265", "svt-av1", "gsav")  # these pack SH degree 0 and want more than one frame
 
 Groups = list[list[Gaussians]]
@@ -73,11 +77,23 @@ def _ours(sequence: GaussianSequence, groups: Groups, picked: list[int], setting
         start = time.perf_counter()
         inputs = lambda done, _: iter([Group(g) for g in groups[done:]])  # noqa: E731
         report = encode_groups(inputs, out, config, EncodeSettings(**setting), fingerprint={})
-        middle = time.perf_counter()
-        stream = open_stream(out)
-        decoded = [stream.frame(t) for t in range(stream.frame_count)]
-        end = time.perf_counter()
-    return report.bytes, len(decoded), middle - start, end - middle, decoded.__getitem__
+        encode_s = time.perf_counter() - start
+        decoded, decode_s = _timed_decoding(lambda: _frames(out))
+    return report.bytes, len(decoded), encode_s, decode_s, decoded.__getitem__
+
+
+def _frames(path: Path) -> list[Gaussians]:
+    stream = open_stream(path)
+    return [stream.frame(t) for t in range(stream.frame_count)]
+
+
+def _timed_decoding(decode: Callable[[], list[Gaussians]]) -> tuple[list[Gaussians], float]:
+    seconds = []
+    for _ in range(DECODE_RUNS):
+        start = time.perf_counter()
+        decoded = decode()
+        seconds.append(time.perf_counter() - start)
+    return decoded, float(np.median(seconds))
 
 
 def _baseline(codec: str) -> Callable:
@@ -91,13 +107,12 @@ def _baseline(codec: str) -> Callable:
             baseline.prepare(group[0])
         start = time.perf_counter()
         coded = [baseline.encode(group, **setting) for group in groups]
-        middle = time.perf_counter()
-        decoded = [frame for files in coded for frame in baseline.decode(files)]
-        end = time.perf_counter()
+        encode_s = time.perf_counter() - start
+        decoded, decode_s = _timed_decoding(lambda: [frame for files in coded for frame in baseline.decode(files)])
         numbers = picked if baseline.per_frame else range(len(frames))
         by_number = dict(zip(numbers, decoded, strict=True))
         size = sum(len(data) for files in coded for data in files.values())
-        return size, len(decoded), middle - start, end - middle, by_number.__getitem__
+        return size, len(decoded), encode_s, decode_s, by_number.__getitem__
 
     return run
 
@@ -105,13 +120,14 @@ def _baseline(codec: str) -> Callable:
 def update(path: Path, entries: Iterable[dict]) -> Iterator[dict]:
     """Puts entries into a result file as they come, each in the place of an older one of the same setting.
 
-    Yields the entries; the BD-rates are those of the whole file.
+    Yields the entries; BD-rates and shares are those of the whole file.
     """
     stored: list[dict] = json.loads(path.read_text())["entries"] if path.exists() else []
     for entry in entries:
         key = lambda e: (e["sequence"], e["codec"], e["setting"])  # noqa: E731
         stored = sorted([*(e for e in stored if key(e) != key(entry)), entry], key=_place)
-        write_result(path, {"settings": {"psnr_every": EVERY}, "entries": stored, "bd_rate": bd_rates(stored)})
+        derived = {"bd_rate": bd_rates(stored), "shares": shares(stored)}
+        write_result(path, {"settings": {"psnr_every": EVERY}, "entries": stored, **derived})
         yield entry
 
 
@@ -132,6 +148,24 @@ def bd_rates(entries: Sequence[dict]) -> list[dict]:
                 continue
             span = shared_psnr(curves[anchor], curves[OURS], within)
             found.append({"sequence": name, "anchor": anchor, "percent": round(percent, 2), "psnr": span})
+    return found
+
+
+def shares(entries: Sequence[dict]) -> list[dict]:
+    """gscodec's size of single frames at the PSNR of the peers that have one point, log size linear in PSNR between.
+
+    `kb` is None where the curve does not reach that PSNR.
+    """
+    found = []
+    for name in SINGLE:
+        ours = rising(_points(entries, name, OURS))
+        for peer in ONE_POINT:
+            for kb, psnr in _points(entries, name, peer):
+                own = None
+                if ours and ours[0][1] <= psnr <= ours[-1][1]:
+                    own = float(np.exp(np.interp(psnr, [p[1] for p in ours], np.log([p[0] for p in ours]))))
+                    own = round(own, 3)
+                found.append({"sequence": name, "peer": peer, "psnr": psnr, "kb": own, "peer_kb": kb})
     return found
 
 
