@@ -11,6 +11,7 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,8 +35,6 @@ ANCHORS = {"videogs": (39, 45), "videogs-raw": (39, 45), "x265": (39, 52)}  # an
 ONE_POINT = ("sog", "spz")
 VIDEO = ("videogs", "videogs-raw", "x265", "svt-av1", "gsav")  # these pack SH degree 0 and want more than one frame
 
-Groups = list[list[Gaussians]]
-
 
 def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[dict]:
     """Yields the entries of a codec's curve on one sequence.
@@ -46,7 +45,7 @@ def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[
     if sequence_name in SINGLE and codec in VIDEO:
         return
     sequence = open_case(sequence_name, data, work)
-    groups = [[group.visible(t) for t in range(len(group))] for group in sequence.groups]
+    groups = [replace(group, frames=[group.visible(t) for t in range(len(group))]) for group in sequence.groups]
     picked = list(range(0, sequence.frame_count, EVERY))
     settings = {f"quality {q}": {"quality": q} for q in QUALITIES} if codec == OURS else BASELINES[codec].settings
     for name, setting in settings.items():
@@ -61,21 +60,21 @@ def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[
             "codec_psnr": round(quality, 3),
             "encode_s_per_frame": round(encode_s / frames, 4),
             "decode_ms_per_frame": round(1000 * decode_s / frames, 2),
-            "gaussians": len(groups[0][0]),
+            "gaussians": len(sequence.frame(0)),
             "commit": commit(),
         }
 
 
-def _ours(sequence: GaussianSequence, groups: Groups, picked: list[int], setting: dict):
+def _ours(sequence: GaussianSequence, groups: list[Group], picked: list[int], setting: dict):
     """(bytes, frames, seconds of encoding, of decoding, frame -> Gaussians)."""
-    first, longest = groups[0][0], max(map(len, groups))
+    first, longest = groups[0].frames[0], max(map(len, groups))
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder, "rd.gsv")
         config = stream_config(
-            fps=sequence.fps, sh_degree=first.sh_degree, gaussians=max(len(g[0]) for g in groups), frames=longest
+            fps=sequence.fps, sh_degree=first.sh_degree, gaussians=max(len(g.frames[0]) for g in groups), frames=longest
         )
         start = time.perf_counter()
-        inputs = lambda done, _: iter([Group(g) for g in groups[done:]])  # noqa: E731
+        inputs = lambda done, _: iter(groups[done:])  # noqa: E731
         report = encode_groups(inputs, out, config, EncodeSettings(**setting), fingerprint={})
         encode_s = time.perf_counter() - start
         decoded, decode_s = _timed_decoding(lambda: _frames(out))
@@ -99,14 +98,13 @@ def _timed_decoding(decode: Callable[[], list[Gaussians]]) -> tuple[list[Gaussia
 def _baseline(codec: str) -> Callable:
     baseline = BASELINES[codec]
 
-    def run(_: GaussianSequence, groups: Groups, picked: list[int], setting: dict):
-        frames = [frame for group in groups for frame in group]
-        if baseline.per_frame:
-            groups = [[frames[t]] for t in picked]
-        for group in groups:
-            baseline.prepare(group[0])
+    def run(_: GaussianSequence, groups: list[Group], picked: list[int], setting: dict):
+        frames = [frame for group in groups for frame in group.frames]
+        parts = [[frames[t]] for t in picked] if baseline.per_frame else [group.frames for group in groups]
+        for part in parts:
+            baseline.prepare(part[0])
         start = time.perf_counter()
-        coded = [baseline.encode(group, **setting) for group in groups]
+        coded = [baseline.encode(part, **setting) for part in parts]
         encode_s = time.perf_counter() - start
         decoded, decode_s = _timed_decoding(lambda: [frame for files in coded for frame in baseline.decode(files)])
         numbers = picked if baseline.per_frame else range(len(frames))
