@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.bench.baselines import BASELINES
+from gscodec.bench.baselines import BASELINES, Baseline
 from gscodec.bench.machine import commit, write_result
 from gscodec.bench.sequences import SINGLE, open_case
 from gscodec.decode import open_stream
@@ -35,6 +35,8 @@ ANCHORS = {"videogs": (39, 45), "videogs-raw": (39, 45), "x265": (39, 52)}  # an
 ONE_POINT = ("sog", "spz")
 VIDEO = ("videogs", "videogs-raw", "x265", "svt-av1", "gsav")  # these pack SH degree 0 and want more than one frame
 
+Coded = tuple[int, int, float, float, Callable[[int], Gaussians]]
+
 
 def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[dict]:
     """Yields the entries of a codec's curve on one sequence.
@@ -45,12 +47,14 @@ def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[
     if sequence_name in SINGLE and codec in VIDEO:
         return
     sequence = open_case(sequence_name, data, work)
-    groups = [replace(group, frames=[group.visible(t) for t in range(len(group))]) for group in sequence.groups]
+    groups = [replace(group, frames=list(group.frames)) for group in sequence.groups]
     picked = list(range(0, sequence.frame_count, EVERY))
     settings = {f"quality {q}": {"quality": q} for q in QUALITIES} if codec == OURS else BASELINES[codec].settings
     for name, setting in settings.items():
-        run = _ours if codec == OURS else _baseline(codec)
-        size, frames, encode_s, decode_s, decoded = run(sequence, groups, picked, setting)
+        if codec == OURS:
+            size, frames, encode_s, decode_s, decoded = _ours(sequence, groups, setting)
+        else:
+            size, frames, encode_s, decode_s, decoded = _peer(BASELINES[codec], groups, picked, setting)
         quality = evaluate_splats(decoded, sequence, picked)["codec_psnr"]
         yield {
             "sequence": sequence_name,
@@ -65,7 +69,7 @@ def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[
         }
 
 
-def _ours(sequence: GaussianSequence, groups: list[Group], picked: list[int], setting: dict):
+def _ours(sequence: GaussianSequence, groups: list[Group], setting: dict) -> Coded:
     """(bytes, frames, seconds of encoding, of decoding, frame -> Gaussians)."""
     first, longest = groups[0].frames[0], max(map(len, groups))
     with tempfile.TemporaryDirectory() as folder:
@@ -95,24 +99,21 @@ def _timed_decoding(decode: Callable[[], list[Gaussians]]) -> tuple[list[Gaussia
     return decoded, float(np.median(seconds))
 
 
-def _baseline(codec: str) -> Callable:
-    baseline = BASELINES[codec]
-
-    def run(_: GaussianSequence, groups: list[Group], picked: list[int], setting: dict):
-        frames = [frame for group in groups for frame in group.frames]
-        parts = [[frames[t]] for t in picked] if baseline.per_frame else [group.frames for group in groups]
-        for part in parts:
-            baseline.prepare(part[0])
-        start = time.perf_counter()
-        coded = [baseline.encode(part, **setting) for part in parts]
-        encode_s = time.perf_counter() - start
-        decoded, decode_s = _timed_decoding(lambda: [frame for files in coded for frame in baseline.decode(files)])
-        numbers = picked if baseline.per_frame else range(len(frames))
-        by_number = dict(zip(numbers, decoded, strict=True))
-        size = sum(len(data) for files in coded for data in files.values())
-        return size, len(decoded), encode_s, decode_s, by_number.__getitem__
-
-    return run
+def _peer(baseline: Baseline, groups: list[Group], picked: list[int], setting: dict) -> Coded:
+    """The same of a peer; frames that are coded alone are those of `picked`."""
+    shown = [[group.visible(t) for t in range(len(group))] for group in groups]
+    numbers = range(sum(map(len, shown)))
+    if baseline.per_frame:
+        numbers, frames = picked, [frame for group in shown for frame in group]
+        shown = [[frames[t]] for t in picked]
+    for frames in shown:
+        baseline.prepare(frames[0])
+    start = time.perf_counter()
+    coded = [baseline.encode(frames, **setting) for frames in shown]
+    encode_s = time.perf_counter() - start
+    decoded, decode_s = _timed_decoding(lambda: [frame for files in coded for frame in baseline.decode(files)])
+    size = sum(len(data) for files in coded for data in files.values())
+    return size, len(decoded), encode_s, decode_s, dict(zip(numbers, decoded, strict=True)).__getitem__
 
 
 def update(path: Path, entries: Iterable[dict]) -> Iterator[dict]:
