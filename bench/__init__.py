@@ -1,4 +1,4 @@
 """Measurements: a benchmark writes JSON with machine, commit and settings, and charts are drawn from that JSON alone.
 
-`raster` is behind `gscodec bench raster`; `run` measures the whole pipeline; results/ and charts/ are published.
+`raster` and `rd` are behind `gscodec bench`; `run` measures the whole pipeline; results/ and charts/ are published.
 """

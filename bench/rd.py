@@ -1,8 +1,8 @@
 """Size, quality and time of gscodec and its peers on the same sequences: bench/results/rd.json, entry by entry.
 
 The size is all that decoding needs, side information and container included; the quality is the codec PSNR of
-`gscodec eval` on every fifth frame; times are of one run on frames in memory, encoding without training and decoding
-to float attributes. A peer's order of Gaussians is made once for its whole curve and not timed, in its favour.
+`gscodec eval` on every fifth frame. Times are of frames in memory: encoding without training (one run), decoding to
+float attributes (median of 3). The order of Gaussians that a peer makes once for its whole curve is not timed.
 """
 
 from __future__ import annotations
@@ -11,9 +11,12 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from gscodec.bench.baselines import BASELINES
+import numpy as np
+
+from gscodec.bench.baselines import BASELINES, Baseline
 from gscodec.bench.machine import commit, write_result
 from gscodec.bench.sequences import SINGLE, open_case
 from gscodec.decode import open_stream
@@ -24,13 +27,15 @@ from gscodec.metrics import bd_rate, evaluate_splats, rising
 from gscodec.metrics.bd_rate import shared_psnr
 
 OURS = "gscodec"
-QUALITIES = (20, 30, 40, 50, 60, 70, 80, 90)
+QUALITIES = (20, 30, 40, 50, 60, 70, 80, 90, 100)
 CODECS = (OURS, *BASELINES)
+DECODE_RUNS = 3
 EVERY = 5  # frames between those whose PSNR is measured
 ANCHORS = {"videogs": (39, 45), "videogs-raw": (39, 45), "x265": (39, 52)}  # and the PSNR over which BD-rate is taken
+ONE_POINT = ("sog", "spz")
 VIDEO = ("videogs", "videogs-raw", "x265", "svt-av1", "gsav")  # these pack SH degree 0 and want more than one frame
 
-Groups = list[list[Gaussians]]
+Coded = tuple[int, int, float, float, Callable[[int], Gaussians]]
 
 
 def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[dict]:
@@ -42,12 +47,14 @@ def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[
     if sequence_name in SINGLE and codec in VIDEO:
         return
     sequence = open_case(sequence_name, data, work)
-    groups = [[group.visible(t) for t in range(len(group))] for group in sequence.groups]
+    groups = [replace(group, frames=list(group.frames)) for group in sequence.groups]
     picked = list(range(0, sequence.frame_count, EVERY))
     settings = {f"quality {q}": {"quality": q} for q in QUALITIES} if codec == OURS else BASELINES[codec].settings
     for name, setting in settings.items():
-        run = _ours if codec == OURS else _baseline(codec)
-        size, frames, encode_s, decode_s, decoded = run(sequence, groups, picked, setting)
+        if codec == OURS:
+            size, frames, encode_s, decode_s, decoded = _ours(sequence, groups, setting)
+        else:
+            size, frames, encode_s, decode_s, decoded = _peer(BASELINES[codec], groups, picked, setting)
         quality = evaluate_splats(decoded, sequence, picked)["codec_psnr"]
         yield {
             "sequence": sequence_name,
@@ -57,61 +64,69 @@ def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[
             "codec_psnr": round(quality, 3),
             "encode_s_per_frame": round(encode_s / frames, 4),
             "decode_ms_per_frame": round(1000 * decode_s / frames, 2),
-            "gaussians": len(groups[0][0]),
+            "gaussians": len(sequence.frame(0)),
             "commit": commit(),
         }
 
 
-def _ours(sequence: GaussianSequence, groups: Groups, picked: list[int], setting: dict):
+def _ours(sequence: GaussianSequence, groups: list[Group], setting: dict) -> Coded:
     """(bytes, frames, seconds of encoding, of decoding, frame -> Gaussians)."""
-    first, longest = groups[0][0], max(map(len, groups))
+    first, longest = groups[0].frames[0], max(map(len, groups))
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder, "rd.gsv")
         config = stream_config(
-            fps=sequence.fps, sh_degree=first.sh_degree, gaussians=max(len(g[0]) for g in groups), frames=longest
+            fps=sequence.fps, sh_degree=first.sh_degree, gaussians=max(len(g.frames[0]) for g in groups), frames=longest
         )
         start = time.perf_counter()
-        inputs = lambda done, _: iter([Group(g) for g in groups[done:]])  # noqa: E731
+        inputs = lambda done, _: iter(groups[done:])  # noqa: E731
         report = encode_groups(inputs, out, config, EncodeSettings(**setting), fingerprint={})
-        middle = time.perf_counter()
-        stream = open_stream(out)
-        decoded = [stream.frame(t) for t in range(stream.frame_count)]
-        end = time.perf_counter()
-    return report.bytes, len(decoded), middle - start, end - middle, decoded.__getitem__
+        encode_s = time.perf_counter() - start
+        decoded, decode_s = _timed_decoding(lambda: _frames(out))
+    return report.bytes, len(decoded), encode_s, decode_s, decoded.__getitem__
 
 
-def _baseline(codec: str) -> Callable:
-    baseline = BASELINES[codec]
+def _frames(path: Path) -> list[Gaussians]:
+    stream = open_stream(path)
+    return [stream.frame(t) for t in range(stream.frame_count)]
 
-    def run(_: GaussianSequence, groups: Groups, picked: list[int], setting: dict):
-        frames = [frame for group in groups for frame in group]
-        if baseline.per_frame:
-            groups = [[frames[t]] for t in picked]
-        for group in groups:
-            baseline.prepare(group[0])
+
+def _timed_decoding(decode: Callable[[], list[Gaussians]]) -> tuple[list[Gaussians], float]:
+    seconds = []
+    for _ in range(DECODE_RUNS):
         start = time.perf_counter()
-        coded = [baseline.encode(group, **setting) for group in groups]
-        middle = time.perf_counter()
-        decoded = [frame for files in coded for frame in baseline.decode(files)]
-        end = time.perf_counter()
-        numbers = picked if baseline.per_frame else range(len(frames))
-        by_number = dict(zip(numbers, decoded, strict=True))
-        size = sum(len(data) for files in coded for data in files.values())
-        return size, len(decoded), middle - start, end - middle, by_number.__getitem__
+        decoded = decode()
+        seconds.append(time.perf_counter() - start)
+    return decoded, float(np.median(seconds))
 
-    return run
+
+def _peer(baseline: Baseline, groups: list[Group], picked: list[int], setting: dict) -> Coded:
+    """The same of a peer; frames that are coded alone are those of `picked`."""
+    shown = [[group.visible(t) for t in range(len(group))] for group in groups]
+    numbers = range(sum(map(len, shown)))
+    if baseline.per_frame:
+        numbers, frames = picked, [frame for group in shown for frame in group]
+        shown = [[frames[t]] for t in picked]
+    for frames in shown:
+        baseline.prepare(frames[0])
+    start = time.perf_counter()
+    coded = [baseline.encode(frames, **setting) for frames in shown]
+    encode_s = time.perf_counter() - start
+    decoded, decode_s = _timed_decoding(lambda: [frame for files in coded for frame in baseline.decode(files)])
+    size = sum(len(data) for files in coded for data in files.values())
+    return size, len(decoded), encode_s, decode_s, dict(zip(numbers, decoded, strict=True)).__getitem__
 
 
 def update(path: Path, entries: Iterable[dict]) -> Iterator[dict]:
     """Puts entries into a result file as they come, each in the place of an older one of the same setting.
 
-    Yields the entries; the BD-rates are those of the whole file.
+    Yields the entries; BD-rates and shares are those of the whole file.
     """
     stored: list[dict] = json.loads(path.read_text())["entries"] if path.exists() else []
     for entry in entries:
         key = lambda e: (e["sequence"], e["codec"], e["setting"])  # noqa: E731
         stored = sorted([*(e for e in stored if key(e) != key(entry)), entry], key=_place)
-        write_result(path, {"settings": {"psnr_every": EVERY}, "entries": stored, "bd_rate": bd_rates(stored)})
+        derived = {"bd_rate": bd_rates(stored), "shares": shares(stored)}
+        write_result(path, {"settings": {"psnr_every": EVERY}, "entries": stored, **derived})
         yield entry
 
 
@@ -132,6 +147,24 @@ def bd_rates(entries: Sequence[dict]) -> list[dict]:
                 continue
             span = shared_psnr(curves[anchor], curves[OURS], within)
             found.append({"sequence": name, "anchor": anchor, "percent": round(percent, 2), "psnr": span})
+    return found
+
+
+def shares(entries: Sequence[dict]) -> list[dict]:
+    """gscodec's size of single frames at the PSNR of the peers that have one point, log size linear in PSNR between.
+
+    `kb` is None where the curve does not reach that PSNR.
+    """
+    found = []
+    for name in SINGLE:
+        ours = rising(_points(entries, name, OURS))
+        for peer in ONE_POINT:
+            for kb, psnr in _points(entries, name, peer):
+                own = None
+                if ours and ours[0][1] <= psnr <= ours[-1][1]:
+                    own = float(np.exp(np.interp(psnr, [p[1] for p in ours], np.log([p[0] for p in ours]))))
+                    own = round(own, 3)
+                found.append({"sequence": name, "peer": peer, "psnr": psnr, "kb": own, "peer_kb": kb})
     return found
 
 

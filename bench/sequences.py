@@ -1,4 +1,4 @@
-"""The sequences and frames that codecs are measured on; made once, then kept in a work folder.
+"""The sequences and frames that codecs are measured on; made once and kept in a work folder, until it is deleted.
 
 statue: a scanned statue that moves (20 frames, 101,275 Gaussians), by the data folder's tools/animate_splat.py.
 lumberjack: 20 frames of the captured character, trained with the preset fast. statue-0, playbot and fruit are single

@@ -15,6 +15,7 @@ pytest.importorskip("zstandard")
 from gscodec.bench.baselines import BASELINES
 from gscodec.bench.baselines.grid import grid_order
 from gscodec.bench.rd import OURS, bd_rates, measure, update
+from gscodec.metrics.charts import draw_charts
 from gscodec.splats import write_splat
 
 KEYS = {"sequence", "codec", "setting", "kb_per_frame", "codec_psnr", "encode_s_per_frame", "decode_ms_per_frame"}
@@ -82,3 +83,18 @@ def test_entries_replace_older_ones_and_bd_rates_follow(tmp_path):
     assert result["bd_rate"][0]["percent"] == pytest.approx(-95)
     assert {"machine", "commit", "settings"} <= set(result)
     assert bd_rates(ours) == []
+
+
+def test_charts_of_a_small_result(tmp_path):
+    pytest.importorskip("matplotlib")
+    entries = [entry(c, str(i), k * 2**i, 40.0 + 2 * i) for c, k in ((OURS, 10), ("videogs", 99)) for i in range(4)]
+    everywhere = [{**e, "sequence": s} for e in entries for s in ("statue", "lumberjack", "fruit")]
+    single = {**entry("sog", "default", 60.0, 43.0), "sequence": "fruit"}
+    list(update(tmp_path / "rd.json", [*everywhere, single]))
+    (share,) = json.loads((tmp_path / "rd.json").read_text())["shares"]
+    assert share["kb"] == pytest.approx(10 * 2**1.5, abs=0.01)
+    written = draw_charts(tmp_path, tmp_path / "charts")
+    assert sorted(p.name for p in written) == [
+        f"rd_{name}.{ending}" for name in ("frames", "size", "time") for ending in ("png", "svg")
+    ]
+    assert all("gscodec" in p.read_text() for p in written if p.suffix == ".svg")

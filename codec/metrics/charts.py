@@ -1,4 +1,4 @@
-"""Charts from results: every .json in a folder that has a chart becomes NAME.svg and NAME.png. matplotlib draws."""
+"""Charts from results: every .json in a folder that has charts becomes their .svg and .png. matplotlib draws."""
 
 from __future__ import annotations
 
@@ -6,9 +6,14 @@ import json
 from pathlib import Path
 
 from gscodec.errors import UsageError, require
+from gscodec.metrics.rd_chart import frames_chart, size_chart, time_chart
 from gscodec.metrics.speed_chart import speed_chart
 
-CHARTS = {"raster": speed_chart}  # result file without .json -> function(result) that returns a matplotlib Figure
+CHARTS = {  # result file without .json -> chart -> function(result) that returns a matplotlib Figure
+    "raster": {"raster": speed_chart},
+    "rd": {"rd_size": size_chart, "rd_time": time_chart, "rd_frames": frames_chart},
+}
+STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 
 
 def draw_charts(results: Path, charts: Path) -> list[Path]:
@@ -27,12 +32,12 @@ def draw_charts(results: Path, charts: Path) -> list[Path]:
     Path(charts).mkdir(parents=True, exist_ok=True)
     written = []
     for path in found:
-        # a fixed salt and no date: the same results give the same bytes
-        with rc_context(
-            {"svg.hashsalt": path.stem, "font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
-        ):
-            figure = CHARTS[path.stem](json.loads(path.read_text()))
-            for suffix, options in ((".svg", {"metadata": {"Date": None}}), (".png", {"dpi": 110})):
-                written.append(Path(charts) / (path.stem + suffix))
-                figure.savefig(written[-1], bbox_inches="tight", **options)
+        result = json.loads(path.read_text())
+        for name, draw in CHARTS[path.stem].items():
+            # a fixed salt and no date: the same results give the same bytes
+            with rc_context({"svg.hashsalt": name, "svg.fonttype": "none", **STYLE}):
+                figure = draw(result)
+                for suffix, options in ((".svg", {"metadata": {"Date": None}}), (".png", {"dpi": 110})):
+                    written.append(Path(charts) / (name + suffix))
+                    figure.savefig(written[-1], bbox_inches="tight", **options)
     return written
