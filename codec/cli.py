@@ -124,15 +124,22 @@ def train(
 
 @app.command()
 def decode(
-    stream: Stream, folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the .ply files go.")]
+    stream: Stream,
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the .ply files go.")],
+    drc: Annotated[bool, typer.Option("--drc", help="Only the points, as Draco files.")] = False,
 ) -> None:
     """Stream to one standard 3DGS .ply per frame."""
     from gscodec.decode import open_stream
-    from gscodec.splats import write_sequence
+    from gscodec.splats import write_sequence, write_splat
 
     s = open_stream(stream)
     _warn_if_cut(s)
-    write_sequence(s.sequence(), folder)
+    if drc:
+        folder.mkdir(parents=True, exist_ok=True)
+        for t in range(s.frame_count):
+            write_splat(folder / f"{t:06d}.drc", s.frame(t))
+    else:
+        write_sequence(s.sequence(), folder)
     _out.print(f"{folder}: {s.frame_count} frames")
 
 
