@@ -59,6 +59,9 @@ def encode(
     seq: Sequence,
     out: Stream,
     quality: Quality = 50.0,
+    bitrate: Annotated[
+        str | None, typer.Option(metavar="RATE", help="Bits per second instead of a quality: 8M, 500k.")
+    ] = None,
     preset: Preset = "medium",
     frames: Frames = None,
     gop: Gop = 20,
@@ -75,7 +78,7 @@ def encode(
     from gscodec.progress import Bar
 
     with Bar() as bar:
-        settings = EncodeSettings(quality, keep_all, random_access, layers)
+        settings = EncodeSettings(quality, _bits(bitrate), keep_all, random_access, layers)
         result = encode_input(seq, out, settings, preset=preset, frames=frames, gop=gop, bar=bar)
     if report:
         report.write_text(json.dumps(result.to_json(), indent=1))
@@ -89,6 +92,16 @@ def encode(
     if result.interrupted:
         print("stopped early: the file holds the groups done, the same command goes on", file=sys.stderr)
         raise typer.Exit(130)
+
+
+def _bits(rate: str | None) -> float | None:
+    """Bits per second of "8M", "500k" or "250000"."""
+    if rate is None:
+        return None
+    try:
+        return float(rate.rstrip("kM")) * {"k": 1e3, "M": 1e6}.get(rate[-1:], 1.0)
+    except ValueError:
+        raise UsageError(f"--bitrate {rate}: expected bits per second, such as 8M, 500k or 250000") from None
 
 
 @app.command()
@@ -111,15 +124,22 @@ def train(
 
 @app.command()
 def decode(
-    stream: Stream, folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the .ply files go.")]
+    stream: Stream,
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the .ply files go.")],
+    drc: Annotated[bool, typer.Option("--drc", help="Only the points, as Draco files.")] = False,
 ) -> None:
     """Stream to one standard 3DGS .ply per frame."""
     from gscodec.decode import open_stream
-    from gscodec.splats import write_sequence
+    from gscodec.splats import write_sequence, write_splat
 
     s = open_stream(stream)
     _warn_if_cut(s)
-    write_sequence(s.sequence(), folder)
+    if drc:
+        folder.mkdir(parents=True, exist_ok=True)
+        for t in range(s.frame_count):
+            write_splat(folder / f"{t:06d}.drc", s.frame(t))
+    else:
+        write_sequence(s.sequence(), folder)
     _out.print(f"{folder}: {s.frame_count} frames")
 
 

@@ -72,6 +72,7 @@ def _encode_splats(source, out, settings, frames, gop, bar) -> EncodeReport:
         out,
         config,
         settings,
+        cameras=cameras,
         fingerprint={"input": str(source.resolve()), "frames": frames, "gop": gop, **asdict(settings)},
         on_group=lambda r: bar.update("encode", r.frames, total),
     )
@@ -135,6 +136,7 @@ def _encode_capture(source, out, settings, preset, frames, gop, bar) -> EncodeRe
         out,
         config,
         settings,
+        cameras=capture.cameras,
         fingerprint={"input": str(source.resolve()), "frames": frames, **asdict(recipe), **asdict(settings)},
     )
     if not report.interrupted:

@@ -112,6 +112,14 @@ def test_higher_quality_costs_more_and_errs_less(tmp_path):
     assert errors == sorted(errors, reverse=True)
 
 
+def test_bitrate_is_met_over_the_file(tmp_path):
+    groups = [turning(400, frames=t).groups[0] for t in (4, 6, 2, 4)]
+    sequence = turning().with_groups(groups)
+    for kilobytes in (0.5, 0.9):
+        report = write(sequence, tmp_path / f"{kilobytes}.gsv", bitrate=kilobytes * 8000 * 25)
+        assert report.bytes / 16 / 1000 == pytest.approx(kilobytes, rel=0.05)
+
+
 def test_what_nobody_sees_is_dropped_unless_all_is_to_be_kept(tmp_path):
     g = blob(100)
     faint = g.logit_opacities.copy()
@@ -283,6 +291,8 @@ def test_a_part_cut_anywhere_keeps_its_whole_groups(tmp_path):
 def test_settings_out_of_range_are_refused():
     with pytest.raises(UsageError, match="quality 101"):
         EncodeSettings(quality=101)
+    with pytest.raises(UsageError, match="bitrate 0"):
+        EncodeSettings(bitrate=0)
 
 
 def test_report_is_json(tmp_path):

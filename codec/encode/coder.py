@@ -5,7 +5,7 @@ The coder remembers the last independent group as it was coded, and where the Ga
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,7 +29,7 @@ class CodedGroup:
     independent: bool
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Reference:
     coded: Coded
     decoded: object  # _native.DecodedGroup
@@ -40,35 +40,34 @@ class _Reference:
 
 
 class GroupCoder:
-    """Codes groups in their order.
+    """Codes groups in their order. A shallow copy is a coder of its own, for trying.
 
     Args:
-        quality, keep_all, layers, cameras: as in `code_group`.
+        keep_all, layers, cameras: as in `code_group`.
         random_access: frames from one independent group to the next at most; 0 or 1: every group is independent.
     """
 
-    def __init__(self, *, quality: float, keep_all: bool, layers: int, random_access: int, cameras: list[Camera] = ()):
-        self._options = {"quality": quality, "keep_all": keep_all, "cameras": cameras}
+    def __init__(self, *, keep_all: bool, layers: int, random_access: int, cameras: list[Camera] = ()):
+        self._options = {"keep_all": keep_all, "cameras": cameras}
         self._layers = layers
         self._random_access, self._reference = random_access, None
 
-    def code(self, group: Group) -> CodedGroup:
+    def code(self, group: Group, quality: float) -> CodedGroup:
         """Raises CaptureError: its parents do not fit the group before."""
         parents, r = self._parents(group), self._reference
         if parents is None or r.frames + len(group) > self._random_access:
-            return self._independent(group)
-        integers = predict_group(group, parents, r.back, r.coded, **self._options)
+            return self._independent(group, quality)
+        integers = predict_group(group, parents, r.back, r.coded, quality=quality, **self._options)
         payload, units = _native.encode_group(integers, r.decoded)
         if len(payload) > DOUBT * r.bytes:
-            other = self._independent(group)
+            other = self._independent(group, quality)
             if len(other.payload) <= len(payload):
                 return other
-            self._reference = r
-        r.frames, r.back, r.index = r.frames + len(group), r.back + 1, parents
+        self._reference = replace(r, frames=r.frames + len(group), back=r.back + 1, index=parents)
         return CodedGroup(payload, units, len(integers["positions"]), False)
 
-    def _independent(self, group: Group) -> CodedGroup:
-        coded = code_group(group, layers=self._layers, **self._options)
+    def _independent(self, group: Group, quality: float) -> CodedGroup:
+        coded = code_group(group, quality, layers=self._layers, **self._options)
         payload, units = _native.encode_group(coded.integers)
         if self._random_access > len(group):
             decoded = _native.DecodedGroup(payload, len(_native.levels()))

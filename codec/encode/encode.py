@@ -16,6 +16,7 @@ import numpy as np
 from gscodec.bitstream.levels import smallest_level
 from gscodec.camera import Camera
 from gscodec.encode.coder import CodedGroup, GroupCoder
+from gscodec.encode.rate import RateControl
 from gscodec.encode.writer import StreamWriter
 from gscodec.errors import UsageError
 from gscodec.gaussians import Group
@@ -29,6 +30,7 @@ class EncodeSettings:
 
     Attributes:
         quality: 0 (small) to 100 (fine); 50 is about 41 dB against the input.
+        bitrate: bits per second that the whole file is to have, instead of one quality; None: `quality` it is.
         keep_all: also code Gaussians that are never visible.
         random_access: frames from one independent group to the next at most; the groups between are predicted from it
             where their parents are known and it is cheaper. 0 or 1: every group is independent.
@@ -36,6 +38,7 @@ class EncodeSettings:
     """
 
     quality: float = 50.0
+    bitrate: float | None = None
     keep_all: bool = False
     random_access: int = 60
     layers: int = 1
@@ -43,6 +46,8 @@ class EncodeSettings:
     def __post_init__(self):
         if not 0 <= self.quality <= 100:
             raise UsageError(f"--quality {self.quality:g} is out of range, expected 0 (small) to 100 (fine)")
+        if self.bitrate is not None and not self.bitrate > 0:
+            raise UsageError(f"--bitrate {self.bitrate:g} is out of range, expected bits per second above 0")
         if self.random_access < 0:
             raise UsageError(f"--random-access {self.random_access} is out of range, expected 0 frames or more")
         if not 1 <= self.layers <= LAYERS_MAX:
@@ -116,24 +121,23 @@ def encode_groups(
     settings: EncodeSettings,
     *,
     fingerprint: dict,
+    cameras: list[Camera] = (),
     on_group: Callable[[EncodeReport], None] | None = None,
 ) -> EncodeReport:
     """Writes `out` from the groups that `groups(done, frames)` yields: those after the `done` groups, `frames` frames,
-    that an earlier run left in the file.
+    that an earlier run left in the file. `cameras`: those of the capture; from those for training, too, it is measured
+    what the Gaussians matter.
 
     Ctrl-C finishes the file with the groups done and returns with `interrupted` set; the next run goes on.
     """
     writer = StreamWriter(out, config, fingerprint)
     coder = GroupCoder(
-        quality=settings.quality,
         keep_all=settings.keep_all,
         layers=settings.layers,
         random_access=settings.random_access,
-        cameras=[
-            Camera(c["name"], np.array(c["K"]), np.array(c["viewmat"]), c["width"], c["height"])
-            for c in config["cameras"]
-        ],
+        cameras=[c for c in cameras if c.split == "train"],
     )
+    rate = RateControl(settings.bitrate, config["fps"], settings.quality) if settings.bitrate else None
     report = EncodeReport(seconds={"input": 0.0, "code": 0.0})
     clock = time.perf_counter
     try:
@@ -141,7 +145,10 @@ def encode_groups(
         for group in groups(writer.groups, writer.frames):
             report.seconds["input"] += clock() - mark
             mark = clock()
-            coded = coder.code(group)
+            if rate:
+                coder, coded = rate.code(coder, group, writer.frames, writer.bytes)
+            else:
+                coded = coder.code(group, settings.quality)
             report.seconds["code"] += clock() - mark
             writer.append(coded.payload, len(group), sync=coded.independent)
             _account(report, writer, coded)

@@ -7,17 +7,18 @@ from pathlib import Path
 from gscodec.errors import CaptureError, UsageError
 from gscodec.gaussians import Gaussians
 from gscodec.splats.compressed_ply import gaussians_of_compressed, is_compressed, write_compressed_ply
+from gscodec.splats.drc import read_drc, write_drc
 from gscodec.splats.ply import gaussians_of, sh_count, write_ply
 from gscodec.splats.ply_table import read_header, read_table
 from gscodec.splats.sog import SH_BANDS, read_sog, read_sog_meta, write_sog
 
-ENDINGS = (".ply", ".compressed.ply", ".sog")
-EXPECTED = ".ply (3DGS or SuperSplat compressed), .sog or an unpacked SOG folder (meta.json)"
+ENDINGS = (".ply", ".compressed.ply", ".sog", ".drc")
+EXPECTED = ".ply (3DGS or SuperSplat compressed), .sog or an unpacked SOG folder (meta.json), .drc (points only)"
 
 
 def is_splat(path: Path) -> bool:
     """Whether `path` looks like one frame: a known ending or an unpacked SOG folder."""
-    return path.suffix.lower() in (".ply", ".sog") or (path / "meta.json").is_file() or path.name == "meta.json"
+    return path.suffix.lower() in (".ply", ".sog", ".drc") or (path / "meta.json").is_file() or path.name == "meta.json"
 
 
 def read_splat(path: str | Path) -> Gaussians:
@@ -25,13 +26,15 @@ def read_splat(path: str | Path) -> Gaussians:
 
     Raises:
         CaptureError: the format is not known or the file is missing or damaged.
-        UsageError: the format needs a library of the `encode` extra (only .sog does).
+        UsageError: the format needs a library of the `encode` extra (.sog and .drc do).
     """
     path = Path(path)
     if not path.exists():
         raise CaptureError(f"{path}: no such file, expected a splat: {EXPECTED}")
     if not is_splat(path):
         raise CaptureError(f"{path}: not a known splat format, expected {EXPECTED}")
+    if path.suffix.lower() == ".drc":
+        return read_drc(path)
     if path.suffix.lower() != ".ply":
         return read_sog(path)
     table = read_table(path)
@@ -49,12 +52,14 @@ def splat_size(path: Path) -> tuple[int, int]:
         count, dtype = elements.get("vertex", (0, None))
         names = elements["sh"][1].names if "sh" in elements else dtype.names if dtype else ()
         return count, sh_count(names or (), path)
+    if path.suffix.lower() == ".drc":
+        return len(read_drc(path)), 0  # it does not say before it is decoded
     meta, _ = read_sog_meta(path)
     return int(meta.get("count", 0)), SH_BANDS.get(meta.get("shN", {}).get("bands", 0), 0)
 
 
 def write_splat(path: str | Path, gaussians: Gaussians) -> None:
-    """Writes one frame in the format of the name's ending: .ply, .compressed.ply, .sog or .../meta.json.
+    """Writes one frame in the format of the name's ending: .ply, .compressed.ply, .sog, .../meta.json or .drc.
 
     Raises:
         UsageError: the ending is unknown.
@@ -66,5 +71,7 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> None:
         write_ply(path, gaussians)
     elif path.suffix.lower() == ".sog" or path.name == "meta.json":
         write_sog(path, gaussians)
+    elif path.suffix.lower() == ".drc":
+        write_drc(path, gaussians)
     else:
         raise UsageError(f"{path}: cannot tell the format from the name, expected {', '.join(ENDINGS)} or meta.json")

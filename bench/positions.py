@@ -1,0 +1,82 @@
+"""Positions beside Draco's kd-tree coder, bits per Gaussian at equal steps -> bench/results/positions.json.
+
+usage: GSCODEC_DATA=... python bench/positions.py [NAME=SPLAT ...]   (other splats besides those of the data folder)
+
+Both coders get the same integers, as a set: points of the grid that Draco quantizes to with so many bits. DracoPy 2,
+compression level 10, order free. Ours is the positions unit of a stream.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import DracoPy
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+from bench.machine import write_result
+from gscodec import _native
+from gscodec.splats import open_sequence
+
+BITS = (9, 10, 11, 12, 13, 14)
+SCENES = {"statue": "splats/statue.ply", "playbot": "splats/playbot.ply", "fruit": "splats/fruit.ply", "wave": "wave"}
+RESULT = Path(__file__).parent / "results" / "positions.json"
+
+
+def ours(positions: np.ndarray) -> int:
+    """Bytes of the positions unit."""
+    empty = {"steps": [1.0], "offsets": [0.0]}
+    channels = {
+        name: {k: v * count for k, v in empty.items()} | {"values": np.zeros((count, len(positions)), np.int32)}
+        for name, count in (("log_scales", 3), ("quats", 3), ("logit_opacities", 1), ("sh0", 3))
+    }
+    order = _native.morton_order(positions)
+    group = {
+        "frames": 1,
+        "origin": [0.0, 0.0, 0.0],
+        "grid_step": 1.0,
+        "grid_bits": max(1, int(positions.max()).bit_length()),
+        "layers": [len(positions)],
+        "positions": positions[order],
+        "channels": channels,
+        "trajectories": {},
+    }
+    _, units = _native.encode_group(group)
+    return next(u["bytes"] for u in units if u["type"] == "positions")
+
+
+def compare(name: str, means: np.ndarray, bits: int) -> dict:
+    """One row of the table."""
+    extent = float((means.max(0) - means.min(0)).max())
+    step = extent / (2**bits - 1)
+    positions = np.rint((means - means.min(0)) / step).astype(np.uint32)
+    draco = DracoPy.encode(means, quantization_bits=bits, compression_level=10, preserve_order=False)
+    per = 8 / len(means)
+    a, b = ours(positions) * per, len(draco) * per
+    return {
+        "scene": name,
+        "gaussians": len(means),
+        "bits_per_axis": bits,
+        "step": step,
+        "ours": round(a, 2),
+        "draco": round(b, 2),
+        "saved": round(1 - a / b, 3),
+    }
+
+
+def main() -> None:
+    """Writes the table."""
+    data = Path(os.environ["GSCODEC_DATA"])
+    scenes = {n: data / p for n, p in SCENES.items()} | dict(a.split("=", 1) for a in sys.argv[1:])
+    rows = []
+    for name, path in scenes.items():
+        means = np.unique(open_sequence(Path(path)).frame(0).means, axis=0)
+        rows += [compare(name, means, bits) for bits in BITS]
+    write_result(RESULT, {"rows": rows})
+    print(*rows, sep="\n")
+
+
+if __name__ == "__main__":
+    main()
