@@ -296,6 +296,35 @@ def bench_rd(
         _out.print(f"{r['sequence']:<11}BD-rate against {r['anchor']:<12}{r['percent']:7.1f} %, {span}")
 
 
+@bench.command("train")
+def bench_train(
+    capture: Annotated[str | None, typer.Option(help="Comma-separated: lumberjack, stage.")] = None,
+    recipe: Annotated[str | None, typer.Option(help="Comma-separated: gscodec, alone (every frame by itself).")] = None,
+    preset: Preset = "medium",
+    frames: Annotated[str | None, typer.Option(metavar="A:B:STEP", help="Only these frames.")] = None,
+    quality: Quality = 50.0,
+    data: Annotated[Path | None, typer.Option(envvar="GSCODEC_DATA", help="Folder with the captures.")] = None,
+    out: Annotated[Path, typer.Option(help="The result file; its other entries stay.")] = Path(
+        "bench/results/train.json"
+    ),
+    as_json: Json = False,
+) -> None:
+    """Quality against time and size of training, ours and every frame alone."""
+    from gscodec.commands import bench_train as measure
+
+    entries = []
+    for e in measure(capture, recipe, preset=preset, frames=frames, quality=quality, data=data, out=out):
+        entries.append(e)
+        if not as_json:
+            size = "-" if e["kb_per_frame"] is None else f"{e['kb_per_frame']:.2f} kB/frame"
+            _out.print(
+                f"{e['capture']:<11}{e['recipe']:<8}{e['preset']:<7}{e['seconds_per_frame']:7.2f} s/frame  "
+                f"{e['psnr_fg'] or e['psnr']:6.2f} dB  {e['gaussians']:>6} Gaussians  {size}"
+            )
+    if as_json:
+        print(json.dumps(entries, indent=1))
+
+
 @app.command()
 def chart(
     results: Annotated[Path, typer.Argument(help="Folder of results.")] = Path("bench/results"),

@@ -259,6 +259,24 @@ def bench_rd(codecs: str | None, sequences: str | None, *, data: Path | None, wo
                 print(f"{sequence}, {codec}: left out, {e}", file=sys.stderr)
 
 
+def bench_train(
+    captures: str | None, recipes: str | None, *, preset: str, frames: str | None, quality: float, data, out: Path
+) -> Iterator[dict]:
+    """Yields what bench.train measures (the lists are comma-separated, None: all), and puts it into `out` as it comes.
+
+    Raises:
+        UsageError: an unknown capture or recipe, or no data folder.
+    """
+    require("torch", "measuring training")
+    from gscodec.bench.train import CAPTURES, RECIPES, measure, update
+
+    if data is None:
+        raise UsageError("bench train needs the data folder, set --data or GSCODEC_DATA")
+    for capture in _names("--capture", captures, CAPTURES) or CAPTURES:
+        for recipe in _names("--recipe", recipes, RECIPES) or RECIPES:
+            yield from update(out, measure(capture, recipe, preset, frames, data, quality))
+
+
 def _names(option: str, text: str | None, known) -> list[str] | None:
     """ "a,b" -> ["a", "b"], all of them known; None stays None."""
     names = text.split(",") if text else None
