@@ -2,8 +2,9 @@
 
 usage: python bench/fuzz.py [--seconds 180]        for each target; needs a nightly toolchain and cargo-fuzz
 
-Executions add up as long as the code that is fuzzed stays the same. Each target runs in libFuzzer without a sanitizer,
-since the code has no unsafe block, and with limits on the time and memory of one input. A finding ends the run.
+Executions add up, for each state of the code that is fuzzed (the git tree of gsv/src). Each target runs in libFuzzer
+without a sanitizer, since the code has no unsafe block, and with limits on the time and memory of one input. A finding
+ends the run.
 """
 
 from __future__ import annotations
@@ -42,13 +43,11 @@ def main() -> None:
     path = RESULTS / "fuzz.json"
     tree = ["git", "rev-parse", "HEAD:codec/native/gsv/src"]
     source = subprocess.run(tree, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
-    result = json.loads(path.read_text()) if path.exists() else {}
-    if result.get("source") != source:
-        result = {"source": source, "executions": dict.fromkeys(TARGETS, 0)}
+    runs = json.loads(path.read_text())["runs"] if path.exists() else {}
+    own = runs.setdefault(source, dict.fromkeys(TARGETS, 0))
     for target in TARGETS:
-        result["executions"][target] += fuzz(target, seconds)
-    counts = {"source": source, "executions": result["executions"], "all": sum(result["executions"].values())}
-    write_result(path, counts | {"findings": 0})
+        own[target] += fuzz(target, seconds)
+    write_result(path, {"executions": sum(sum(r.values()) for r in runs.values()), "findings": 0, "runs": runs})
     print(path.read_text())
 
 

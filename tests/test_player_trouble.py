@@ -86,9 +86,9 @@ def test_a_manifest_of_nothing(browser, server, other):
 
 def test_a_seek_fetches_what_it_needs(browser, server, other, tmp_path):
     """A file whose groups are larger than the first request: the one that is looked at, and no other but the next."""
-    s = sequence(6000)
+    s = sequence(8000)
     path = tmp_path / "large.gsv"
-    config = stream_config(fps=1, sh_degree=0, gaussians=6000, frames=LENGTH)
+    config = stream_config(fps=1, sh_degree=0, gaussians=8000, frames=LENGTH)
     encode_groups(lambda done, frames: iter(s.groups[done:]), path, config, EncodeSettings(quality=95), fingerprint={})
     groups = open_stream(path).groups
     assert groups[0]["size"] > 70_000

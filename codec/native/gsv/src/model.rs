@@ -45,11 +45,27 @@ static STRETCH: LazyLock<[i16; 4096]> = LazyLock::new(|| {
     })
 });
 
-/// Step of a counter that has seen n bins: 1 / (n + 1.5), in 1/65536.
-static RATE: LazyLock<[u32; 256]> = LazyLock::new(|| std::array::from_fn(|n| 131_072 / (2 * n as u32 + 3)));
+/// What follows n bins seen: the step of the counter, 1 / (n + 1.5) in 1/65536, and its low bits after one more bin.
+type Steps = [(u32, u32); 256];
+static STEPS: LazyLock<Steps> = LazyLock::new(|| {
+    std::array::from_fn(|n| {
+        let next = (n as u32 + 1).min(AGE_MAX);
+        (131_072 / (2 * n as u32 + 3), age(next) << 8 | next)
+    })
+});
 
-/// A counter: probability of 1 (22 bits) above the number of bins seen (10 bits). Tables hold it xor `NEW`, so that a new
-/// table is all zeros: untouched pages of it cost nothing.
+/// How much a counter that has seen `n` bins can be trusted, 0 to 3.
+fn age(n: u32) -> u32 {
+    match n {
+        0..=3 => 0,
+        4..=15 => 1,
+        16..=63 => 2,
+        _ => 3,
+    }
+}
+
+/// A counter: probability of 1 (22 bits) above its age (2 bits) and the number of bins seen (8 bits). Tables hold it xor `NEW`, so
+/// that a new table is all zeros: untouched pages of it cost nothing.
 #[derive(Clone, Copy)]
 struct Counter(u32);
 
@@ -57,22 +73,17 @@ const NEW: u32 = 1 << 31;
 
 impl Counter {
     #[inline]
-    fn updated(self, bin: bool, rate: &[u32; 256]) -> u32 {
-        let (p, n) = (i64::from(self.0 >> 10), self.0 & 255);
+    fn updated(self, bin: bool, steps: &Steps) -> u32 {
+        let p = i64::from(self.0 >> 10);
+        let (rate, low) = steps[(self.0 & 255) as usize];
         let target = if bin { (1 << 22) - 1 } else { 0 };
-        let p = p + (((target - p) * i64::from(rate[n as usize])) >> 16);
-        ((p as u32) << 10 | (n + u32::from(n < AGE_MAX))) ^ NEW
+        let p = p + (((target - p) * i64::from(rate)) >> 16);
+        ((p as u32) << 10 | low) ^ NEW
     }
 
-    /// How much the counter can be trusted, 0 to 3.
     #[inline]
     fn age(self) -> usize {
-        match self.0 & 255 {
-            0..=3 => 0,
-            4..=15 => 1,
-            16..=63 => 2,
-            _ => 3,
-        }
+        (self.0 >> 8 & 3) as usize
     }
 }
 
@@ -83,7 +94,7 @@ pub struct Model {
     weights: Vec<[i32; 2]>, // less WEIGHT_NEW
     stretch: &'static [i16; 4096],
     squash: &'static [u16; 2 * STRETCH_MAX as usize + 1],
-    rate: &'static [u32; 256],
+    steps: &'static Steps,
 }
 
 impl Model {
@@ -95,7 +106,7 @@ impl Model {
             weights: vec![[0; 2]; sets * 16],
             stretch: &STRETCH,
             squash: &SQUASH,
-            rate: &RATE,
+            steps: &STEPS,
         }
     }
 
@@ -116,8 +127,8 @@ impl Model {
         let err = if bin { 65536 - p } else { -p };
         let learned = |w: i32, s: i32| (w + ((s * err + 16384) >> 15)).clamp(-WEIGHT_MAX, WEIGHT_MAX) - WEIGHT_NEW;
         *slot = [learned(weight[0], sa), learned(weight[1], sb)];
-        *slot_a = ca.updated(bin, self.rate);
-        *slot_b = cb.updated(bin, self.rate);
+        *slot_a = ca.updated(bin, self.steps);
+        *slot_b = cb.updated(bin, self.steps);
         bin
     }
 }

@@ -108,6 +108,8 @@ pub const ALL_LAYERS: usize = 256;
 /// Splits a group payload; every CRC and dependency is checked.
 pub fn split(payload: &[u8], layers: usize) -> Result<Vec<Unit<'_>>> {
     let mut units = scan(payload, layers)?;
+    let later = |u: &Unit| u.damage.is_some() && usize::from(u.layer) >= layers; // or so it claims: then others are missing
+    units.truncate(units.iter().position(later).unwrap_or(units.len()));
     match units.iter_mut().find_map(|u| u.damage.take()) {
         Some(damage) => Err(damage),
         None => Ok(units),

@@ -68,6 +68,13 @@ proptest! {
             let end = units.iter().find(|u| usize::from(u.layer) >= layers).map_or(payload.len(), |u| u.offset);
             let prefix = decode_group(&payload, &how).unwrap();
             prop_assert_eq!(&prefix, &decode_group(&payload[..end], &how).unwrap());
+            let mut cut = payload.clone();
+            if end < cut.len() {
+                cut[end + 4] ^= 1; // damage behind the prefix is nobody's business
+                prop_assert_eq!(&prefix, &decode_group(&cut, &how).unwrap());
+                cut.truncate(end + 9);
+                prop_assert_eq!(&prefix, &decode_group(&cut, &how).unwrap());
+            }
             let range = g.range(0..layers);
             prop_assert_eq!(&prefix.positions, &g.positions[range.clone()]);
             for (t, whole) in prefix.trajectories.iter().zip(&g.trajectories) {
