@@ -1,8 +1,8 @@
 """Floats to integers: one group of Gaussians -> the integer maps that `_native.encode_group` turns into bytes.
 
-Stages: prune what nobody sees, choose each Gaussian's canonical form, quantize the canonical frame (its positions give
-the order), fit the motion to the *decoded* canonical frame, quantize what motion leaves over. Every later stage works
-on the values that the decoder will have, so errors do not add up.
+Stages: choose each Gaussian's canonical form, measure what it matters, prune what nobody sees, fit the motion, find the
+pose from which it carries each Gaussian nearest to all frames, quantize that (its positions give the order), quantize
+what motion leaves over. Every later stage works on the values that the decoder will have, so errors do not add up.
 """
 
 from __future__ import annotations
@@ -42,6 +42,11 @@ class Stack:
         """The Gaussians at `index`, in that order."""
         arrays = (self.means, self.quats, self.log_scales, self.logit_opacities, self.sh0, self.shN)
         return Stack(*(a[:, index] for a in arrays), None if self.lifetimes is None else self.lifetimes[index])
+
+    def only(self, t: int) -> Stack:
+        """Frame `t` alone."""
+        arrays = (self.means, self.quats, self.log_scales, self.logit_opacities, self.sh0, self.shN)
+        return Stack(*(a[t : t + 1] for a in arrays), None)
 
     def frame(self, t: int) -> Gaussians:
         """All Gaussians as they are at frame `t`."""
@@ -248,10 +253,10 @@ def _steps(s: Stack, measured: Importance, error: float, nominal: Steps) -> dict
     """[C] f32 step of each channel of each attribute."""
     if not len(measured.removal):
         return {n: np.full(w.shape[1], getattr(nominal, n), np.float32) for n, w in measured.weights.items()}
-    middle = len(s.means) // 2
-    values = {n: v[middle] for n, v in _appearance(s).items()}
-    values |= {"means": s.means[middle], "quats": s.quats[middle, :, 1:]}
-    return steps_for_error(measured.weights, values, error, subject_radius(s.means[middle]))
+    middle = s.only(len(s.means) // 2)
+    values = {n: v[0] for n, v in _appearance(middle).items()}
+    values |= {"means": middle.means[0], "quats": middle.quats[0, :, 1:]}
+    return steps_for_error(measured.weights, values, error, subject_radius(middle.means[0]))
 
 
 def _rest_pose(

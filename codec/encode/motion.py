@@ -60,12 +60,13 @@ class NodeMotion:
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
     """[count] indices of `points` [N, 3], each the farthest from those before it; starts nearest to the centre."""
-    first = int(((points - points.mean(0)) ** 2).sum(1).argmin())
-    chosen = [first]
-    distance = ((points - points[first]) ** 2).sum(1)
-    for _ in range(min(count, len(points)) - 1):
-        chosen.append(int(distance.argmax()))
-        np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(1), out=distance)
+    points = points - points.mean(0)
+    square = (points**2).sum(1)
+    chosen, distance = [], np.full(len(points), np.inf)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(distance.argmax() if chosen else square.argmin()))
+        p = points[chosen[-1]]
+        np.minimum(distance, square - 2 * (points @ p) + p @ p, out=distance)
     return np.array(chosen)
 
 
