@@ -22,7 +22,7 @@ def speed_chart(result: dict):
     square = [e for e in fast if (e["width"], e["height"]) == (1024, 1024)]
     _lines(by_count, _usual(square), lambda e: e["gaussians"], "Gaussians (1024 x 1024)")
     hundred = [e for e in fast if e["gaussians"] == 100_000]
-    _lines(by_pixels, hundred, lambda e: e["width"] * e["height"], "pixels (100,000 Gaussians)")
+    _lines(by_pixels, hundred, lambda e: e["width"] * e["height"] / 1e6, "megapixels (100,000 Gaussians)")
     _bars(by_cores, entries, most)
     machine = result["machine"]
     figure.suptitle(
@@ -42,6 +42,9 @@ def _lines(axes, entries: list[dict], x, label: str) -> None:
     for key, name in PASSES.items():
         axes.loglog([x(e) for e in entries], [e[key] for e in entries], marker="o", markersize=3, label=name)
     axes.set(xlabel=label, ylabel="ms")
+    axes.xaxis.set_minor_formatter("")
+    ticks = sorted({x(e) for e in entries})
+    axes.set_xticks(ticks, [f"{t:,.3g}" if t < 1000 else f"{t:,.0f}" for t in ticks], rotation=30, ha="right")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
 
