@@ -1,4 +1,4 @@
-"""Training kernels against their plain torch references: image loss, hash grid."""
+"""Training kernels against their plain torch references: image loss, Adam, hash grid."""
 
 import pytest
 
@@ -6,6 +6,7 @@ torch = pytest.importorskip("torch")
 
 from gscodec.errors import UsageError  # noqa: E402
 from gscodec.train.hashgrid import HashGrid  # noqa: E402
+from gscodec.train.model import BETAS, EPS, Model  # noqa: E402
 from gscodec.train.ssim import image_loss, image_loss_reference  # noqa: E402
 
 
@@ -65,6 +66,24 @@ def test_image_loss_names_wrong_shapes():
         image_loss(torch.zeros(4, 4), torch.zeros(4, 4))
     with pytest.raises(UsageError, match="target has 36 values, expected 48"):
         image_loss(torch.zeros(4, 4, 3), torch.zeros(3, 4, 3))
+
+
+def test_adam_is_that_of_torch():
+    g = torch.Generator().manual_seed(4)
+    shapes = {"means": (1001, 3), "quats": (1001, 4), "log_scales": (1001, 3), "logit_opacities": (1001,)}
+    shapes |= {"sh0": (1001, 3), "shN": (1001, 0, 3)}
+    model = Model({n: torch.randn(s, generator=g) for n, s in shapes.items()})
+    want = {n: p.clone().requires_grad_() for n, p in model.params.items() if p.numel()}
+    rates = {n: 0.01 * (i + 1) for i, n in enumerate(model.params)}
+    optimizer = torch.optim.Adam([{"params": [p], "lr": rates[n]} for n, p in want.items()], betas=BETAS, eps=EPS)
+    for step in range(5):
+        grads = {n: torch.randn(p.shape, generator=g) * 10.0 ** -(3 * step) for n, p in model.params.items()}
+        for n, p in want.items():
+            p.grad = grads[n].clone()
+        optimizer.step()
+        model.adam(grads, rates)
+    for n, p in want.items():
+        torch.testing.assert_close(model.params[n], p.detach(), rtol=1e-5, atol=1e-6)
 
 
 # 4 levels: two dense, two hashed.

@@ -46,6 +46,11 @@ class Workspace:
         return self.native.simd
 
     @property
+    def memory(self) -> int:
+        """Bytes of the native buffers."""
+        return self.native.memory
+
+    @property
     def timings(self) -> dict[str, float]:
         """Milliseconds of the last passes: project, bin, blend, loss, backward_tiles, backward_project."""
         return dict(self.native.timings())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from gscodec import _native
 from gscodec.gaussians import SH_C0, Gaussians
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
@@ -26,16 +27,11 @@ class Model:
 
     @torch.no_grad()
     def adam(self, grads: dict[str, torch.Tensor], rates: dict[str, float]) -> None:
-        """One Adam step (Kingma and Ba 2015) on the attributes in `rates`."""
+        """One Adam step (Kingma and Ba 2015) on the attributes in `rates`, each in one pass over memory."""
         self._steps += 1
-        c1, c2 = 1 - BETAS[0] ** self._steps, 1 - BETAS[1] ** self._steps
         for name, rate in rates.items():
-            if self.params[name].numel() == 0:
-                continue
-            g, m, v = grads[name], self._first[name], self._second[name]
-            m.lerp_(g, 1 - BETAS[0])
-            v.mul_(BETAS[1]).addcmul_(g, g, value=1 - BETAS[1])
-            self.params[name].addcdiv_(m, (v / c2).sqrt_().add_(EPS), value=-rate / c1)
+            tensors = (self.params[name], grads[name].float().contiguous(), self._first[name], self._second[name])
+            _native.adam(tuple(t.numpy() for t in tensors), rate, BETAS, EPS, self._steps)
 
     def restart(self) -> None:
         """Forgets the moments (a new frame, a new stage)."""

@@ -6,7 +6,7 @@ mod kernels;
 use numpy::{PyArray1, PyReadonlyArrayDyn, PyReadwriteArrayDyn, prelude::*};
 use pyo3::exceptions::{PyOverflowError, PyValueError};
 use pyo3::prelude::*;
-use raster::{Gradients, Lambdas, Level, RasterError, Region, Shade, Splats, Step, Target, View};
+use raster::{Gradients, Lambdas, Level, RasterError, Region, Shade, Splats, Step, Surface, Target, View};
 
 type In<'py> = PyReadonlyArrayDyn<'py, f32>;
 type InOut<'py> = PyReadwriteArrayDyn<'py, f32>;
@@ -124,6 +124,12 @@ impl Rasterizer {
         self.inner.level().name()
     }
 
+    /// Bytes of the buffers.
+    #[getter]
+    fn memory(&self) -> usize {
+        self.inner.memory()
+    }
+
     /// Milliseconds of the last passes.
     fn timings(&self) -> Vec<(&'static str, f64)> {
         let t = self.inner.timings;
@@ -209,13 +215,11 @@ impl Rasterizer {
     ) -> PyResult<Bound<'py, PyArray1<u8>>> {
         let (splats, view) = (splats(&params)?, view.view());
         view.check().map_err(usage)?; // before its size is allocated
-        let mut out = vec![0; 3 * view.region.pixels()];
-        py.detach(|| {
-            self.inner.forward(&splats, &view, Shade::over(background), false)?;
-            self.inner.bytes(&mut out)
-        })
-        .map_err(usage)?;
-        Ok(PyArray1::from_vec(py, out))
+        let mut out = vec![[0; 3]; view.region.pixels()];
+        let surface = Surface::Rgb(&mut out);
+        py.detach(|| self.inner.paint(surface, &splats, &view, Shade::over(background)))
+            .map_err(usage)?;
+        Ok(PyArray1::from_vec(py, out.into_flattened()))
     }
 
     /// The picture of the last pass.
@@ -247,5 +251,6 @@ pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<Rasterizer>()?;
     m.add_class::<kernels::HashGrid>()?;
     m.add_function(wrap_pyfunction!(kernels::image_loss, m)?)?;
+    m.add_function(wrap_pyfunction!(kernels::adam, m)?)?;
     m.add_function(wrap_pyfunction!(simd_levels, m)?)
 }

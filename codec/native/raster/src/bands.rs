@@ -77,7 +77,7 @@ impl Band {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Level, Rasterizer, Region, Shade, Splats, View};
+    use crate::{Level, Rasterizer, Region, Shade, Splats, Surface, View};
 
     /// A spiral of Gaussians, denser at the top.
     fn scene(n: usize) -> [Vec<f32>; 5] {
@@ -134,9 +134,14 @@ mod tests {
                 assert_eq!(band.first, row);
                 assert!(band.rows > 0);
                 let (from, to) = (3 * 150 * row, 3 * 150 * (row + band.rows));
-                draw.draw([150, band.rows], shade, |p| p.clone_from(&band.splats))
+                let (mut image, mut alpha) = (vec![0.0; to - from], vec![0.0; (to - from) / 3]);
+                let surface = Surface::Floats {
+                    image: &mut image,
+                    alpha: &mut alpha,
+                };
+                draw.draw(surface, [150, band.rows], shade, |p| p.clone_from(&band.splats))
                     .unwrap();
-                for (a, b) in draw.image().iter().zip(&whole.image()[from..to]) {
+                for (a, b) in image.iter().zip(&whole.image()[from..to]) {
                     assert!((a - b).abs() < 1e-4, "{count} bands: {a} {b}");
                 }
                 row += band.rows;
@@ -151,7 +156,10 @@ mod tests {
         let split = bands.split(&[], [20, 40], 2);
         assert_eq!(split.iter().map(|b| b.rows).sum::<usize>(), 40);
         let mut draw = Rasterizer::new(Level::best(), 0);
-        draw.draw([20, 40], Shade::over([1.0, 0.5, 0.0]), Vec::clear).unwrap();
-        assert!(draw.image().chunks(3).all(|c| c == [1.0, 0.5, 0.0]));
+        let mut pixels = vec![[0; 4]; 800];
+        let surface = Surface::Rgba(&mut pixels);
+        draw.draw(surface, [20, 40], Shade::over([1.0, 0.5, 0.0]), Vec::clear)
+            .unwrap();
+        assert!(pixels.iter().all(|p| *p == [255, 128, 0, 255]));
     }
 }

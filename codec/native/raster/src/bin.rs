@@ -4,14 +4,16 @@
 //! (tile, chunk) its place, and the chunks fill in parallel; the places do not depend on the threads. In the chunk's list the
 //! places then replace the tiles: from them the backward pass gathers the gradients of a Gaussian in a fixed order.
 
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+use std::ops::Range;
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
 use crate::constants::LOG2_ALPHA_MIN;
 use crate::project::{Projected, SLACK, TILE};
-use crate::scene::{MAX_PAIRS, RasterError, Region};
+use crate::scene::{RasterError, Region};
 use crate::simd::prefetch;
+use crate::tile::BATCH;
 
 /// Chunks of the sorted order; bounds the parallelism of binning.
 const CHUNKS: usize = 16;
@@ -21,10 +23,59 @@ const HIDDEN: u32 = u32::MAX;
 /// Items between a prefetch and its use.
 const AHEAD: usize = 12;
 
+/// A rectangle of tiles.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Tiles {
+    pub columns: Range<usize>,
+    pub rows: Range<usize>,
+}
+
+impl Tiles {
+    /// Those that cover a region.
+    pub fn of(region: Region) -> Tiles {
+        Tiles {
+            columns: 0..region.width.div_ceil(TILE),
+            rows: 0..region.height.div_ceil(TILE),
+        }
+    }
+
+    pub fn len(&self) -> usize {
+        self.columns.len() * self.rows.len()
+    }
+
+    /// Two halves, none of a single tile.
+    pub fn halves(&self) -> Option<[Tiles; 2]> {
+        let half = |r: &Range<usize>| (r.start..r.start + r.len() / 2, r.start + r.len() / 2..r.end);
+        let (columns, rows) = (self.columns.clone(), self.rows.clone());
+        if rows.len() > 1 {
+            let (top, bottom) = half(&rows);
+            let left = columns.clone();
+            Some([
+                Tiles {
+                    columns: left,
+                    rows: top,
+                },
+                Tiles { columns, rows: bottom },
+            ])
+        } else if columns.len() > 1 {
+            let (left, right) = half(&columns);
+            let all = rows.clone();
+            Some([
+                Tiles {
+                    columns: left,
+                    rows: all,
+                },
+                Tiles { columns: right, rows },
+            ])
+        } else {
+            None
+        }
+    }
+}
+
 #[derive(Default)]
 pub struct Bins {
-    pub columns: usize,
-    pub rows: usize,
+    pub tiles: Tiles,
     /// [tiles + 1] first pair of each tile
     pub starts: Vec<u32>,
     /// Gaussian of each pair
@@ -42,14 +93,18 @@ pub fn reach(log2_opacity: f32) -> f32 {
     (log2_opacity - LOG2_ALPHA_MIN) * (1.0 + SLACK) + SLACK
 }
 
-/// Calls `visit(tile)` for the tiles that the ellipse of `p` meets at pixel centres.
+/// Calls `visit(tile)` for those of the tiles that the ellipse of `p` meets at pixel centres.
 #[inline(always)]
-fn for_tiles(p: &Projected, columns: usize, mut visit: impl FnMut(usize)) {
+fn for_tiles(p: &Projected, tiles: &Tiles, mut visit: impl FnMut(usize)) {
     let [x0, x1, y0, y1] = p.tiles.map(usize::from);
-    if x0 >= x1 || y0 >= y1 {
-        for row in y0..=y1.max(y0) {
-            for column in x0..=x1.max(x0) {
-                visit(row * columns + column);
+    let small = x0 >= x1 || y0 >= y1;
+    let (x0, y0) = (x0.max(tiles.columns.start), y0.max(tiles.rows.start));
+    let (x1, y1) = (x1.min(tiles.columns.end - 1), y1.min(tiles.rows.end - 1));
+    let start = |row: usize| (row - tiles.rows.start) * tiles.columns.len();
+    if small {
+        for row in y0..=y1 {
+            for column in x0..=x1 {
+                visit(start(row) + column - tiles.columns.start);
             }
         }
         return;
@@ -69,19 +124,61 @@ fn for_tiles(p: &Projected, columns: usize, mut visit: impl FnMut(usize)) {
             let left = (-hl.sqrt() - p.l21 * yl) * inv - SLACK;
             let (first, last) = (tile(p.x + left + 0.5), tile(p.x + right - 0.5));
             for column in first.max(x0)..=last.min(x1) {
-                visit(row * columns + column);
+                visit(start(row) + column - tiles.columns.start);
             }
         }
     }
 }
 
+/// Index of the Gaussian of a key of `DepthSort`.
+#[inline(always)]
+fn index(key: &AtomicU64) -> usize {
+    key.load(Relaxed) as u32 as usize
+}
+
 impl Bins {
-    pub fn tiles(&self) -> usize {
-        self.columns * self.rows
+    /// Bytes of the buffers.
+    pub fn memory(&self) -> usize {
+        let lists = self.lists.iter().map(Vec::capacity).sum::<usize>();
+        4 * (self.starts.capacity() + self.pairs.capacity() + self.owned.capacity() + self.cursors.capacity() + lists)
     }
 
     pub fn tile(&self, t: usize) -> std::ops::Range<usize> {
         self.starts[t] as usize..self.starts[t + 1] as usize
+    }
+
+    /// The first pair of tile `t`.
+    pub fn first(&self, t: usize) -> usize {
+        self.starts[t] as usize
+    }
+
+    /// Where the batches of tile `t` begin, if each tile has as many as its pairs need (a few places stay unused).
+    pub fn batches(&self, t: usize) -> usize {
+        self.first(t) / BATCH + t
+    }
+
+    /// Cuts what belongs to rows `first ..` of tiles, placed by `start`, at row `middle`; nothing of nothing.
+    pub fn cut<'a, T>(
+        &self,
+        items: &'a mut [T],
+        first: usize,
+        middle: usize,
+        start: fn(&Bins, usize) -> usize,
+    ) -> (&'a mut [T], &'a mut [T]) {
+        let columns = self.tiles.columns.len();
+        let length = start(self, middle * columns) - start(self, first * columns);
+        items.split_at_mut(length.min(items.len()))
+    }
+
+    /// Cuts what belongs to tile `t` off what belongs to the tiles `t ..`.
+    pub fn cut_tile<'a, T>(
+        &self,
+        items: &'a mut [T],
+        t: usize,
+        start: fn(&Bins, usize) -> usize,
+    ) -> (&'a mut [T], &'a mut [T]) {
+        let length = start(self, t + 1) - start(self, t);
+        items.split_at_mut(length.min(items.len()))
     }
 
     /// The list entry of a visible Gaussian and what follows it.
@@ -110,10 +207,17 @@ impl Bins {
     }
 
     /// # Errors
-    /// More than MAX_PAIRS pairs.
-    pub fn build(&mut self, projected: &[Projected], sorted: &[u64], region: Region) -> Result<(), RasterError> {
-        (self.columns, self.rows) = (region.width.div_ceil(TILE), region.height.div_ceil(TILE));
-        let (columns, tiles) = (self.columns, self.tiles());
+    /// More than `limit` pairs, visible Gaussians included, or more than its share of them in one chunk.
+    pub fn build(
+        &mut self,
+        projected: &[Projected],
+        sorted: &[AtomicU64],
+        rectangle: Tiles,
+        limit: usize,
+    ) -> Result<(), RasterError> {
+        let tiles = rectangle.len();
+        self.tiles = rectangle;
+        let rectangle = &self.tiles;
         self.cursors.clear();
         self.cursors.resize(CHUNKS * tiles, 0);
         self.lists.resize_with(CHUNKS, Vec::new);
@@ -129,37 +233,36 @@ impl Bins {
             .zip(sorted.par_chunks(share))
             .enumerate();
         work.for_each(|(chunk, ((count, list), keys))| {
-            for (i, &key) in keys.iter().enumerate() {
-                if let Some(&next) = keys.get(i + AHEAD) {
-                    prefetch(projected, next as u32 as usize);
+            for (i, key) in keys.iter().enumerate() {
+                if let Some(next) = keys.get(i + AHEAD) {
+                    prefetch(projected, index(next));
                 }
-                let (g, head) = (key as u32 as usize, list.len());
+                let (g, head) = (index(key), list.len());
                 owned[g].store((chunk as u32) << OFFSET_BITS | head as u32, Relaxed);
                 list.push(0);
-                for_tiles(&projected[g], columns, |t| {
+                for_tiles(&projected[g], rectangle, |t| {
                     count[t] += 1;
                     list.push(t as u32);
                 });
                 list[head] = (list.len() - head - 1) as u32;
-                if list.len() > MAX_PAIRS / CHUNKS {
-                    return; // the prefix sum reports it
+                if list.len() > limit / CHUNKS {
+                    return; // reported below
                 }
             }
         });
-        self.prefix(tiles)?;
+        if self.lists.iter().any(|list| list.len() > limit / CHUNKS) {
+            return Err(RasterError::TooMany {
+                what: "Gaussian-tile pairs",
+                limit,
+            });
+        }
+        self.prefix(tiles);
         self.fill(tiles, sorted, share);
         Ok(())
     }
 
     /// Turns the counts into first places and sets `starts` and the size of `pairs`.
-    fn prefix(&mut self, tiles: usize) -> Result<(), RasterError> {
-        let full = |list: &Vec<u32>| list.len() > MAX_PAIRS / CHUNKS;
-        if self.lists.iter().any(full) {
-            return Err(RasterError::TooMany {
-                what: "Gaussian-tile pairs",
-                limit: MAX_PAIRS,
-            });
-        }
+    fn prefix(&mut self, tiles: usize) {
         self.starts.clear();
         let mut sum = 0;
         for t in 0..tiles {
@@ -170,11 +273,10 @@ impl Bins {
         }
         self.starts.push(sum);
         self.pairs.resize_with(sum as usize, AtomicU32::default);
-        Ok(())
     }
 
     /// Writes the pairs; the tiles in the lists become places.
-    fn fill(&mut self, tiles: usize, sorted: &[u64], share: usize) {
+    fn fill(&mut self, tiles: usize, sorted: &[AtomicU64], share: usize) {
         let pairs = &self.pairs;
         let work = self
             .cursors
@@ -183,12 +285,12 @@ impl Bins {
             .zip(sorted.par_chunks(share));
         work.for_each(|((cursor, list), keys)| {
             let mut rest = &mut list[..];
-            for &key in keys {
+            for key in keys {
                 let Some((n, own)) = rest.split_first_mut() else { return };
                 let (own, after) = own.split_at_mut(*n as usize);
                 for tile in own {
                     let place = &mut cursor[*tile as usize];
-                    pairs[*place as usize].store(key as u32, Relaxed);
+                    pairs[*place as usize].store(index(key) as u32, Relaxed);
                     *tile = *place;
                     *place += 1;
                 }

@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicU32;
 use crate::constants::{ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_STOP};
 use crate::project::{Projected, TILE};
 use crate::simd::{Vector, c, dispatch};
-use crate::tile::{BATCH, BLOCK, Batch, PIXEL_X, PIXEL_Y, Plane, swizzle};
+use crate::tile::{BATCH, BLOCK, BLOCKS, Batch, Hits, PIXEL_X, PIXEL_Y, Plane, opacities, swizzle};
 
 /// A tile while it is drawn.
 pub struct Canvas {
@@ -51,20 +51,19 @@ fn blend<V: Vector>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut 
     let mut rgb = [V::load(rows[0]), V::load(rows[1]), V::load(rows[2])];
     let mut rest = hits;
     while rest != 0 {
-        let s = &batch.splats[rest.trailing_zeros() as usize & (BATCH - 1)];
-        rest &= rest - 1;
-        let u = px.mul_add(c(s.l11), py.mul_add(c(s.l21), c(s.u0)));
-        let v = py.mul_add(c(s.l22), c(s.v0));
-        let e = v.neg_mul_add(v, u.neg_mul_add(u, c(s.log2_opacity)));
-        let alpha = e.exp2().min(c(ALPHA_MAX));
-        let next = alpha.neg_mul_add(t, t);
-        let hit = e.ge(c(LOG2_ALPHA_MIN));
-        let draw = hit & next.ge(c(TRANSMITTANCE_STOP));
-        let weight = (alpha * t).select(draw, c(0.0));
-        for ch in 0..3 {
-            rgb[ch] = weight.mul_add(c(s.rgb[ch]), rgb[ch]);
+        let splats = batch.take(&mut rest);
+        let [_, _, e, raw] = opacities(splats, [px; 2], [py; 2]);
+        for ((s, e), raw) in splats.into_iter().zip(e).zip(raw) {
+            let alpha = raw.min(c(ALPHA_MAX));
+            let next = alpha.neg_mul_add(t, t);
+            let hit = e.ge(c(LOG2_ALPHA_MIN));
+            let draw = hit & next.ge(c(TRANSMITTANCE_STOP));
+            let weight = (alpha * t).select(draw, c(0.0));
+            for ch in 0..3 {
+                rgb[ch] = weight.mul_add(c(s.rgb[ch]), rgb[ch]);
+            }
+            t = next.select(draw, t.negative().select(hit, t));
         }
-        t = next.select(draw, t.negative().select(hit, t));
         if !V::any(c::<V>(0.0).lt(t)) {
             break;
         }
@@ -76,8 +75,8 @@ fn blend<V: Vector>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut 
     (hits & !rest, V::any(c::<V>(0.0).lt(t)))
 }
 
-/// Draws the first `count` pairs onto the canvas and leaves in `masks` the blocks that each Gaussian was drawn on, for the backward pass;
-/// an empty `masks` means that there is none.
+/// Draws the first `count` pairs onto the canvas and leaves in `seen` on which blocks each batch was drawn, for the backward
+/// pass; an empty `seen` means that there is none.
 #[inline(always)]
 fn forward_kernel<V: Vector>(
     projected: &[Projected],
@@ -85,10 +84,10 @@ fn forward_kernel<V: Vector>(
     count: usize,
     origin: [f32; 2],
     canvas: &mut Canvas,
-    masks: &mut [u16],
+    seen: &mut [Hits],
 ) {
     let mut batch = Batch::new();
-    masks.fill(0);
+    seen.fill([0; BLOCKS]);
     for first in (0..count).step_by(BATCH) {
         let n = (count - first).min(BATCH);
         batch.fill(projected, &pairs[first..], n, origin);
@@ -97,21 +96,17 @@ fn forward_kernel<V: Vector>(
         while live != 0 {
             let b = live.trailing_zeros() as usize;
             live &= live - 1;
-            let (mut seen, mut open) = (0, false);
+            let (mut visited, mut open) = (0, false);
             for at in (0..BLOCK).step_by(V::LANES) {
                 let (s, o) = blend::<V>(&batch, hits[b], b, at, canvas);
-                seen |= s;
+                visited |= s;
                 open |= o;
             }
             if !open {
                 canvas.live &= !(1 << b);
             }
-            let Some(masks) = masks.get_mut(first..first + n) else {
-                continue;
-            };
-            while seen != 0 {
-                masks[seen.trailing_zeros() as usize & (BATCH - 1)] |= 1 << b;
-                seen &= seen - 1;
+            if let Some(seen) = seen.get_mut(first / BATCH) {
+                seen[b] = visited;
             }
         }
         if canvas.live == 0 {
@@ -126,6 +121,6 @@ dispatch!(
         count: usize,
         origin: [f32; 2],
         canvas: &mut Canvas,
-        masks: &mut [u16],
+        seen: &mut [Hits],
     )
 );

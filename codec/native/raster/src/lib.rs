@@ -6,6 +6,7 @@
 // Kernels index several arrays in step; iterators over some of them would hide that.
 #![allow(clippy::needless_range_loop)]
 
+mod adam;
 mod backward;
 mod bands;
 mod bin;
@@ -28,9 +29,11 @@ mod ssim;
 mod step;
 mod tile;
 
+pub use adam::Adam;
 pub use bands::{Band, Bands};
 pub use hashgrid::HashGrid;
 pub use loss::{ImageLoss, LossValue, Pair};
+pub use picture::Surface;
 pub use project::Projected;
 pub use rasterizer::{Rasterizer, Shade, Timings};
 pub use scene::{Gradients, RasterError, Region, Splats, View};

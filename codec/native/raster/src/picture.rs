@@ -1,21 +1,120 @@
 //! Between tiles, whose pixels lie block by block, and images, whose pixels lie row by row.
 
+use std::ops::Range;
+
 use crate::backward::Adjoint;
 use crate::forward::Canvas;
 use crate::project::TILE;
 use crate::rasterizer::Shade;
+use crate::scene::{RasterError, Region, check_length};
 use crate::tile::{Plane, swizzle};
 
+/// What is drawn on: rows of pixels of the region, as floats or, for viewers, as bytes without a float image in between.
+pub enum Surface<'a> {
+    /// [H, W, 3] and [H, W]
+    Floats {
+        image: &'a mut [f32],
+        alpha: &'a mut [f32],
+    },
+    Rgb(&'a mut [[u8; 3]]),
+    /// Alpha is 255.
+    Rgba(&'a mut [[u8; 4]]),
+}
+
+impl<'a> Surface<'a> {
+    /// # Errors
+    /// A length other than that of the region.
+    pub fn check(&self, region: Region) -> Result<(), RasterError> {
+        let pixels = region.pixels();
+        match self {
+            Surface::Floats { image, alpha } => {
+                check_length("image", image.len(), 3 * pixels)?;
+                check_length("alpha", alpha.len(), pixels)
+            }
+            Surface::Rgb(p) => check_length("8-bit image", p.len(), pixels),
+            Surface::Rgba(p) => check_length("8-bit image", p.len(), pixels),
+        }
+    }
+
+    pub fn pixels(&self) -> usize {
+        match self {
+            Surface::Floats { alpha, .. } => alpha.len(),
+            Surface::Rgb(p) => p.len(),
+            Surface::Rgba(p) => p.len(),
+        }
+    }
+
+    /// The pixels of `range`.
+    pub fn part(&mut self, range: Range<usize>) -> Surface<'_> {
+        match self {
+            Surface::Floats { image, alpha } => Surface::Floats {
+                image: &mut image[3 * range.start..3 * range.end],
+                alpha: &mut alpha[range],
+            },
+            Surface::Rgb(p) => Surface::Rgb(&mut p[range]),
+            Surface::Rgba(p) => Surface::Rgba(&mut p[range]),
+        }
+    }
+
+    /// The first `n` pixels, and the others.
+    pub fn split_at(self, n: usize) -> (Surface<'a>, Surface<'a>) {
+        match self {
+            Surface::Floats { image, alpha } => {
+                let (image, image_rest) = image.split_at_mut(3 * n);
+                let (alpha, alpha_rest) = alpha.split_at_mut(n);
+                let rest = Surface::Floats {
+                    image: image_rest,
+                    alpha: alpha_rest,
+                };
+                (Surface::Floats { image, alpha }, rest)
+            }
+            Surface::Rgb(p) => {
+                let (a, b) = p.split_at_mut(n);
+                (Surface::Rgb(a), Surface::Rgb(b))
+            }
+            Surface::Rgba(p) => {
+                let (a, b) = p.split_at_mut(n);
+                (Surface::Rgba(a), Surface::Rgba(b))
+            }
+        }
+    }
+
+    /// Writes as many pixels from `at` on as `columns` says.
+    #[inline(always)]
+    fn put(&mut self, at: usize, columns: usize, rgb: &[[f32; 3]; TILE], opacity: &[f32; TILE]) {
+        let (rgb, opacity) = (&rgb[..columns], &opacity[..columns]);
+        match self {
+            Surface::Floats { image, alpha } => {
+                image[3 * at..3 * (at + columns)].copy_from_slice(rgb.as_flattened());
+                alpha[at..at + columns].copy_from_slice(opacity);
+            }
+            Surface::Rgb(p) => {
+                for (p, c) in p[at..at + columns].iter_mut().zip(rgb) {
+                    *p = c.map(byte);
+                }
+            }
+            Surface::Rgba(p) => {
+                for (p, c) in p[at..at + columns].iter_mut().zip(rgb) {
+                    *p = [byte(c[0]), byte(c[1]), byte(c[2]), 255];
+                }
+            }
+        }
+    }
+}
+
+/// 0 to 1 -> 0 to 255, rounded. The sum with 2^23 leaves the integer in the low bits, which WebAssembly engines do faster than
+/// to convert.
+#[inline(always)]
+fn byte(v: f32) -> u8 {
+    (v.clamp(0.0, 1.0) * 255.0 + 8_388_608.0).to_bits() as u8
+}
+
 /// Writes a finished tile to the rows of its band.
-pub fn finish(canvas: &Canvas, shade: Shade, x: usize, width: usize, image: &mut [f32], alpha: &mut [f32]) {
+pub fn finish(canvas: &Canvas, shade: Shade, x: usize, width: usize, band: &mut Surface) {
     let (gain, back) = (shade.gain.unwrap_or([1.0; 3]), shade.background);
-    let whole = width - x >= TILE;
-    for (y, (image, alpha)) in image
-        .chunks_exact_mut(3 * width)
-        .zip(alpha.chunks_exact_mut(width))
-        .enumerate()
-    {
-        let mut rgb_row = [0.0; 3 * TILE];
+    let columns = TILE.min(width - x);
+    for y in 0..band.pixels() / width {
+        let mut rgb_row = [[0.0; 3]; TILE];
         let mut alpha_row = [0.0; TILE];
         let four = y % 4 * 4..y % 4 * 4 + 4;
         for column in 0..4 {
@@ -24,31 +123,27 @@ pub fn finish(canvas: &Canvas, shade: Shade, x: usize, width: usize, image: &mut
             let [r, g, b] = [0, 1, 2].map(|ch| &canvas.rgb[ch].0[b][four.clone()]);
             for i in 0..4 {
                 let (at, t) = (4 * column + i, t[i].abs());
-                rgb_row[3 * at] = gain[0] * r[i] + t * back[0];
-                rgb_row[3 * at + 1] = gain[1] * g[i] + t * back[1];
-                rgb_row[3 * at + 2] = gain[2] * b[i] + t * back[2];
+                rgb_row[at] = [
+                    gain[0] * r[i] + t * back[0],
+                    gain[1] * g[i] + t * back[1],
+                    gain[2] * b[i] + t * back[2],
+                ];
                 alpha_row[at] = 1.0 - t;
             }
         }
-        let (image, alpha) = (&mut image[3 * x..], &mut alpha[x..]);
-        if whole {
-            image[..3 * TILE].copy_from_slice(&rgb_row);
-            alpha[..TILE].copy_from_slice(&alpha_row);
-        } else {
-            image.copy_from_slice(&rgb_row[..image.len()]);
-            alpha.copy_from_slice(&alpha_row[..alpha.len()]);
-        }
+        band.put(y * width + x, columns, &rgb_row, &alpha_row);
     }
 }
 
 /// A tile without Gaussians.
-pub fn finish_empty(shade: Shade, x: usize, width: usize, image: &mut [f32], alpha: &mut [f32]) {
-    let columns = TILE.min(width - x);
-    let mut row = [0.0; 3 * TILE];
-    row.as_chunks_mut::<3>().0.fill(shade.background);
-    for (image, alpha) in image.chunks_exact_mut(3 * width).zip(alpha.chunks_exact_mut(width)) {
-        image[3 * x..3 * (x + columns)].copy_from_slice(&row[..3 * columns]);
-        alpha[x..x + columns].fill(0.0);
+pub fn finish_empty(shade: Shade, x: usize, width: usize, band: &mut Surface) {
+    for y in 0..band.pixels() / width {
+        band.put(
+            y * width + x,
+            TILE.min(width - x),
+            &[shade.background; TILE],
+            &[0.0; TILE],
+        );
     }
 }
 

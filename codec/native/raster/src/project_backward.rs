@@ -1,50 +1,61 @@
 //! Sums over the pixels of a Gaussian -> gradients of its parameters; the mirror of project.rs, 16 Gaussians at a time.
 
+use std::ops::Range;
+
 use crate::backward::Sums;
 use crate::bin::Bins;
 use crate::project::{Ewa, Lens, WHITEN, colour, direction, dot3, ewa};
 use crate::scene::{Gradients, Splats};
 use crate::sh;
 use crate::simd::{Vector, c, dispatch, prefetch};
-use crate::soa::{CHUNK, Row, Soa};
+use crate::soa::{CHUNK, Row, Soa, write_columns};
 
-/// Rows of the chunk: means 0-2, quats 3-6, log_scales 7-9, logit 10, sh0 11-13, grad2d 14; and shN.
-pub struct GradientRows {
-    pub rows: [Row; 15],
-    pub sh_n: [[Row; 3]; 15],
+/// Gradients of a chunk as rows.
+struct GradientRows {
+    means: [Row; 3],
+    quats: [Row; 4],
+    log_scales: [Row; 3],
+    logits: [Row; 1],
+    sh0: [Row; 3],
+    sh_n: [[Row; 3]; 15],
+    grad2d: [Row; 1],
 }
 
 impl GradientRows {
-    pub fn new() -> GradientRows {
+    fn new() -> GradientRows {
+        let z = [0.0; CHUNK];
         GradientRows {
-            rows: [[0.0; CHUNK]; 15],
-            sh_n: [[[0.0; CHUNK]; 3]; 15],
+            means: [z; 3],
+            quats: [z; 4],
+            log_scales: [z; 3],
+            logits: [z],
+            sh0: [z; 3],
+            sh_n: [[z; 3]; 15],
+            grad2d: [z],
         }
     }
 
-    /// To the Gaussians `at ..` of `out`; 0 for the invisible.
-    pub fn write(&self, n: usize, seen: u16, sums: &[Row; 12], at: usize, k: usize, out: &mut Gradients) {
-        for lane in 0..n {
-            let g = at + lane;
-            let keep = |v: f32| if seen >> lane & 1 == 1 { v } else { 0.0 };
-            for d in 0..3 {
-                out.means[3 * g + d] = keep(self.rows[d][lane]);
-                out.log_scales[3 * g + d] = keep(self.rows[7 + d][lane]);
-                out.sh0[3 * g + d] = keep(self.rows[11 + d][lane]);
-            }
-            for d in 0..4 {
-                out.quats[4 * g + d] = keep(self.rows[3 + d][lane]);
-            }
-            out.logit_opacities[g] = keep(self.rows[10][lane]);
-            out.grad2d[g] = keep(self.rows[14][lane]);
-            out.sum_weight[g] = sums[9][lane];
-            out.max_weight[g] = sums[10][lane];
-            let sh_n = &mut out.sh_n[3 * k * g..3 * k * (g + 1)];
+    /// To the `n` Gaussians `at ..` of `out`; 0 for those without a bit in `seen`.
+    #[inline(always)]
+    fn write(&self, n: usize, seen: u16, sums: &[Row; 12], at: usize, k: usize, out: &mut Gradients) {
+        let to = at + n;
+        write_columns(&self.means, seen, &mut out.means[3 * at..3 * to]);
+        write_columns(&self.quats, seen, &mut out.quats[4 * at..4 * to]);
+        write_columns(&self.log_scales, seen, &mut out.log_scales[3 * at..3 * to]);
+        write_columns(&self.logits, seen, &mut out.logit_opacities[at..to]);
+        write_columns(&self.sh0, seen, &mut out.sh0[3 * at..3 * to]);
+        write_columns(&self.grad2d, seen, &mut out.grad2d[at..to]);
+        out.sum_weight[at..to].copy_from_slice(&sums[9][..n]);
+        out.max_weight[at..to].copy_from_slice(&sums[10][..n]);
+        if k == 0 {
+            return;
+        }
+        for (lane, out) in out.sh_n[3 * k * at..3 * k * to].chunks_exact_mut(3 * k).enumerate() {
             if seen >> lane & 1 == 0 {
-                sh_n.fill(0.0);
+                out.fill(0.0);
                 continue;
             }
-            for (out, rows) in sh_n.as_chunks_mut::<3>().0.iter_mut().zip(&self.sh_n) {
+            for (out, rows) in out.as_chunks_mut::<3>().0.iter_mut().zip(&self.sh_n) {
                 *out = [rows[0][lane], rows[1][lane], rows[2][lane]];
             }
         }
@@ -54,8 +65,8 @@ impl GradientRows {
 /// Gaussians between a prefetch of their pairs and its use; their places are fetched twice as early.
 const AHEAD: usize = 24;
 
-/// Adds up the pairs of 16 Gaussians, in the order of their tiles. Bit i of the mask is set if Gaussian first + i has any.
-pub fn gather(bins: &Bins, sums: &[Sums], first: usize, n: usize) -> ([Row; 12], u16) {
+/// Adds up the pairs of `n` Gaussians, in the order of their tiles. Bit i of the mask is set if Gaussian first + i has any.
+fn gather(bins: &Bins, sums: &[Sums], first: usize, n: usize) -> ([Row; 12], u16) {
     let (mut rows, mut seen) = ([[0.0; CHUNK]; 12], 0);
     for lane in 0..n {
         let g = first + lane;
@@ -132,7 +143,7 @@ fn quat_backward<V: Vector>(e: &Ewa<V>, d: &[[V; 3]; 3]) -> [V; 4] {
     ]
 }
 
-/// Writes rows 0-9 (means, quats, log_scales) except the part of means that comes from colour.
+/// Writes means, quats and log_scales except the part of means that comes from colour.
 #[inline(always)]
 fn geometry<V: Vector>(e: &Ewa<V>, lens: &Lens, s: &Screen<V>, at: usize, out: &mut GradientRows) {
     let (two, w) = (c::<V>(2.0), &lens.rotation);
@@ -141,7 +152,7 @@ fn geometry<V: Vector>(e: &Ewa<V>, lens: &Lens, s: &Screen<V>, at: usize, out: &
     for j in 0..3 {
         dm[0][j] = two * s.cov[0] * e.m[0][j] + s.cov[1] * e.m[1][j];
         dm[1][j] = two * s.cov[2] * e.m[1][j] + s.cov[1] * e.m[0][j];
-        (dm[0][j] * e.m[0][j] + dm[1][j] * e.m[1][j]).store(&mut out.rows[7 + j][at..]);
+        (dm[0][j] * e.m[0][j] + dm[1][j] * e.m[1][j]).store(&mut out.log_scales[j][at..]);
         dm[0][j] = dm[0][j] * e.scale[j];
         dm[1][j] = dm[1][j] * e.scale[j];
         for i in 0..3 {
@@ -149,7 +160,7 @@ fn geometry<V: Vector>(e: &Ewa<V>, lens: &Lens, s: &Screen<V>, at: usize, out: &
         }
     }
     for (i, v) in quat_backward(e, &drot).into_iter().enumerate() {
-        v.store(&mut out.rows[3 + i][at..]);
+        v.store(&mut out.quats[i][at..]);
     }
     let mut dp = [c::<V>(0.0); 3];
     for i in 0..2 {
@@ -163,7 +174,7 @@ fn geometry<V: Vector>(e: &Ewa<V>, lens: &Lens, s: &Screen<V>, at: usize, out: &
         dp[2] = dp[2] - e.inv_z * (dot3(djw, e.jw[i]) + dslope * x) - a * x * s.mean2d[i];
     }
     for j in 0..3 {
-        dot3([c(w[0][j]), c(w[1][j]), c(w[2][j])], dp).store(&mut out.rows[j][at..]);
+        dot3([c(w[0][j]), c(w[1][j]), c(w[2][j])], dp).store(&mut out.means[j][at..]);
     }
 }
 
@@ -174,7 +185,7 @@ fn colour_backward<V: Vector>(soa: &Soa, lens: &Lens, k: usize, sums: &[Row; 12]
     let mut d = rgb;
     for ch in 0..3 {
         d[ch] = V::load(&sums[6 + ch][at..]).select(c::<V>(0.0).lt(rgb[ch]), c(0.0));
-        (d[ch] * c(sh::SH_C0)).store(&mut out.rows[11 + ch][at..]);
+        (d[ch] * c(sh::SH_C0)).store(&mut out.sh0[ch][at..]);
     }
     if k == 0 {
         return;
@@ -191,8 +202,26 @@ fn colour_backward<V: Vector>(soa: &Soa, lens: &Lens, k: usize, sums: &[Row; 12]
     let ddir = sh::basis_backward(k, dir, &dbasis);
     let along = dot3(ddir, dir);
     for j in 0..3 {
-        let mean = V::load(&out.rows[j][at..]) + inv * (ddir[j] - dir[j] * along);
-        mean.store(&mut out.rows[j][at..]);
+        let mean = V::load(&out.means[j][at..]) + inv * (ddir[j] - dir[j] * along);
+        mean.store(&mut out.means[j][at..]);
+    }
+}
+
+/// Gradients of 16 Gaussians from their sums; lanes that are not visible hold garbage.
+#[inline(always)]
+fn chunk<V: Vector>(soa: &Soa, lens: &Lens, k: usize, sums: &[Row; 12], out: &mut GradientRows) {
+    for at in (0..CHUNK).step_by(V::LANES) {
+        let e = ewa::<V>(soa, lens, at);
+        let s = screen(&e, sums, at);
+        geometry(&e, lens, &s, at, out);
+        colour_backward::<V>(soa, lens, k, sums, at, out);
+        // d ln(sigmoid(x)) / dx = 1 - sigmoid(x)
+        let logit = V::load(&soa.logits[at..]).max(c(-55.0));
+        let up = crate::project::exp(-logit);
+        (V::load(&sums[0][at..]) * up / (c::<V>(1.0) + up)).store(&mut out.logits[0][at..]);
+        let gx = s.mean2d[0] * c(0.5 * lens.full[0]);
+        let gy = s.mean2d[1] * c(0.5 * lens.full[1]);
+        gx.mul_add(gx, gy * gy).sqrt().store(&mut out.grad2d[0][at..]);
     }
 }
 
@@ -200,33 +229,28 @@ fn colour_backward<V: Vector>(soa: &Soa, lens: &Lens, k: usize, sums: &[Row; 12]
 fn project_backward_kernel<V: Vector>(
     splats: &Splats,
     lens: &Lens,
-    first: usize,
-    sums: &[Row; 12],
-    out: &mut GradientRows,
+    bins: &Bins,
+    sums: &[Sums],
+    range: Range<usize>,
+    out: &mut Gradients,
 ) {
-    let mut soa = Soa::new();
-    soa.fill(splats, first);
-    for at in (0..CHUNK).step_by(V::LANES) {
-        let e = ewa::<V>(&soa, lens, at);
-        let s = screen(&e, sums, at);
-        geometry(&e, lens, &s, at, out);
-        colour_backward::<V>(&soa, lens, splats.sh_k, sums, at, out);
-        // d ln(sigmoid(x)) / dx = 1 - sigmoid(x)
-        let logit = V::load(&soa.logits[at..]).max(c(-55.0));
-        let up = crate::project::exp(-logit);
-        (V::load(&sums[0][at..]) * up / (c::<V>(1.0) + up)).store(&mut out.rows[10][at..]);
-        let gx = s.mean2d[0] * c(0.5 * lens.full[0]);
-        let gy = s.mean2d[1] * c(0.5 * lens.full[1]);
-        gx.mul_add(gx, gy * gy).sqrt().store(&mut out.rows[14][at..]);
+    let (mut soa, mut rows) = (Soa::new(), GradientRows::new());
+    for first in range.clone().step_by(CHUNK) {
+        let n = CHUNK.min(range.end - first);
+        let (sums, seen) = gather(bins, sums, first, n);
+        soa.fill(splats, first);
+        chunk::<V>(&soa, lens, splats.sh_k, &sums, &mut rows);
+        rows.write(n, seen, &sums, first - range.start, splats.sh_k, out);
     }
 }
 dispatch!(
-    /// Gradients of Gaussians first .. first + 16 from their sums; lanes that are not visible hold garbage.
+    /// Gradients of the Gaussians in `range` from the sums of all pairs; `out` is theirs.
     pub fn project_backward = project_backward_kernel(
         splats: &Splats,
         lens: &Lens,
-        first: usize,
-        sums: &[Row; 12],
-        out: &mut GradientRows,
+        bins: &Bins,
+        sums: &[Sums],
+        range: Range<usize>,
+        out: &mut Gradients,
     )
 );

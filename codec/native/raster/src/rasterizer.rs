@@ -3,25 +3,31 @@
 //! All buffers are kept from picture to picture. Work is divided in ways that depend on the input only (16 pixel rows, 256
 //! Gaussians), every piece owns what it writes, and sums over pairs have a fixed order: results do not depend on the threads.
 
+use std::mem::take;
 use std::ops::Range;
 
 use rayon::prelude::*;
 
 use crate::backward::{Sums, backward};
-use crate::bin::Bins;
+use crate::bin::{Bins, Tiles};
 use crate::clock::Clock;
 use crate::divide::divide;
 use crate::forward::{Canvas, forward};
-use crate::picture::{Pixels, finish, finish_empty};
+use crate::picture::{Pixels, Surface, finish, finish_empty};
 use crate::project::{Lens, Projected, TILE, project};
-use crate::project_backward::{GradientRows, gather, project_backward};
-use crate::scene::{Gradients, RasterError, Region, Splats, View, check_length, check_size};
+use crate::project_backward::project_backward;
+use crate::scene::{Gradients, MAX_PAIRS, RasterError, Region, Splats, View, check_length, check_size};
 use crate::simd::Level;
-use crate::soa::CHUNK;
 use crate::sort::DepthSort;
+use crate::tile::{BLOCKS, Hits};
 
 /// Gaussians of one task.
 const SHARE: usize = 256;
+
+/// Gaussian-tile pairs that a picture may take at a time, a Gaussian or in all; 8 bytes each. A tile alone needs at most two
+/// entries a Gaussian, so that dividing the tiles always ends.
+const PAIRS_EACH: usize = 8;
+const PAIRS_FREE: usize = 1 << 20;
 
 /// Milliseconds of the last passes.
 #[derive(Clone, Copy, Default, Debug)]
@@ -54,7 +60,7 @@ pub struct Rasterizer {
     projected: Vec<Projected>,
     sort: DepthSort,
     bins: Bins,
-    masks: Vec<u16>,
+    seen: Vec<Hits>,
     sums: Vec<Sums>,
     pub(crate) image: Vec<f32>, // [H, W, 3] of the region
     pub(crate) alpha: Vec<f32>, // [H, W]
@@ -76,7 +82,7 @@ impl Rasterizer {
             projected: Vec::new(),
             sort: DepthSort::default(),
             bins: Bins::default(),
-            masks: Vec::new(),
+            seen: Vec::new(),
             sums: Vec::new(),
             image: Vec::new(),
             alpha: Vec::new(),
@@ -98,20 +104,11 @@ impl Rasterizer {
         &self.alpha
     }
 
-    /// The last image as 8 bits, rounded and clamped.
-    ///
-    /// # Errors
-    /// A length other than that of the image.
-    pub fn bytes(&self, out: &mut [u8]) -> Result<(), RasterError> {
-        check_length("8-bit image", out.len(), self.image.len())?;
-        out.par_chunks_mut(1 << 14)
-            .zip(self.image.par_chunks(1 << 14))
-            .for_each(|(out, image)| {
-                for (o, v) in out.iter_mut().zip(image) {
-                    *o = (v.clamp(0.0, 1.0) * 255.0 + 0.5) as i32 as u8;
-                }
-            });
-        Ok(())
+    /// Bytes of all buffers.
+    pub fn memory(&self) -> usize {
+        let gaussians = size_of::<Projected>() * self.projected.capacity() + self.sort.memory();
+        let pairs = size_of::<Hits>() * self.seen.capacity() + size_of::<Sums>() * self.sums.capacity();
+        gaussians + self.bins.memory() + pairs + 4 * (self.image.capacity() + self.alpha.capacity())
     }
 
     pub fn projected(&self) -> &[Projected] {
@@ -135,9 +132,10 @@ impl Rasterizer {
     /// width x height, which must be what `project` made for one of that size.
     ///
     /// # Errors
-    /// As `forward`.
+    /// As `paint`.
     pub fn draw(
         &mut self,
+        surface: Surface,
         [width, height]: [usize; 2],
         shade: Shade,
         fill: impl FnOnce(&mut Vec<Projected>),
@@ -150,8 +148,19 @@ impl Rasterizer {
             height,
         };
         check_size(region, width, height)?;
+        surface.check(region)?;
         self.drawn = None;
-        self.run(|s| s.draw_here(region, shade, false))
+        self.run(|s| s.draw_on(surface, region, shade, false))
+    }
+
+    /// Draws the view on a surface of the caller's; `image` and `alpha` stay what they are.
+    ///
+    /// # Errors
+    /// As `forward`, or a surface of another size.
+    pub fn paint(&mut self, surface: Surface, splats: &Splats, view: &View, shade: Shade) -> Result<(), RasterError> {
+        self.project(splats, view)?;
+        surface.check(view.region)?;
+        self.run(|s| s.draw_on(surface, view.region, shade, false))
     }
 
     /// Runs `f` with this workspace in its own threads.
@@ -186,7 +195,16 @@ impl Rasterizer {
         let lens = Lens::new(view);
         self.drawn = None;
         self.project_here(splats, &lens);
-        self.draw_here(view.region, shade, training)?;
+        let (mut image, mut alpha) = (take(&mut self.image), take(&mut self.alpha));
+        image.resize(3 * view.region.pixels(), 0.0);
+        alpha.resize(view.region.pixels(), 0.0);
+        let surface = Surface::Floats {
+            image: &mut image,
+            alpha: &mut alpha,
+        };
+        let drawn = self.draw_on(surface, view.region, shade, training);
+        (self.image, self.alpha) = (image, alpha);
+        drawn?;
         if training {
             self.drawn = Some((lens, view.region, shade));
         }
@@ -202,55 +220,95 @@ impl Rasterizer {
         self.timings.project = start.ms();
     }
 
-    fn draw_here(&mut self, region: Region, shade: Shade, training: bool) -> Result<(), RasterError> {
+    fn draw_on(
+        &mut self,
+        mut surface: Surface,
+        region: Region,
+        shade: Shade,
+        training: bool,
+    ) -> Result<(), RasterError> {
         let start = Clock::start();
-        let sorted = self.sort.sort(&self.projected);
-        self.bins.build(&self.projected, sorted, region)?;
-        self.timings.bin = start.ms();
+        self.sort.sort(&self.projected);
+        (self.timings.bin, self.timings.blend) = (start.ms(), 0.0);
+        self.draw_tiles(&mut surface, Tiles::of(region), region, shade, training)
+    }
+
+    /// Bins and blends a rectangle of tiles; in halves if that would take too much memory, but for training, which needs all
+    /// pairs afterwards.
+    fn draw_tiles(
+        &mut self,
+        surface: &mut Surface,
+        tiles: Tiles,
+        region: Region,
+        shade: Shade,
+        training: bool,
+    ) -> Result<(), RasterError> {
+        let (start, halves) = (Clock::start(), tiles.halves());
+        let limit = if training {
+            MAX_PAIRS
+        } else {
+            (PAIRS_EACH * self.projected.len()).max(PAIRS_FREE)
+        };
+        let built = self
+            .bins
+            .build(&self.projected, self.sort.keys(), tiles, limit.min(MAX_PAIRS));
+        self.timings.bin += start.ms();
+        match (built, halves) {
+            (Err(_), Some([first, second])) if !training => {
+                self.draw_tiles(surface, first, region, shade, training)?;
+                return self.draw_tiles(surface, second, region, shade, training);
+            }
+            (built, _) => built?,
+        }
         let start = Clock::start();
-        self.masks.resize(if training { self.bins.pairs.len() } else { 0 }, 0);
-        self.image.resize(3 * region.pixels(), 0.0);
-        self.alpha.resize(region.pixels(), 0.0);
-        self.blend(region, shade);
-        self.timings.blend = start.ms();
+        let batches = self.bins.batches(self.bins.tiles.len());
+        self.seen.resize(if training { batches } else { 0 }, [0; BLOCKS]);
+        self.blend(surface, region, shade);
+        self.timings.blend += start.ms();
         Ok(())
     }
 
-    fn blend(&mut self, region: Region, shade: Shade) {
+    fn blend(&mut self, surface: &mut Surface, region: Region, shade: Shade) {
         let (level, bins, projected, width) = (self.level, &self.bins, &self.projected[..], region.width);
-        let work = (&mut self.image[..], &mut self.alpha[..], &mut self.masks[..]);
-        let cut = |(image, alpha, masks): (_, _, _), rows: &Range<usize>, middle: usize| {
-            let pixels = (middle - rows.start) * TILE * width;
-            let (image, image_rest) = <[f32]>::split_at_mut(image, 3 * pixels);
-            let (alpha, alpha_rest) = <[f32]>::split_at_mut(alpha, pixels);
-            let (masks, masks_rest) = cut_pairs(masks, bins, rows.start, middle);
-            ((image, alpha, masks), (image_rest, alpha_rest, masks_rest))
-        };
-        divide(0..bins.rows, 1, work, &cut, &|row, (image, alpha, mut masks)| {
-            for column in 0..bins.columns {
-                let t = row.start * bins.columns + column;
-                let range = bins.tile(t);
-                let (own, rest) = masks.split_at_mut(range.len().min(masks.len()));
-                masks = rest;
-                let x = column * TILE;
-                if range.is_empty() {
-                    finish_empty(shade, x, width, image, alpha);
-                    continue;
+        let (top, left) = (bins.tiles.rows.start, bins.tiles.columns.start);
+        let pixels = top * TILE * width..(bins.tiles.rows.end * TILE).min(region.height) * width;
+        let work = (surface.part(pixels), &mut self.seen[..]);
+        let (rows, columns) = (bins.tiles.rows.len(), bins.tiles.columns.len());
+        divide(
+            0..rows,
+            1,
+            work,
+            &|(band, seen), rows, middle| {
+                let (band, band_rest) = band.split_at((middle - rows.start) * TILE * width);
+                let (seen, seen_rest) = bins.cut(seen, rows.start, middle, Bins::batches);
+                ((band, seen), (band_rest, seen_rest))
+            },
+            &|row, (mut band, mut seen)| {
+                for column in 0..columns {
+                    let t = row.start * columns + column;
+                    let range = bins.tile(t);
+                    let (own, rest) = bins.cut_tile(seen, t, Bins::batches);
+                    seen = rest;
+                    let x = (left + column) * TILE;
+                    if range.is_empty() {
+                        finish_empty(shade, x, width, &mut band);
+                        continue;
+                    }
+                    let mut canvas = Canvas::new(width - x, band.pixels() / width);
+                    let origin = [x as f32, ((top + row.start) * TILE) as f32];
+                    forward(
+                        level,
+                        projected,
+                        &bins.pairs[range.start..],
+                        range.len(),
+                        origin,
+                        &mut canvas,
+                        own,
+                    );
+                    finish(&canvas, shade, x, width, &mut band);
                 }
-                let mut canvas = Canvas::new(width - x, alpha.len() / width);
-                let origin = [x as f32, (row.start * TILE) as f32];
-                forward(
-                    level,
-                    projected,
-                    &bins.pairs[range.start..],
-                    range.len(),
-                    origin,
-                    &mut canvas,
-                    own,
-                );
-                finish(&canvas, shade, x, width, image, alpha);
-            }
-        });
+            },
+        );
     }
 
     /// Gradients of the last training picture. `grad_image` [H, W, 3], `grad_alpha` [H, W] of the region.
@@ -298,7 +356,7 @@ impl Rasterizer {
     }
 
     fn backward_tiles(&mut self, width: usize, shade: Shade, grad_image: &[f32], grad_alpha: &[f32]) {
-        let (level, bins, projected, masks) = (self.level, &self.bins, &self.projected[..], &self.masks[..]);
+        let (level, bins, projected, seen) = (self.level, &self.bins, &self.projected[..], &self.seen[..]);
         let pixels = Pixels {
             image: &self.image,
             alpha: &self.alpha,
@@ -306,27 +364,22 @@ impl Rasterizer {
             grad_alpha,
             width,
         };
-        let cut = |sums, rows: &Range<usize>, middle| cut_pairs(sums, bins, rows.start, middle);
-        divide(
-            0..bins.rows,
-            1,
-            &mut self.sums[..],
-            &cut,
-            &|row, mut sums: &mut [Sums]| {
-                for column in 0..bins.columns {
-                    let range = bins.tile(row.start * bins.columns + column);
-                    let (own, rest) = sums.split_at_mut(range.len());
-                    sums = rest;
-                    if own.is_empty() {
-                        continue;
-                    }
-                    let (x, y) = (column * TILE, row.start * TILE);
-                    let mut adjoint = pixels.adjoint(x, y, shade);
-                    let (pairs, masks) = (&bins.pairs[range.start..], &masks[range]);
-                    backward(level, projected, pairs, [x as f32, y as f32], masks, &mut adjoint, own);
+        let cut = |sums, rows: &Range<usize>, middle| bins.cut(sums, rows.start, middle, Bins::first);
+        let (rows, columns) = (bins.tiles.rows.len(), bins.tiles.columns.len());
+        divide(0..rows, 1, &mut self.sums[..], &cut, &|row, mut sums: &mut [Sums]| {
+            for column in 0..columns {
+                let t = row.start * columns + column;
+                let (own, rest) = bins.cut_tile(sums, t, Bins::first);
+                sums = rest;
+                if own.is_empty() {
+                    continue;
                 }
-            },
-        );
+                let (x, y) = (column * TILE, row.start * TILE);
+                let mut adjoint = pixels.adjoint(x, y, shade);
+                let (pairs, hits) = (&bins.pairs[bins.first(t)..], &seen[bins.batches(t)..]);
+                backward(level, projected, pairs, [x as f32, y as f32], hits, &mut adjoint, own);
+            }
+        });
     }
 
     fn backward_gaussians(&self, splats: &Splats, lens: &Lens, out: &mut Gradients) {
@@ -337,21 +390,69 @@ impl Rasterizer {
             SHARE,
             out,
             &|g, range, middle| g.split_at(middle - range.start, splats.sh_k),
-            &|range, mut out| {
-                let mut rows = GradientRows::new();
-                for first in range.clone().step_by(CHUNK) {
-                    let n = CHUNK.min(range.end - first);
-                    let (sums, seen) = gather(&self.bins, &self.sums, first, n);
-                    project_backward(self.level, splats, lens, first, &sums, &mut rows);
-                    rows.write(n, seen, &sums, first - range.start, splats.sh_k, &mut out);
-                }
-            },
+            &|range, mut out| project_backward(self.level, splats, lens, &self.bins, &self.sums, range, &mut out),
         );
     }
 }
 
-/// The pairs of tile rows `first .. middle`, and the rest; nothing of nothing.
-fn cut_pairs<'a, T>(pairs: &'a mut [T], bins: &Bins, first: usize, middle: usize) -> (&'a mut [T], &'a mut [T]) {
-    let start = |row: usize| bins.starts[row * bins.columns] as usize;
-    pairs.split_at_mut((start(middle) - start(first)).min(pairs.len()))
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// `n` round splats of the given scale on a line that winds through the view, and a camera of size x size pixels.
+    fn draw(n: usize, log_scale: f32, size: usize, training: bool) -> Rasterizer {
+        let t = |i: usize| i as f32 / n as f32;
+        let means: Vec<f32> = (0..n)
+            .flat_map(|i| [(9.0 * t(i)).sin(), t(i) - 0.5, 3.0 + t(i)])
+            .collect();
+        let splats = Splats {
+            means: &means,
+            quats: &[1.0, 0.0, 0.0, 0.0].repeat(n),
+            log_scales: &vec![log_scale; 3 * n],
+            logit_opacities: &vec![-3.0; n],
+            sh0: &(0..3 * n).map(|i| (i as f32).sin()).collect::<Vec<f32>>(),
+            sh_n: &[],
+            sh_k: 0,
+        };
+        let region = Region {
+            x: 0,
+            y: 0,
+            width: size,
+            height: size,
+        };
+        let view = View {
+            width: size,
+            height: size,
+            focal: [size as f32; 2],
+            center: [0.5 * size as f32; 2],
+            rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            translation: [0.0; 3],
+            region,
+        };
+        let mut r = Rasterizer::new(Level::best(), 0);
+        r.forward(&splats, &view, Shade::over([0.1, 0.2, 0.3]), training)
+            .unwrap();
+        r
+    }
+
+    #[test]
+    fn splats_that_fill_the_screen_are_drawn_in_parts_of_bounded_memory() {
+        let (n, size) = (600, 1000);
+        let (parts, whole) = (draw(n, 1.0, size, false), draw(n, 1.0, size, true));
+        assert!(whole.bins.pairs.len() > PAIRS_FREE && parts.bins.pairs.len() < PAIRS_FREE);
+        assert!(parts.image == whole.image && parts.alpha == whole.alpha);
+        // 8 bytes a pair, in vectors that may have grown to twice their length
+        assert!(
+            parts.memory() < 200 * n + 16 * size * size + 2 * 8 * PAIRS_FREE,
+            "{}",
+            parts.memory()
+        );
+    }
+
+    #[test]
+    fn small_splats_take_less_than_200_bytes() {
+        let (n, size) = (100_000, 256);
+        let memory = draw(n, -6.0, size, false).memory();
+        assert!(memory < 200 * n + 16 * size * size, "{memory}");
+    }
 }

@@ -31,6 +31,7 @@ impl Soa {
     }
 
     /// Gaussians first .. first + 16 of `s`, fewer at the end.
+    #[inline(always)] // into kernels, whose wide instructions it needs
     pub fn fill(&mut self, s: &Splats, first: usize) -> usize {
         let n = CHUNK.min(s.len() - first);
         self.means = [[f32::NAN; CHUNK]; 3];
@@ -54,10 +55,40 @@ impl Soa {
 }
 
 /// [n, D] -> D rows of n.
+#[inline(always)]
 fn columns<const D: usize>(rows: &mut [Row; D], flat: &[f32]) {
+    if let ([whole], []) = flat.as_chunks::<D>().0.as_chunks::<CHUNK>() {
+        for d in 0..D {
+            for lane in 0..CHUNK {
+                rows[d][lane] = whole[lane][d];
+            }
+        }
+        return;
+    }
     for (lane, item) in flat.chunks_exact(D).enumerate() {
         for d in 0..D {
             rows[d][lane] = item[d];
+        }
+    }
+}
+
+/// D rows -> [n, D], the mirror of `columns`; 0 where `seen` has no bit.
+#[inline(always)]
+pub fn write_columns<const D: usize>(rows: &[Row; D], seen: u16, flat: &mut [f32]) {
+    let keep = |d: usize, lane: usize| if seen >> lane & 1 == 1 { rows[d][lane] } else { 0.0 };
+    if let ([whole], []) = flat.as_chunks_mut::<D>().0.as_chunks_mut::<CHUNK>()
+        && seen == u16::MAX
+    {
+        for lane in 0..CHUNK {
+            for d in 0..D {
+                whole[lane][d] = rows[d][lane];
+            }
+        }
+        return;
+    }
+    for (lane, item) in flat.chunks_exact_mut(D).enumerate() {
+        for d in 0..D {
+            item[d] = keep(d, lane);
         }
     }
 }

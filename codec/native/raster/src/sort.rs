@@ -1,56 +1,106 @@
 //! Visible Gaussians front to back: a stable least-significant-digit radix sort of (depth, index).
 //!
 //! Depths of one picture span few exponents, so the keys are taken relative to the smallest and two passes usually do.
-//! Ties keep the order of the indices, which makes the picture independent of everything but its input.
+//! Ties keep the order of the indices, which makes the picture independent of everything but its input. A pass counts and
+//! moves fixed chunks in parallel; a prefix sum over (digit, chunk) gives each its places.
+
+use std::ops::Range;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+
+use rayon::prelude::*;
 
 use crate::project::Projected;
 
 const DIGIT: u32 = 11;
 const BUCKETS: usize = 1 << DIGIT;
+/// Bounds the parallelism of sorting.
+const CHUNKS: usize = 4;
 
 #[derive(Default)]
 pub struct DepthSort {
-    keys: Vec<u64>, // depth bits << 32 | index
-    swap: Vec<u64>,
+    keys: Vec<AtomicU64>, // depth bits << 32 | index
+    swap: Vec<AtomicU64>,
+    places: Vec<u32>, // [CHUNKS, BUCKETS]
+    visible: usize,
 }
 
 impl DepthSort {
-    /// Indices of the visible Gaussians, nearest first, as the low halves of the result.
-    pub fn sort(&mut self, projected: &[Projected]) -> &[u64] {
-        self.keys.clear();
-        let (mut low, mut high) = (u32::MAX, 0);
-        for (i, p) in projected.iter().enumerate() {
-            if p.visible() {
-                let bits = p.depth.to_bits(); // positive floats sort like their bits
-                low = low.min(bits);
-                high = high.max(bits);
-                self.keys.push(u64::from(bits) << 32 | i as u64);
-            }
-        }
-        self.swap.resize(self.keys.len(), 0);
-        let significant = 32 - high.saturating_sub(low).leading_zeros();
-        for pass in 0..significant.div_ceil(DIGIT) {
-            self.pass(low, 32 + pass * DIGIT);
-        }
-        &self.keys
+    /// Indices of the visible Gaussians of the last `sort`, nearest first, as the low halves.
+    pub fn keys(&self) -> &[AtomicU64] {
+        &self.keys[..self.visible]
     }
 
-    fn pass(&mut self, low: u32, shift: u32) {
+    /// Bytes of the buffers.
+    pub fn memory(&self) -> usize {
+        8 * (self.keys.capacity() + self.swap.capacity()) + 4 * self.places.capacity()
+    }
+
+    pub fn sort(&mut self, projected: &[Projected]) {
+        let share = projected.len().div_ceil(CHUNKS).max(1);
+        self.keys.resize_with(projected.len(), AtomicU64::default);
+        self.swap.resize_with(projected.len(), AtomicU64::default);
+        self.places.resize(CHUNKS * BUCKETS, 0);
+        // of each chunk: the visible ones, the smallest and the largest depth
+        let mut found = [(0, u32::MAX, 0); CHUNKS];
+        let chunks = projected.par_chunks(share).zip(self.keys.par_chunks_mut(share));
+        chunks
+            .zip(&mut found[..])
+            .enumerate()
+            .for_each(|(chunk, ((projected, keys), found))| {
+                let (n, low, high) = found;
+                for (i, p) in projected.iter().enumerate() {
+                    if p.visible() {
+                        let bits = p.depth.to_bits(); // positive floats sort like their bits
+                        *low = bits.min(*low);
+                        *high = bits.max(*high);
+                        keys[*n] = AtomicU64::new(u64::from(bits) << 32 | (chunk * share + i) as u64);
+                        *n += 1;
+                    }
+                }
+            });
+        let total = found.iter().map(|f| f.0).sum::<usize>();
+        let low = found.iter().fold(u32::MAX, |low, f| low.min(f.1));
+        let high = found.iter().fold(0, |high, f| high.max(f.2));
+        let significant = 32 - high.saturating_sub(low).leading_zeros();
+        let mut parts = std::array::from_fn(|i| {
+            let first = (i * share).min(projected.len());
+            first..first + found[i].0
+        });
+        // one pass at least, since it also closes the gaps between the chunks
+        for pass in 0..significant.div_ceil(DIGIT).max(1) {
+            self.pass(&parts, low, 32 + pass * DIGIT);
+            let share = total.div_ceil(CHUNKS);
+            parts = std::array::from_fn(|i| (i * share).min(total)..((i + 1) * share).min(total));
+        }
+        self.visible = total;
+    }
+
+    fn pass(&mut self, parts: &[Range<usize>; CHUNKS], low: u32, shift: u32) {
         let base = u64::from(low) << 32;
         let digit = |key: u64| ((key - base) >> shift) as usize & (BUCKETS - 1);
-        let mut next = [0u32; BUCKETS];
-        for &key in &self.keys {
-            next[digit(key)] += 1;
-        }
+        let (keys, swap) = (&self.keys, &self.swap);
+        let places = self.places.par_chunks_exact_mut(BUCKETS).zip(parts);
+        places.for_each(|(places, part)| {
+            places.fill(0);
+            for key in &keys[part.clone()] {
+                places[digit(key.load(Relaxed))] += 1;
+            }
+        });
         let mut sum = 0;
-        for n in &mut next {
-            sum += std::mem::replace(n, sum);
+        for bucket in 0..BUCKETS {
+            for chunk in 0..CHUNKS {
+                sum += std::mem::replace(&mut self.places[chunk * BUCKETS + bucket], sum);
+            }
         }
-        for &key in &self.keys {
-            let slot = &mut next[digit(key)];
-            self.swap[*slot as usize] = key;
-            *slot += 1;
-        }
+        let places = self.places.par_chunks_exact_mut(BUCKETS).zip(parts);
+        places.for_each(|(places, part)| {
+            for key in &keys[part.clone()] {
+                let key = key.load(Relaxed);
+                let place = &mut places[digit(key)];
+                swap[*place as usize].store(key, Relaxed);
+                *place += 1;
+            }
+        });
         std::mem::swap(&mut self.keys, &mut self.swap);
     }
 }
@@ -72,7 +122,8 @@ mod tests {
         let mut want: Vec<usize> = (0..600).filter(|i| i % 5 != 0).collect();
         want.sort_by(|&a, &b| depth(a).total_cmp(&depth(b)));
         let mut sort = DepthSort::default();
-        let got: Vec<usize> = sort.sort(&p).iter().map(|k| *k as u32 as usize).collect();
+        sort.sort(&p);
+        let got: Vec<usize> = sort.keys().iter().map(|k| k.load(Relaxed) as u32 as usize).collect();
         assert_eq!(got, want);
     }
 }

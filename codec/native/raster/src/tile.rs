@@ -11,6 +11,11 @@ pub const BLOCKS: usize = 16;
 pub const BLOCK: usize = 16;
 /// Gaussians of one batch, the bits of a mask.
 pub const BATCH: usize = 64;
+/// Pairs between a prefetch and its use.
+const AHEAD: usize = 16;
+
+/// Which Gaussians of a batch meet each block: bit i of entry b is Gaussian i on block b.
+pub type Hits = [u64; BLOCKS];
 
 /// One value a pixel, [block][pixel of the block].
 #[derive(Clone, Copy)]
@@ -58,6 +63,36 @@ pub struct Local {
     y: f32,
 }
 
+impl Local {
+    /// One that meets no pixel.
+    const NOWHERE: Local = Local {
+        l11: 0.0,
+        l21: 0.0,
+        u0: 0.0,
+        l22: 0.0,
+        v0: 0.0,
+        log2_opacity: -100.0,
+        rgb: [0.0; 3],
+        x: 0.0,
+        y: 0.0,
+    };
+}
+
+/// u, v, log2(alpha) and alpha before the clamp of a Gaussian on a vector of pixels, N times at once: the exponentials do not
+/// depend on each other, and a processor looks too few instructions ahead to find that out by itself.
+#[inline(always)]
+pub fn opacities<V: Vector, const N: usize>(s: [&Local; N], x: [V; N], y: [V; N]) -> [[V; N]; 4] {
+    let (mut u, mut v, mut e) = (x, y, x);
+    for i in 0..N {
+        u[i] = x[i].mul_add(c(s[i].l11), y[i].mul_add(c(s[i].l21), c(s[i].u0)));
+        v[i] = y[i].mul_add(c(s[i].l22), c(s[i].v0));
+    }
+    for i in 0..N {
+        e[i] = v[i].neg_mul_add(v[i], u[i].neg_mul_add(u[i], c(s[i].log2_opacity)));
+    }
+    [u, v, e, V::exp2_near(e)]
+}
+
 /// Up to 64 Gaussians of the tile, copied together.
 pub struct Batch {
     pub splats: [Local; BATCH],
@@ -72,13 +107,13 @@ impl Batch {
         }
     }
 
-    /// The first `n` of `pairs`; those after them are fetched for the next call, be it for this tile or the next one.
+    /// The first `n` of `pairs`.
     #[inline(always)]
     pub fn fill(&mut self, projected: &[Projected], pairs: &[AtomicU32], n: usize, origin: [f32; 2]) {
-        for pair in pairs.iter().skip(n).take(BATCH) {
-            prefetch(projected, pair.load(Relaxed) as usize);
-        }
-        for (s, pair) in self.splats[..n].iter_mut().zip(pairs) {
+        for (i, (s, pair)) in self.splats[..n].iter_mut().zip(pairs).enumerate() {
+            if let Some(next) = pairs.get(i + AHEAD) {
+                prefetch(projected, next.load(Relaxed) as usize);
+            }
             let p = &projected[pair.load(Relaxed) as usize];
             let (x, y) = (p.x - origin[0], p.y - origin[1]);
             *s = Local {
@@ -95,9 +130,22 @@ impl Batch {
         }
     }
 
-    /// Exact test of each ellipse against the pixel centres of each block: bit i of hits[b] is Gaussian i on block b.
+    /// Takes the next two Gaussians from `hits`, filled up with one that meets no pixel.
     #[inline(always)]
-    pub fn hits<V: Vector>(&mut self, n: usize) -> [u64; BLOCKS] {
+    pub fn take(&self, hits: &mut u64) -> [&Local; 2] {
+        let mut next = [&Local::NOWHERE; 2];
+        for s in &mut next {
+            if *hits != 0 {
+                *s = &self.splats[hits.trailing_zeros() as usize & (BATCH - 1)];
+                *hits &= *hits - 1;
+            }
+        }
+        next
+    }
+
+    /// Exact test of each ellipse against the pixel centres of each block.
+    #[inline(always)]
+    pub fn hits<V: Vector>(&mut self, n: usize) -> Hits {
         for (lane, s) in self.splats[..n].iter().enumerate() {
             let fields = [s.x, s.y, s.l11, s.l21, s.l22, reach(s.log2_opacity)];
             for (row, v) in self.rows.iter_mut().zip(fields) {
@@ -113,7 +161,7 @@ impl Batch {
     }
 
     #[inline(always)]
-    fn hit_lanes<V: Vector>(&self, at: usize, hits: &mut [u64; BLOCKS]) {
+    fn hit_lanes<V: Vector>(&self, at: usize, hits: &mut Hits) {
         let r = &self.rows;
         let (x, y) = (V::load(&r[0][at..]), V::load(&r[1][at..]));
         let (l11, l21, l22) = (V::load(&r[2][at..]), V::load(&r[3][at..]), V::load(&r[4][at..]));

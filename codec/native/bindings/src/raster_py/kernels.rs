@@ -1,8 +1,8 @@
-//! Training kernels that work on arrays alone: image loss and hash grid.
+//! Training kernels that work on arrays alone: image loss, Adam and hash grid.
 
 use numpy::{PyArray1, prelude::*};
 use pyo3::prelude::*;
-use raster::{ImageLoss, Pair};
+use raster::{Adam, ImageLoss, Level, Pair};
 
 use super::{In, InOut, contiguous, level, usage};
 
@@ -42,6 +42,29 @@ pub fn image_loss<'py>(
         value.ssim,
         PyArray1::from_vec(py, grad),
     ))
+}
+
+/// One step of Adam in place, `step` counted from 1; all arrays have the same length.
+#[pyfunction]
+pub fn adam(
+    py: Python,
+    arrays: (InOut, In, InOut, InOut),
+    rate: f64,
+    betas: [f64; 2],
+    epsilon: f32,
+    step: i32,
+) -> PyResult<()> {
+    let (mut param, grad, mut first, mut second) = arrays;
+    let adam = Adam {
+        betas: betas.map(|b| b as f32),
+        epsilon,
+        rate: (rate / (1.0 - betas[0].powi(step))) as f32,
+        correction: (1.0 / (1.0 - betas[1].powi(step))) as f32,
+    };
+    let (param, grad) = (contiguous(param.as_slice_mut())?, contiguous(grad.as_slice())?);
+    let (first, second) = (contiguous(first.as_slice_mut())?, contiguous(second.as_slice_mut())?);
+    py.detach(|| adam.step(Level::best(), param, grad, first, second))
+        .map_err(usage)
 }
 
 /// Instant-NGP grid: `cells` on a side of each level, `table` entries at most a level.

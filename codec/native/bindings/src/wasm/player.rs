@@ -6,9 +6,11 @@ use gsv::container::demux::Demuxer;
 use gsv::decode::{Decoding, decode_group, reference_of};
 use gsv::evaluate::{Evaluator, Frame};
 use gsv::levels::Level as Caps;
-use raster::{Band, Bands, Level, Projected, Rasterizer, Region, Shade, Splats, View};
+use raster::{Band, Bands, Level, Projected, Rasterizer, Region, Shade, Splats, Surface, View};
 use std::fmt::Display;
 
+/// 4096 x 4096. A larger picture is refused; an allocation that fails would end the instance.
+const MAX_PIXELS: usize = 1 << 24;
 /// Groups that an instance can hold.
 const SLOTS: usize = 8;
 
@@ -183,12 +185,10 @@ impl Player {
 
     pub fn draw(&mut self, size: [usize; 2], background: [f32; 3]) -> bool {
         let (shade, splats) = (Shade::over(background), &mut self.splats);
-        let drawn = self.raster.draw(size, shade, |p| std::mem::swap(p, splats));
-        let colours = self.raster.image().as_chunks::<3>().0;
-        self.pixels.resize(colours.len(), [255; 4]);
-        for (p, c) in self.pixels.iter_mut().zip(colours) {
-            *p = [byte(c[0]), byte(c[1]), byte(c[2]), 255];
-        }
+        self.pixels
+            .resize(size[0].saturating_mul(size[1]).min(MAX_PIXELS), [255; 4]);
+        let surface = Surface::Rgba(&mut self.pixels);
+        let drawn = self.raster.draw(surface, size, shade, |p| std::mem::swap(p, splats));
         self.done(drawn)
     }
 
@@ -199,12 +199,6 @@ impl Player {
         }
         level.is_some()
     }
-}
-
-/// 0 to 1 -> 0 to 255, rounded. The sum with 2^23 leaves the integer in the low bits, which engines do faster than to convert.
-#[inline(always)]
-fn byte(v: f32) -> u8 {
-    (v.clamp(0.0, 1.0) * 255.0 + 8_388_608.0).to_bits() as u8
 }
 
 fn floats(values: &[f32]) -> Vec<u8> {

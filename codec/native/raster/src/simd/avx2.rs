@@ -7,7 +7,7 @@
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
 
-use super::{Vector, exp2_poly};
+use super::{MAGIC, Vector, exp2_poly, exp2_polys};
 
 #[derive(Clone, Copy)]
 pub struct F32x8(__m256);
@@ -132,6 +132,18 @@ impl Vector for F32x8 {
             let e = _mm256_slli_epi32::<23>(_mm256_add_epi32(_mm256_cvtps_epi32(n), _mm256_set1_epi32(127)));
             F32x8(_mm256_mul_ps(p.0, _mm256_castsi256_ps(e)))
         }
+    }
+    #[inline(always)]
+    fn exp2_near<const N: usize>(x: [Self; N]) -> [Self; N] {
+        let (up, mut p) = exp2_polys(x, Self::splat(MAGIC));
+        for (p, up) in p.iter_mut().zip(up) {
+            // SAFETY: see the head of this file.
+            unsafe {
+                let n = _mm256_slli_epi32::<23>(_mm256_castps_si256(up.0));
+                p.0 = _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p.0), n));
+            }
+        }
+        p
     }
     #[inline(always)]
     fn split_exponent(self) -> (Self, Self) {

@@ -7,7 +7,7 @@
 use std::arch::x86_64::*;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
-use super::{Vector, exp2_poly};
+use super::{MAGIC, Vector, exp2_poly, exp2_polys};
 
 #[derive(Clone, Copy)]
 pub struct F32x16(__m512);
@@ -121,6 +121,18 @@ impl Vector for F32x16 {
             let p = exp2_poly(self - F32x16(n));
             F32x16(_mm512_scalef_ps(p.0, n))
         }
+    }
+    #[inline(always)]
+    fn exp2_near<const N: usize>(x: [Self; N]) -> [Self; N] {
+        let (up, mut p) = exp2_polys(x, Self::splat(MAGIC));
+        for (p, up) in p.iter_mut().zip(up) {
+            // SAFETY: see the head of this file.
+            unsafe {
+                let n = _mm512_slli_epi32::<23>(_mm512_castps_si512(up.0));
+                p.0 = _mm512_castsi512_ps(_mm512_add_epi32(_mm512_castps_si512(p.0), n));
+            }
+        }
+        p
     }
     #[inline(always)]
     fn split_exponent(self) -> (Self, Self) {

@@ -1,11 +1,14 @@
 //! One vector interface for all kernels. A kernel is written once, generic over `Vector`; the instances are `f32` (the plain
-//! reference), AVX2 + FMA and AVX-512, chosen at run time by `Level`, and WebAssembly simd128, chosen by the build. `dispatch!` makes the entry point of a kernel: it
-//! compiles the instance inside a function that has the target features, which is what lets the intrinsics inline.
+//! reference), AVX2 + FMA and AVX-512, chosen at run time by `Level`, WebAssembly simd128, chosen by the build, and a portable
+//! one for all other machines, ARM above all. `dispatch!` makes the entry point of a kernel: it compiles the instance inside a
+//! function that has the target features, which is what lets the intrinsics inline.
 
 #[cfg(target_arch = "x86_64")]
 pub mod avx2;
 #[cfg(target_arch = "x86_64")]
 pub mod avx512;
+#[cfg(not(target_family = "wasm"))]
+pub mod portable;
 mod scalar;
 #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
 pub mod wasm128;
@@ -54,6 +57,11 @@ pub trait Vector:
     fn negative(self) -> Self;
     /// 2^x, relative error below 5e-6 for -126 <= x <= 126; 0 or infinity far outside.
     fn exp2(self) -> Self;
+    /// 2^x as `exp2` of several independent vectors, for -126 <= x <= 126 only; anything for other x.
+    #[inline(always)]
+    fn exp2_near<const N: usize>(x: [Self; N]) -> [Self; N] {
+        x.map(Self::exp2)
+    }
     /// (m, e) with x = m 2^e, m in [1, 2), for positive normal x.
     fn split_exponent(self) -> (Self, Self);
     fn ge(self, b: Self) -> Self::Mask;
@@ -109,6 +117,9 @@ pub(crate) fn prefetch<T>(items: &[T], index: usize) {
     let _ = (items, index);
 }
 
+/// 1.5 * 2^23: adding it rounds to whole numbers, which then stand in the low bits.
+pub(crate) const MAGIC: f32 = 12_582_912.0;
+
 /// Minimax polynomial of 2^f on [-0.5, 0.5], degree 4, relative error 2.6e-6.
 #[inline(always)]
 pub(crate) fn exp2_poly<V: Vector>(f: V) -> V {
@@ -118,6 +129,23 @@ pub(crate) fn exp2_poly<V: Vector>(f: V) -> V {
     f.mul_add(p, c(9.999_992e-1))
 }
 
+/// x + magic, and 2^(x rounded down or up to a whole number - x); step by step for all of them, which hides the latency.
+#[inline(always)]
+pub(crate) fn exp2_polys<V: Vector, const N: usize>(x: [V; N], magic: V) -> ([V; N], [V; N]) {
+    let up = x.map(|x| x + magic);
+    let mut f = x;
+    for i in 0..N {
+        f[i] = x[i] - (up[i] - magic);
+    }
+    let mut p = [c::<V>(9.570_097e-3); N];
+    for k in [5.591_786e-2, 2.402_474_5e-1, 6.931_218e-1, 9.999_992e-1] {
+        for i in 0..N {
+            p[i] = f[i].mul_add(p[i], c(k));
+        }
+    }
+    (up, p)
+}
+
 /// An instruction set that this machine has been found to have. There is no other way to make one, so kernels may rely on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Level(Isa);
@@ -125,6 +153,8 @@ pub struct Level(Isa);
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Isa {
     Scalar,
+    #[cfg(not(target_family = "wasm"))]
+    Portable,
     #[cfg(target_arch = "x86_64")]
     Avx2,
     #[cfg(target_arch = "x86_64")]
@@ -152,6 +182,8 @@ impl Level {
         }
         #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
         found.push(Level(Isa::Wasm128));
+        #[cfg(not(target_family = "wasm"))]
+        found.push(Level(Isa::Portable));
         found.push(Level::SCALAR);
         found
     }
@@ -163,6 +195,8 @@ impl Level {
     pub fn name(self) -> &'static str {
         match self.0 {
             Isa::Scalar => "scalar",
+            #[cfg(not(target_family = "wasm"))]
+            Isa::Portable => "portable",
             #[cfg(target_arch = "x86_64")]
             Isa::Avx2 => "avx2",
             #[cfg(target_arch = "x86_64")]
@@ -199,12 +233,16 @@ macro_rules! dispatch {
                     $crate::simd::Isa::Avx512 => return unsafe { avx512($($arg),*) },
                     // SAFETY: as above.
                     $crate::simd::Isa::Avx2 => return unsafe { avx2($($arg),*) },
-                    $crate::simd::Isa::Scalar => {}
+                    $crate::simd::Isa::Portable | $crate::simd::Isa::Scalar => {}
                 }
             }
             #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
             if level.isa() == $crate::simd::Isa::Wasm128 {
                 return $kernel::<$crate::simd::wasm128::F32x4>($($arg),*);
+            }
+            #[cfg(not(target_family = "wasm"))]
+            if level.isa() == $crate::simd::Isa::Portable {
+                return $kernel::<$crate::simd::portable::F32x4>($($arg),*);
             }
             let _ = level;
             $kernel::<f32>($($arg),*)

@@ -5,7 +5,7 @@
 use std::arch::wasm32::*;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
 
-use super::{Vector, exp2_poly};
+use super::{MAGIC, Vector, exp2_poly, exp2_polys};
 
 #[derive(Clone, Copy)]
 pub struct F32x4(v128);
@@ -55,10 +55,6 @@ fn sum4(a: v128, b: v128, c: v128, d: v128) -> v128 {
     let cd = f32x4_add(i32x4_shuffle::<0, 4, 1, 5>(c, d), i32x4_shuffle::<2, 6, 3, 7>(c, d));
     f32x4_add(i32x4_shuffle::<0, 1, 4, 5>(ab, cd), i32x4_shuffle::<2, 3, 6, 7>(ab, cd))
 }
-
-/// 1.5 * 2^23: adding it rounds to whole numbers, which then stand in the low bits. Engines convert to integers slowly, since
-/// they must saturate.
-const ROUND: f32 = 12_582_912.0;
 
 impl Vector for F32x4 {
     const LANES: usize = 4;
@@ -121,11 +117,17 @@ impl Vector for F32x4 {
         // pmin and pmax return their first operand where the second is NaN or not beyond it
         let x = f32x4_pmax(self.0, f32x4_splat(-127.0));
         let x = f32x4_pmin(x, f32x4_splat(128.0));
-        let z = f32x4_add(x, f32x4_splat(ROUND));
-        let p = exp2_poly(F32x4(f32x4_sub(x, f32x4_sub(z, f32x4_splat(ROUND)))));
+        // engines convert to integers slowly, since they must saturate
+        let z = f32x4_add(x, f32x4_splat(MAGIC));
+        let p = exp2_poly(F32x4(f32x4_sub(x, f32x4_sub(z, f32x4_splat(MAGIC)))));
         // 2^n from the exponent field: 0 for n = -127, infinity for n = 128
         let e = i32x4_shl(i32x4_add(z, i32x4_splat(127)), 23);
         F32x4(f32x4_mul(p.0, e))
+    }
+    #[inline(always)]
+    fn exp2_near<const N: usize>(x: [Self; N]) -> [Self; N] {
+        let (up, p) = exp2_polys(x, Self::splat(MAGIC));
+        std::array::from_fn(|i| F32x4(i32x4_add(p[i].0, i32x4_shl(up[i].0, 23))))
     }
     #[inline(always)]
     fn split_exponent(self) -> (Self, Self) {
