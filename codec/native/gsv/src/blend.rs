@@ -42,7 +42,7 @@ impl Blend {
 }
 
 /// Gaussians that share a search.
-const RUN: usize = 32;
+const RUN: usize = 128;
 
 /// Weights of spec 13.2 from one more neighbour than there are weights.
 fn weights(found: &[(u64, u32)], nodes: usize, index: &mut [u32], weight: &mut [f32]) {

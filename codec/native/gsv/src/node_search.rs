@@ -71,7 +71,9 @@ impl NodeSearch {
             .sums(&mut d, |a, v| (v - box_[a].0).abs().max((v - box_[a].1).abs()));
         let mut farthest = [f64::INFINITY; NEAREST_MAX];
         for d in &d {
-            insert(&mut farthest[..self.count], *d);
+            if *d < farthest[self.count - 1] {
+                insert(&mut farthest[..self.count], *d);
+            }
         }
         let reach = farthest[self.count - 1];
         self.nodes
