@@ -13,7 +13,7 @@ ROOT = Path(gscodec.__file__).parent
 FOLDERS = {"bench": Path(gscodec.bench.__file__).parent, "player": Path(gscodec.player.__file__).parent}
 BASE = {"errors", "gaussians", "camera", "frames", "_native"}
 ALLOWED = {
-    "bench": BASE | {"capture", "decode", "encode", "metrics", "render", "splats", "train"},
+    "bench": BASE | {"bitstream", "capture", "decode", "encode", "metrics", "render", "splats", "train"},
     "bitstream": BASE,
     "capture": BASE,
     "splats": BASE | {"capture"},
