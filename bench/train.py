@@ -3,8 +3,8 @@
 One entry of bench/results/train.json per (capture, recipe, preset): capture, recipe, preset, seconds_per_frame, psnr,
 psnr_fg, ssim, gaussians, kb_per_frame, flicker, all on the test cameras. What gscodec trains is measured twice: before
 coding ("model", no size) and decoded from the stream ("gscodec"). "alone" trains a keyframe for every frame it is asked
-for, with the keyframe budget of the preset: what tracking is to be compared with (no size, and flicker only where all
-frames are there).
+for, with the keyframe budget of the preset: what tracking is to be compared with. "v3" is V3's recipe at about the time
+that our preset medium takes (baselines/v3.py). Both have no size of their own.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gscodec.bench.machine import write_result
 from gscodec.errors import UsageError
 
 CAPTURES = ("lumberjack", "stage")
-RECIPES = ("gscodec", "alone")
+RECIPES = ("gscodec", "alone", "v3")
 KEYS = ("psnr", "psnr_fg", "ssim", "gaussians", "kb_per_frame", "flicker")
 
 
@@ -41,7 +41,7 @@ def measure(capture_name: str, recipe: str, preset: str, frames: str | None, dat
         raise UsageError(f"{folder} does not exist")
     capture = open_capture(folder)
     chosen = range(capture.frame_count)[slice(*(int(x) if x else None for x in (frames or ":").split(":")))]
-    run = {"gscodec": _ours, "alone": _alone}[recipe]
+    run = {"gscodec": _ours, "alone": _alone, "v3": _v3}[recipe]
     for name, seconds, size, result in run(capture, chosen, preset, quality):
         yield {
             "capture": capture_name,
@@ -101,6 +101,15 @@ def _alone(capture, frames: range, preset: str, quality: float):
         train_keyframe(model, Views(capture, 0), frame, settings, steps=settings.keyframe_steps, radius=radius)
         models.append(model.gaussians())
     yield "alone", time.perf_counter() - start, None, _evaluate(_part(capture, frames), models)
+
+
+def _v3(capture, frames: range, preset: str, quality: float):
+    from gscodec.bench.baselines.v3 import train_v3
+    from gscodec.train.settings import train_settings
+
+    part, start = _part(capture, frames), time.perf_counter()
+    models = train_v3(part, range(len(frames)), train_settings(preset))
+    yield "v3", time.perf_counter() - start, None, _evaluate(part, models)
 
 
 def _part(capture, frames: range):

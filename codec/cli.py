@@ -299,7 +299,7 @@ def bench_rd(
 @bench.command("train")
 def bench_train(
     capture: Annotated[str | None, typer.Option(help="Comma-separated: lumberjack, stage.")] = None,
-    recipe: Annotated[str | None, typer.Option(help="Comma-separated: gscodec, alone (every frame by itself).")] = None,
+    recipe: Annotated[str | None, typer.Option(help="Comma-separated: gscodec, alone (every frame), v3.")] = None,
     preset: Preset = "medium",
     frames: Annotated[str | None, typer.Option(metavar="A:B:STEP", help="Only these frames.")] = None,
     quality: Quality = 50.0,

@@ -17,6 +17,7 @@ from gscodec import _native
 from gscodec.bitstream.quantization import trajectory_step
 from gscodec.bitstream.transform import dct_basis
 from gscodec.gaussians import Nodes as GivenNodes
+from gscodec.sampling import farthest_points
 
 NEIGHBORS = 4  # nodes that a Gaussian blends
 NODE_COUNTS = (1, 16, 64, 256, 1024)
@@ -56,18 +57,6 @@ class NodeMotion:
 
     carried: np.ndarray
     turned: np.ndarray
-
-
-def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """[count] indices of `points` [N, 3], each the farthest from those before it; starts nearest to the centre."""
-    points = points - points.mean(0)
-    square = (points**2).sum(1)
-    chosen, distance = [], np.full(len(points), np.inf)
-    while len(chosen) < min(count, len(points)):
-        chosen.append(int(distance.argmax() if chosen else square.argmin()))
-        p = points[chosen[-1]]
-        np.minimum(distance, square - 2 * (points @ p) + p @ p, out=distance)
-    return np.array(chosen)
 
 
 def rotvec_to_quat(v: np.ndarray) -> np.ndarray:

@@ -1,1 +1,1 @@
-"""Capture -> GaussianSequence: keyframe, hash-grid motion, joint fine-tuning. Needs the extra `encode`."""
+"""Capture -> GaussianSequence: keyframe, tracking by a node graph, joint fine-tuning. Needs the extra `encode`."""

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 
 from gscodec import _native
+from gscodec.sampling import farthest_points
 
-NODES = 256  # 64 and 1000 track as well (bench/results/ablation.json)
+NODES = 256  # 1000 track as well
 BLENDED = 4  # nodes that carry one Gaussian
 EDGES = 8  # neighbours of a node in the rigidity term
 GRID = 1e-3  # of the radius: the lattice on which neighbours and weights are computed
@@ -132,13 +133,3 @@ class NodeGraph:
         turned = torch.einsum("mij,mkj->mki", quat_to_matrix(pose.turned), edge)
         missed = turned - (pose.nodes[self._edges] - pose.nodes[:, None])
         return (self._hold * missed).square().sum(2).add(1e-12).sqrt().mean()
-
-
-def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """[count] indices of `points` [N, 3], each the farthest from those before it; starts nearest to the centre."""
-    chosen = [int(((points - points.mean(0)) ** 2).sum(1).argmin())]
-    distance = ((points - points[chosen[0]]) ** 2).sum(1)
-    for _ in range(min(count, len(points)) - 1):
-        chosen.append(int(distance.argmax()))
-        np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(1), out=distance)
-    return np.array(chosen)

@@ -5,8 +5,8 @@ Gaussians' own attributes. The colours must be free while the nodes move: shadin
 with fixed colours the motion follows the shading instead of the surface (lumberjack: 22.5 dB after 6 frames, with free
 colours 26.1). The first half of the steps looks at small pictures, where large motion is near and a step is cheap.
 
-A hash grid and MLP in place of the nodes, or on top of them, gave nothing here (bench/results/ablation.json), so that
-there is none: the nodes are what the stream can carry.
+A hash grid and MLP (V3) on top of the nodes gave nothing here, so that there is none: the nodes are what the stream can
+carry. V3's recipe, with the grid, is a baseline in bench/baselines/v3.py.
 """
 
 from __future__ import annotations

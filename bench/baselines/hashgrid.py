@@ -1,4 +1,4 @@
-"""Multi-resolution hash grid (Instant-NGP, Mueller et al. 2022): native forward and backward, and the plain reference.
+"""Multi-resolution hash grid (Instant-NGP, Mueller et al. 2022) of V3's motion field: native, and the plain reference.
 
 [N, 3] in [0, 1] -> [N, levels * features]. Levels grow geometrically from base_resolution to max_resolution cells on a
 side; a level whose vertices fit the table is dense, the others are hashed. The MLP behind it stays in torch.
