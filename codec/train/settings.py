@@ -37,7 +37,7 @@ class TrainSettings:
     mask_lambda: float = 0.1
     cut_ratio: float = 2.0
     rigidity: float = 0.1
-    rate_lambda: float = 0.04
+    rate_lambda: float = 0.02
     temporal_lambda: float = 0.01
     quality: float = 50.0
     seed: int = 0
