@@ -76,6 +76,20 @@ class Pose:
         return Pose(graph.nodes, rotvec_to_quat(zero), zero, zero)
 
 
+class _Weighted(torch.autograd.Function):
+    """Sparse weights [N, M] times rows [M, C]; scipy's product takes a tenth of the time of gathering rows in torch."""
+
+    @staticmethod
+    def forward(ctx, rows, weights, transposed):
+        ctx.transposed = transposed
+        return torch.from_numpy(weights @ rows.detach().numpy())
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        return torch.from_numpy(ctx.transposed @ grad.numpy()), None, None
+
+
 class NodeGraph:
     """Nodes of a keyframe and the weights by which they carry its Gaussians.
 
@@ -88,6 +102,7 @@ class NodeGraph:
     """
 
     def __init__(self, means: torch.Tensor, radius: float, count: int = NODES):
+        from scipy.sparse import csr_matrix
         from scipy.spatial import cKDTree
 
         self.means = means
@@ -96,8 +111,13 @@ class NodeGraph:
         chosen = np.unique(grid[farthest_points(means.numpy(), count)], axis=0)
         chosen = chosen[_native.morton_order(chosen)]
         index, weight = _native.node_weights(grid, chosen, BLENDED)
-        self.index = torch.from_numpy(index.astype(np.int64))
-        self.weight = torch.from_numpy(weight.astype(np.float32))[..., None]
+        parts = (
+            weight.astype(np.float32).ravel(),
+            index.astype(np.int32).ravel(),
+            index.shape[1] * np.arange(len(grid) + 1),
+        )
+        self._blend = csr_matrix(parts, (len(grid), len(chosen)))  # [N, M]
+        self._gather = self._blend.T.tocsr()
         self.nodes = low + step * torch.from_numpy(chosen.astype(np.float32))
         m, k = len(chosen), min(EDGES, len(chosen) - 1)
         near = cKDTree(self.nodes.numpy()).query(self.nodes.numpy(), k + 1)[1].reshape(m, -1)[:, 1:]
@@ -121,8 +141,8 @@ class NodeGraph:
         R = quat_to_matrix(pose.turned)
         offset = pose.nodes - torch.einsum("mij,mj->mi", R, self.nodes)
         rows = torch.cat([R.flatten(1), offset, pose.turned], 1)
-        blend = (rows[self.index] * self.weight).sum(1)
-        means = torch.einsum("nij,nj->ni", blend[:, :9].view(-1, 3, 3), x) + blend[:, 9:12]
+        blend = _Weighted.apply(rows, self._blend, self._gather)
+        means = (blend[:, :9].view(-1, 3, 3) * x[:, None]).sum(2) + blend[:, 9:12]
         return means, torch.nn.functional.normalize(blend[:, 12:], dim=1)
 
     def rigidity(self, pose: Pose) -> torch.Tensor:
