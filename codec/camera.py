@@ -63,3 +63,29 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     m[:3, :3] = R
     m[:3, 3] = -R @ eye
     return m
+
+
+GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+
+
+def cameras_around(
+    points: np.ndarray, count: int, *, name: str, size: int = 512, focal: float = 1.2, turn: float = 0.0
+) -> list[Camera]:
+    """Cameras in Fibonacci directions around the box of the 1st to 99th percentile of `points` ([N, 3]); even ones have
+    its bounding sphere just in frame, odd ones stand at half that distance.
+
+    Args:
+        size: width and height; focal: focal length in widths; turn: of all directions about z, radians.
+    """
+    low, high = np.percentile(points, (1, 99), axis=0)
+    center, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    f = focal * size
+    distance = radius / np.sin(np.arctan(0.5 * size / f))
+    K = np.array([[f, 0, size / 2], [0, f, size / 2], [0, 0, 1]])
+    cameras = []
+    for i in range(count):
+        z, angle = 1 - (2 * i + 1) / count, i * GOLDEN_ANGLE + turn
+        direction = np.array([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z])
+        eye = center + direction * distance * (0.5 if i % 2 else 1)
+        cameras.append(Camera(f"{name}{i:02}", K, look_at(eye, center, (0, 0, 1)), size, size, split="test"))
+    return cameras

@@ -42,7 +42,8 @@ def build() -> None:
     """
     command = ["cargo", "build", "--quiet", "--profile", "wasm", "--target", TARGET, "-p", "bindings"]
     command += ["--no-default-features", "--features", "wasm"]
-    env = dict(os.environ, RUSTFLAGS=" ".join(["-C target-feature=+simd128", *_remaps()]))
+    flags = ["-C target-feature=+simd128", "-C link-arg=--strip-all", *_remaps()]
+    env = dict(os.environ, RUSTFLAGS=" ".join(flags))
     if not _has_target():
         command += ["-Z", "build-std=std,panic_abort"]
         env |= {"RUSTC_BOOTSTRAP": "1", "CARGO_TARGET_WASM32_UNKNOWN_UNKNOWN_LINKER": "rust-lld"}

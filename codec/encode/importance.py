@@ -13,12 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from gscodec.bitstream.color import TO_RGB
-from gscodec.camera import Camera, look_at
+from gscodec.camera import Camera, cameras_around
 from gscodec.gaussians import Gaussians
 from gscodec.render.workspace import PARAMETERS, Workspace, call
 
-VIEWS, SIZE, FOCAL = 24, 512, 1.2
-GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+VIEWS, SIZE = 24, 512
 # Beyond these steps the derivative says too little; means are in radii of the subject.
 COARSEST = {"means": 0.02, "log_scales": 1.0, "quats": 0.25, "logit_opacities": 2.0, "sh0": 1.0, "shN": 1.0}
 
@@ -45,22 +44,7 @@ def sensitivity_cameras(means: np.ndarray, given: list[Camera] = ()) -> list[Cam
     of them are those of the capture, if they are `given`: they may stand within the scene."""
     taken = [given[i] for i in np.linspace(0, len(given) - 1, min(len(given), VIEWS // 2)).round().astype(int)]
     fitted = [c.resized(SIZE, max(1, round(SIZE * c.height / c.width))) for c in taken]
-    return fitted + _sphere(means, VIEWS - len(taken))
-
-
-def _sphere(means: np.ndarray, count: int) -> list[Camera]:
-    low, high = np.percentile(means, (1, 99), axis=0)
-    center, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
-    f = FOCAL * SIZE
-    distance = radius / np.sin(np.arctan(0.5 * SIZE / f))
-    K = np.array([[f, 0, SIZE / 2], [0, f, SIZE / 2], [0, 0, 1]])
-    cameras = []
-    for i in range(count):
-        z, turn = 1 - (2 * i + 1) / count, i * GOLDEN_ANGLE + 1.3
-        direction = np.array([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z])
-        eye = center + direction * distance * (0.5 if i % 2 else 1)
-        cameras.append(Camera(f"sensitivity{i:02}", K, look_at(eye, center, (0, 0, 1)), SIZE, SIZE))
-    return cameras
+    return fitted + cameras_around(means, VIEWS - len(taken), name="sensitivity", turn=1.3)
 
 
 def measure(frames: list[Gaussians], cameras: list[Camera] = ()) -> Importance:

@@ -7,7 +7,7 @@ and the mask term needs only a margin of it.
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -97,9 +97,8 @@ def shrink(target: Target, scale: float) -> Target:
     share = (alpha / np.float32(255))[..., None]
     small = cv2.resize(share, size, interpolation=cv2.INTER_AREA)
     rgb = cv2.resize(target.rgb * share, size, interpolation=cv2.INTER_AREA) / np.maximum(small, 1e-3)[..., None]
-    K = target.camera.K * np.array([[size[0] / width], [size[1] / height], [1.0]])
     return Target(
-        replace(target.camera, K=K, width=size[0], height=size[1]),
+        target.camera.resized(*size),
         np.rint(rgb.clip(0, 255)).astype(np.uint8),
         None if target.alpha is None else np.rint(255 * small).astype(np.uint8),
     )
