@@ -4,6 +4,8 @@ As its public code does it: a hash grid of 16 levels x 4 features with 2^15 entr
 of a Gaussian to its translation and rotation while the attributes are held; then all attributes are fine-tuned. 800 and
 2,000 steps there; here as many as the time of our own preset allows, in the same proportion. The residual-entropy term
 of the public code has no gradient to speak of and is left out; the rate is that of its packing, see videogs.py.
+
+Its learning rates are not tuned for so few steps: until they are, its figures say nothing about V3.
 """
 
 from __future__ import annotations
