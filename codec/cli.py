@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import sys
 import warnings
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -241,6 +242,17 @@ bench = typer.Typer(help="Measurements, as JSON that charts are drawn from.", no
 app.add_typer(bench, name="bench")
 
 
+def _show_entries(entries: Iterable[dict], as_json: bool, line: Callable[[dict], str]) -> None:
+    """Prints measurements: a line for each as it comes, or the JSON of all."""
+    found = []
+    for e in entries:
+        found.append(e)
+        if not as_json:
+            _out.print(line(e))
+    if as_json:
+        print(json.dumps(found, indent=1))
+
+
 @bench.command("raster")
 def bench_raster(
     scenes: Annotated[str | None, typer.Option(help="Comma-separated: capsule, statue, playbot, lumberjack.")] = None,
@@ -254,17 +266,14 @@ def bench_raster(
     """Speed of the rasterizer and of a training step, by scene, size, instruction set and threads."""
     from gscodec.commands import bench_raster as measure
 
-    entries = []
-    for e in measure(scenes, simd, threads, repeats=repeats, data=data, out=out):
-        entries.append(e)
-        if not as_json:
-            _out.print(
-                f"{e['scene']:<11}{e['gaussians']:>8} {e['width']:>4}x{e['height']:<5}{e['simd']:>8} x{e['threads']:<3}"
-                f"project {e['project_ms']:8.2f}  forward {e['forward_ms']:8.2f}  backward {e['backward_ms']:8.2f}  "
-                f"step {e['step_ms']:8.2f} ms"
-            )
-    if as_json:
-        print(json.dumps(entries, indent=1))
+    def line(e: dict) -> str:
+        return (
+            f"{e['scene']:<11}{e['gaussians']:>8} {e['width']:>4}x{e['height']:<5}{e['simd']:>8} x{e['threads']:<3}"
+            f"project {e['project_ms']:8.2f}  forward {e['forward_ms']:8.2f}  backward {e['backward_ms']:8.2f}  "
+            f"step {e['step_ms']:8.2f} ms"
+        )
+
+    _show_entries(measure(scenes, simd, threads, repeats=repeats, data=data, out=out), as_json, line)
 
 
 @bench.command("rd")
@@ -279,17 +288,15 @@ def bench_rd(
     """Size against quality of gscodec and its peers, with BD-rates."""
     from gscodec.commands import bench_rd as measure
 
-    entries = []
-    for e in measure(codec, sequence, data=data, work=work, out=out):
-        entries.append(e)
-        if not as_json:
-            _out.print(
-                f"{e['sequence']:<11}{e['codec']:<12}{e['setting']:<12}{e['kb_per_frame']:9.2f} kB/frame  "
-                f"{e['codec_psnr']:6.2f} dB  encode {e['encode_s_per_frame']:7.3f} s  "
-                f"decode {e['decode_ms_per_frame']:7.1f} ms a frame"
-            )
+    def line(e: dict) -> str:
+        return (
+            f"{e['sequence']:<11}{e['codec']:<12}{e['setting']:<12}{e['kb_per_frame']:9.2f} kB/frame  "
+            f"{e['codec_psnr']:6.2f} dB  encode {e['encode_s_per_frame']:7.3f} s  "
+            f"decode {e['decode_ms_per_frame']:7.1f} ms a frame"
+        )
+
+    _show_entries(measure(codec, sequence, data=data, work=work, out=out), as_json, line)
     if as_json:
-        print(json.dumps(entries, indent=1))
         return
     for r in json.loads(out.read_text())["bd_rate"] if out.exists() else []:
         span = "{:.1f} to {:.1f} dB".format(*r["psnr"])
@@ -312,17 +319,16 @@ def bench_train(
     """Quality against time and size of training, ours and every frame alone."""
     from gscodec.commands import bench_train as measure
 
-    entries = []
-    for e in measure(capture, recipe, preset=preset, frames=frames, quality=quality, data=data, out=out):
-        entries.append(e)
-        if not as_json:
-            size = "-" if e["kb_per_frame"] is None else f"{e['kb_per_frame']:.2f} kB/frame"
-            _out.print(
-                f"{e['capture']:<11}{e['recipe']:<8}{e['preset']:<7}{e['seconds_per_frame']:7.2f} s/frame  "
-                f"{e['psnr_fg'] or e['psnr']:6.2f} dB  {e['gaussians']:>6} Gaussians  {size}"
-            )
-    if as_json:
-        print(json.dumps(entries, indent=1))
+    def line(e: dict) -> str:
+        size = "-" if e["kb_per_frame"] is None else f"{e['kb_per_frame']:.2f} kB/frame"
+        return (
+            f"{e['capture']:<11}{e['recipe']:<8}{e['preset']:<7}{e['seconds_per_frame']:7.2f} s/frame  "
+            f"{e['psnr_fg'] or e['psnr']:6.2f} dB  {e['gaussians']:>6} Gaussians  {size}"
+        )
+
+    _show_entries(
+        measure(capture, recipe, preset=preset, frames=frames, quality=quality, data=data, out=out), as_json, line
+    )
 
 
 @app.command()

@@ -136,11 +136,6 @@ class GroupModel:
             total = total + laplace_bits(c + noise, self.log_scales[name]).sum()
         return total
 
-    @torch.no_grad()
-    def model(self, t: int) -> Model:
-        """Frame `t` as a model."""
-        return Model(self.frame(t))
-
     def nodes(self) -> Nodes:
         """The carrying motion, for the encoder."""
         rotations, near = [], None
@@ -153,7 +148,7 @@ class GroupModel:
 
     def gaussians(self, t: int) -> Gaussians:
         """Frame `t` in numpy."""
-        return self.model(t).gaussians()
+        return Model(self.frame(t)).gaussians()
 
 
 def _mean_of(graph: NodeGraph, tracked: list[Model], poses: list[Pose]) -> Model:

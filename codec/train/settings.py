@@ -13,7 +13,7 @@ class TrainSettings:
 
     Attributes:
         gop: most frames in a group.
-        keyframe_steps: optimisation steps for the first keyframe; later ones start warm and take half.
+        keyframe_steps: optimisation steps for a keyframe, which always starts from nothing.
         motion_steps: steps a frame for tracking.
         finetune_steps: steps a frame for the joint fine-tuning of the group.
         gaussians_max: bound on the count while densifying.
@@ -22,7 +22,6 @@ class TrainSettings:
         cut_ratio: a frame whose image loss exceeds the keyframe's by this factor starts a group of its own.
         rigidity: weight of the as-rigid-as-possible term.
         rate_lambda: loss per bit and pixel of the residual trajectories.
-        temporal_lambda: weight of frame-to-frame change of the residuals.
         quality: quantization the rate term assumes (0 to 100).
         seed: of everything random.
     """
@@ -38,7 +37,6 @@ class TrainSettings:
     cut_ratio: float = 2.0
     rigidity: float = 0.1
     rate_lambda: float = 0.02
-    temporal_lambda: float = 0.01
     quality: float = 50.0
     seed: int = 0
 
