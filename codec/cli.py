@@ -242,8 +242,8 @@ bench = typer.Typer(help="Measurements, as JSON that charts are drawn from.", no
 app.add_typer(bench, name="bench")
 
 
-def _show_entries(entries: Iterable[dict], as_json: bool, line: Callable[[dict], str]) -> None:
-    """Prints measurements: a line for each as it comes, or the JSON of all."""
+def _show_entries(entries: Iterable[dict], as_json: bool, line: Callable[[dict], str]) -> list[dict]:
+    """Prints measurements, a line for each as it comes, or the JSON of all, and returns them."""
     found = []
     for e in entries:
         found.append(e)
@@ -251,6 +251,7 @@ def _show_entries(entries: Iterable[dict], as_json: bool, line: Callable[[dict],
             _out.print(line(e))
     if as_json:
         print(json.dumps(found, indent=1))
+    return found
 
 
 @bench.command("raster")
@@ -305,7 +306,7 @@ def bench_rd(
 
 @bench.command("train")
 def bench_train(
-    capture: Annotated[str | None, typer.Option(help="Comma-separated: lumberjack, stage.")] = None,
+    capture: Annotated[str | None, typer.Option(help="Comma-separated cases, see bench/train.py.")] = None,
     recipe: Annotated[str | None, typer.Option(help="Comma-separated: gscodec, alone (every frame), v3.")] = None,
     preset: Preset = "medium",
     frames: Annotated[str | None, typer.Option(metavar="A:B:STEP", help="Only these frames.")] = None,
@@ -329,6 +330,29 @@ def bench_train(
     _show_entries(
         measure(capture, recipe, preset=preset, frames=frames, quality=quality, data=data, out=out), as_json, line
     )
+
+
+@bench.command("stress")
+def bench_stress(
+    case: Annotated[str | None, typer.Option(help="Comma-separated cases, see bench/stress_scenes.py.")] = None,
+    out: Annotated[Path, typer.Option(help="The result file; its other entries stay.")] = Path(
+        "bench/results/stress.json"
+    ),
+    as_json: Json = False,
+) -> None:
+    """Training on small captures of what breaks 4D methods; fails if one does worse than bench/stress.py states."""
+    from gscodec.commands import bench_stress as measure
+
+    def line(e: dict) -> str:
+        if "psnr_fg" not in e or e["psnr_fg"] is None:
+            return f"{e['case']:<20}{e['verdict']}"
+        return (
+            f"{e['case']:<20}{e['psnr_fg']:6.2f} dB, alone {e['psnr_fg_alone']:6.2f}  {e['gaussians']:>5} Gaussians  "
+            f"{e['kb_per_frame']:6.2f} kB/frame, alone {e['kb_per_frame_alone']:6.2f}  {e['verdict']}"
+        )
+
+    if any(e["verdict"].startswith("fails") for e in _show_entries(measure(case, out=out), as_json, line)):
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -359,9 +383,7 @@ def main() -> None:
     """Entry point of the `gscodec` command."""
     warnings.showwarning = _say
     try:
-        app(standalone_mode=False)
-    except typer.Exit as e:
-        sys.exit(e.exit_code)
+        sys.exit(app(standalone_mode=False))  # what a command returns, None, or the code of a typer.Exit
     except (typer.Abort, KeyboardInterrupt):
         print("stopped", file=sys.stderr)
         sys.exit(130)

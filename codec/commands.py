@@ -6,6 +6,7 @@ eval:   stream + capture or splats -> metrics                       bench:  scen
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -18,6 +19,7 @@ from gscodec.encode.encode import EncodeReport, EncodeSettings, encode_groups, s
 from gscodec.errors import UsageError, require
 from gscodec.frames import frame_range
 from gscodec.gaussians import GaussianSequence, Group
+from gscodec.part_file import part_file
 from gscodec.progress import Bar
 
 AXES = ("x", "y", "z")
@@ -164,17 +166,34 @@ def up_axis(cameras: list[Camera]) -> str:
 def train_to_folder(
     source: Path, folder: Path, *, preset: str, frames: str | None, gop: int, quality: float, bar: Bar
 ) -> int:
-    """Trains a capture and writes one .ply per frame and sequence.json; returns the number of frames."""
+    """Trains a capture and writes one .ply per frame and sequence.json; returns the number of frames.
+
+    What an earlier run with the same settings left unfinished goes on where it stopped.
+    """
     require("torch", "training a capture")
     from gscodec.splats import SequenceWriter
     from gscodec.train.settings import train_settings
-    from gscodec.train.train import train_groups
+    from gscodec.train.train import Checkpoint, train_groups
 
     capture = _open_capture(source, frames)
     recipe = train_settings(preset, gop=gop, quality=quality)
-    writer = SequenceWriter(folder, capture.fps, capture.cameras)
-    for group in train_groups(capture, recipe, on_progress=lambda p: bar.update(p.stage, p.done, p.total)):
+    work, unfinished = folder / "work", folder / "unfinished.json"
+    made_by = json.dumps({"input": str(source.resolve()), "frames": frames, **asdict(recipe)})
+    same = unfinished.is_file() and unfinished.read_text() == made_by
+    writer = SequenceWriter(folder, capture.fps, capture.cameras, resume=same)
+    with part_file(unfinished) as part:
+        part.write_text(made_by)
+    groups = train_groups(
+        capture,
+        recipe,
+        first_frame=writer.frame_count,
+        checkpoints=work,
+        on_progress=lambda p: bar.update(p.stage, p.done, p.total),
+    )
+    for group in groups:
         writer.add(group)
+    unfinished.unlink()
+    Checkpoint(work).clear()
     return writer.frame_count
 
 
@@ -268,13 +287,26 @@ def bench_train(
         UsageError: an unknown capture or recipe, or no data folder.
     """
     require("torch", "measuring training")
-    from gscodec.bench.train import CAPTURES, RECIPES, measure, update
+    from gscodec.bench.train import CASES, RECIPES, measure, update
 
     if data is None:
         raise UsageError("bench train needs the data folder, set --data or GSCODEC_DATA")
-    for capture in _names("--capture", captures, CAPTURES) or CAPTURES:
+    for capture in _names("--capture", captures, CASES) or CASES:
         for recipe in _names("--recipe", recipes, RECIPES) or RECIPES:
             yield from update(out, measure(capture, recipe, preset, frames, data, quality))
+
+
+def bench_stress(cases: str | None, *, out: Path) -> Iterator[dict]:
+    """Yields what bench.stress measures (comma-separated cases, None: all), and puts it into `out` as it comes.
+
+    Raises:
+        UsageError: an unknown case.
+    """
+    require("torch", "measuring training")
+    from gscodec.bench.stress import measure
+    from gscodec.bench.stress_scenes import SCENES
+
+    yield from measure(_names("--case", cases, SCENES) or list(SCENES), out)
 
 
 def _names(option: str, text: str | None, known) -> list[str] | None:

@@ -6,7 +6,6 @@ checkpoint holds what the next one starts from; a run that stops goes on there.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ import torch
 from gscodec.bitstream.quantization import steps_for, subject_radius
 from gscodec.errors import CaptureError
 from gscodec.gaussians import Group
+from gscodec.part_file import read_arrays, write_arrays
 from gscodec.train.carve import carve, random_box
 from gscodec.train.finetune import GroupModel, finetune
 from gscodec.train.graph import Pose
@@ -77,31 +77,23 @@ class Checkpoint:
         return self.folder / f"before_{next_frame:06d}.npz"
 
     def save(self, next_frame: int, subject: Subject | None) -> None:
-        """Writes the subject as it is before `next_frame`, atomically, and drops older ones; None needs no file."""
+        """Writes the subject as it is before `next_frame`, atomically; None needs no file. Of the older ones the last
+        stays, since the stream may not have the group between them yet."""
         if self.folder is None or subject is None:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
-        old = list(self.folder.glob("before_*.npz"))
-        part = self.folder / "writing.npz"
-        np.savez(part, **subject.state())
-        os.replace(part, self._path(next_frame))
-        for path in old[:-1]:  # the newest but one stays: the stream may not have the last group yet
+        write_arrays(self._path(next_frame), subject.state())
+        for path in sorted(p for p in self.folder.glob("before_*.npz") if p < self._path(next_frame))[:-1]:
             path.unlink()
 
     def load(self, next_frame: int) -> dict | None:
         """The state that `save` wrote for `next_frame`, or None."""
-        if self.folder is None or not self._path(next_frame).exists():
-            return None
-        try:
-            with np.load(self._path(next_frame)) as z:
-                return dict(z)
-        except (OSError, ValueError, KeyError):
-            return None
+        return None if self.folder is None else read_arrays(self._path(next_frame))
 
     def clear(self) -> None:
-        """Removes the folder once the run is complete."""
+        """Removes the folder: the run is complete, or another one begins."""
         if self.folder is not None and self.folder.is_dir():
-            for path in self.folder.glob("*.npz"):
+            for path in self.folder.glob("before_*"):
                 path.unlink()
             self.folder.rmdir()
 
@@ -157,6 +149,8 @@ def train_groups(
     torch.set_num_threads(1)
     store = Checkpoint(checkpoints)
     run = _Run(capture, settings, on_progress)
+    if not first_frame:
+        store.clear()  # what an earlier run with other settings may have left
     state = store.load(first_frame) if first_frame else None  # absent after a cut, too
     if state is not None:
         run.subject = Subject.restored(state, run.views, settings)
@@ -198,6 +192,7 @@ class _Run:
     def group(self, frames: range) -> Group:
         """Trains one group; it ends before `frames` does where the Gaussians no longer serve."""
         track = _Track([], [])
+        self.views.restart()
         if self.subject is not None:
             self._follow(frames, track)
         parents = np.arange(len(self.subject.tracker.own), dtype=np.int32) if track.models else None
