@@ -36,6 +36,9 @@ Stream = Annotated[Path, typer.Argument(metavar="OUT.gsv", help="A .gsv file.")]
 Frames = Annotated[str | None, typer.Option(metavar="A:B", help="Only frames A to B-1.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Gop = Annotated[int, typer.Option(help="Frames in a group.")]
+RandomAccess = Annotated[
+    int, typer.Option(metavar="N", help="Frames from one independent group to the next at most; 0: no prediction.")
+]
 Preset = Annotated[str, typer.Option(help="Training budget: fast, medium or slow.")]
 Quality = Annotated[float, typer.Option(help="0 (small) to 100 (fine).")]
 
@@ -67,10 +70,11 @@ def encode(
     frames: Frames = None,
     gop: Gop = 20,
     keep_all: Annotated[bool, typer.Option("--keep-all", help="Keep Gaussians that nobody can see.")] = False,
-    random_access: Annotated[
-        int, typer.Option(metavar="N", help="Frames from one independent group to the next at most; 0: no prediction.")
-    ] = 60,
+    random_access: RandomAccess = 60,
     layers: Annotated[int, typer.Option(help="Layers of importance; the first ones alone are a coarser picture.")] = 1,
+    ray: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Train on this Ray cluster; its machines see SEQ too.")
+    ] = None,
     report: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the report there.")] = None,
 ) -> None:
     """Capture or Gaussian sequence to a stream. A second run resumes; Ctrl-C leaves a playable file."""
@@ -80,7 +84,7 @@ def encode(
 
     with Bar() as bar:
         settings = EncodeSettings(quality, _bits(bitrate), keep_all, random_access, layers)
-        result = encode_input(seq, out, settings, preset=preset, frames=frames, gop=gop, bar=bar)
+        result = encode_input(seq, out, settings, preset=preset, frames=frames, gop=gop, cluster=ray, bar=bar)
     if report:
         report.write_text(json.dumps(result.to_json(), indent=1))
     if result.groups == 0:
@@ -112,6 +116,7 @@ def train(
     preset: Preset = "medium",
     frames: Frames = None,
     gop: Gop = 20,
+    random_access: RandomAccess = 60,
     quality: Quality = 50.0,
 ) -> None:
     """Capture to one .ply per frame, the first half of encode."""
@@ -119,7 +124,8 @@ def train(
     from gscodec.progress import Bar
 
     with Bar() as bar:
-        count = train_to_folder(capture, folder, preset=preset, frames=frames, gop=gop, quality=quality, bar=bar)
+        options = {"preset": preset, "frames": frames, "gop": gop, "random_access": random_access, "quality": quality}
+        count = train_to_folder(capture, folder, **options, bar=bar)
     _out.print(f"{folder}: {count} frames")
 
 

@@ -10,6 +10,7 @@ import json
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -33,9 +34,10 @@ def encode_input(
     preset: str,
     frames: str | None,
     gop: int,
+    cluster: str | None = None,
     bar: Bar,
 ) -> EncodeReport:
-    """Encodes a capture or splats at `source` into the file `out`.
+    """Encodes a capture or splats at `source` into the file `out`. `cluster`: address of the Ray cluster that trains.
 
     Raises:
         UsageError, CaptureError: see the message.
@@ -50,8 +52,10 @@ def encode_input(
     kind = detect_input(source)
     out.parent.mkdir(parents=True, exist_ok=True)
     if kind == "splats":
+        if cluster:
+            raise UsageError(f"--ray {cluster}: {source} holds splats, which need no training; leave --ray away")
         return _encode_splats(source, out, settings, frames, gop, bar)
-    return _encode_capture(source, out, settings, preset, frames, gop, bar)
+    return _encode_capture(source, out, settings, preset, frames, gop, cluster, bar)
 
 
 def _encode_splats(source, out, settings, frames, gop, bar) -> EncodeReport:
@@ -111,7 +115,7 @@ def _restrict(sequence: GaussianSequence, frames: str | None) -> GaussianSequenc
     return sequence.with_groups(groups)
 
 
-def _encode_capture(source, out, settings, preset, frames, gop, bar) -> EncodeReport:
+def _encode_capture(source, out, settings, preset, frames, gop, cluster, bar) -> EncodeReport:
     require("torch", "training a capture")
     from gscodec.train.settings import train_settings
     from gscodec.train.train import Checkpoint, train_groups
@@ -119,6 +123,25 @@ def _encode_capture(source, out, settings, preset, frames, gop, bar) -> EncodeRe
     capture = _open_capture(source, frames)
     recipe = train_settings(preset, gop=gop, quality=settings.quality)
     work = out.with_name(out.name + ".work")
+
+    def groups(_, first_frame: int) -> Iterator[Group]:
+        if cluster:
+            from gscodec.train.cluster import cluster_groups
+
+            opened = partial(_open_capture, source.resolve(), frames)
+            on_progress = lambda done: bar.update("train on the cluster", done, capture.frame_count)  # noqa: E731
+            return cluster_groups(
+                cluster, opened, recipe, settings.random_access, first_frame=first_frame, on_progress=on_progress
+            )
+        return train_groups(
+            capture,
+            recipe,
+            first_frame=first_frame,
+            random_access=settings.random_access,
+            checkpoints=work,
+            on_progress=lambda p: bar.update(p.stage, p.done, p.total),
+        )
+
     config = stream_config(
         fps=capture.fps,
         sh_degree=0,
@@ -128,13 +151,7 @@ def _encode_capture(source, out, settings, preset, frames, gop, bar) -> EncodeRe
         up=up_axis(capture.cameras),
     )
     report = encode_groups(
-        lambda _, frames_done: train_groups(
-            capture,
-            recipe,
-            first_frame=frames_done,
-            checkpoints=work,
-            on_progress=lambda p: bar.update(p.stage, p.done, p.total),
-        ),
+        groups,
         out,
         config,
         settings,
@@ -164,7 +181,15 @@ def up_axis(cameras: list[Camera]) -> str:
 
 
 def train_to_folder(
-    source: Path, folder: Path, *, preset: str, frames: str | None, gop: int, quality: float, bar: Bar
+    source: Path,
+    folder: Path,
+    *,
+    preset: str,
+    frames: str | None,
+    gop: int,
+    random_access: int,
+    quality: float,
+    bar: Bar,
 ) -> int:
     """Trains a capture and writes one .ply per frame and sequence.json; returns the number of frames.
 
@@ -178,7 +203,8 @@ def train_to_folder(
     capture = _open_capture(source, frames)
     recipe = train_settings(preset, gop=gop, quality=quality)
     work, unfinished = folder / "work", folder / "unfinished.json"
-    made_by = json.dumps({"input": str(source.resolve()), "frames": frames, **asdict(recipe)})
+    facts = {"input": str(source.resolve()), "frames": frames, "random_access": random_access}
+    made_by = json.dumps(facts | asdict(recipe))
     same = unfinished.is_file() and unfinished.read_text() == made_by
     writer = SequenceWriter(folder, capture.fps, capture.cameras, resume=same)
     with part_file(unfinished) as part:
@@ -187,6 +213,7 @@ def train_to_folder(
         capture,
         recipe,
         first_frame=writer.frame_count,
+        random_access=random_access,
         checkpoints=work,
         on_progress=lambda p: bar.update(p.stage, p.done, p.total),
     )

@@ -129,16 +129,19 @@ def train_groups(
     settings: TrainSettings,
     *,
     first_frame: int = 0,
+    random_access: int = 0,
     checkpoints: Path | None = None,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> Iterator[Group]:
     """Trains `capture` from `first_frame` on and yields each group when it is done.
 
     A group continues the Gaussians of the one before (`Group.parents`) as long as they serve; where the image loss of a
-    tracked frame is `cut_ratio` times the keyframe's, the group ends and the next one starts anew.
+    tracked frame is `cut_ratio` times the keyframe's, the group ends and the next one starts anew. So does every
+    segment of `random_access` frames: segments depend on nothing but their own frames.
 
     Args:
         first_frame: where an earlier run stopped; a group starts there.
+        random_access: see `segments`.
         checkpoints: folder for what the next group starts from; None keeps it in memory only.
         on_progress: called after every step.
 
@@ -155,12 +158,22 @@ def train_groups(
     if state is not None:
         run.subject = Subject.restored(state, run.views, settings)
     start = first_frame
-    while start < capture.frame_count:
-        run.estimate(capture.frame_count - start)
-        group = run.group(range(start, min(start + settings.gop, capture.frame_count)))
-        start += len(group)
-        store.save(start, run.subject)
-        yield group
+    for segment in segments(capture.frame_count, settings.gop, random_access):
+        while start < segment.stop:
+            run.estimate(capture.frame_count - start)
+            group = run.group(range(start, min(start + settings.gop, segment.stop)))
+            start += len(group)
+            if start == segment.stop:
+                run.subject = None
+            store.save(start, run.subject)
+            yield group
+
+
+def segments(frame_count: int, gop: int, random_access: int) -> list[range]:
+    """Frames that are trained without a look at others: `random_access` of them, or a group where that is longer, each;
+    all in one where it is 0."""
+    length = max(random_access, gop) if random_access else max(frame_count, 1)
+    return [range(a, min(a + length, frame_count)) for a in range(0, frame_count, length)]
 
 
 class _Run:
