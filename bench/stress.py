@@ -4,7 +4,7 @@ One entry of bench/results/stress.json per case; both have the preset's keyframe
 quality. PSNR is of the subject on the test cameras, over the frames that have one. `lost` is by how much the sequence
 is worse than the frames alone, before coding; `verdict` holds it against `ALLOWED`: at most 1 dB, or as much as a case
 is known to lose, with the reason. A crash, a value that is not finite and more Gaussians than asked for are failures
-everywhere.
+everywhere, and so is more than `STATIC_SHARE` of the bytes of the frames alone where nothing moves.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ BUDGETS = {  # of single cases
 }
 ALONE_MOST = 12  # frames trained alone
 ALLOWED_DB = 1.0
+STATIC_SHARE = 0.2
 ALLOWED: dict[str, tuple[float, str]] = {}  # case -> dB, and why it is more
 
 
@@ -58,6 +59,9 @@ def _verdict(name: str, found: dict) -> str:
         return "fails: values that are not finite"
     if found["gaussians_most"] > BUDGET["gaussians_max"]:
         return f"fails: {found['gaussians_most']} Gaussians"
+    share = found["kb_per_frame"] / found["kb_per_frame_alone"]
+    if name == "static" and share > STATIC_SHARE:
+        return f"fails: {share:.0%} of the bytes of every frame alone, {STATIC_SHARE:.0%} allowed where nothing moves"
     if found["lost"] is not None and found["lost"] > allowed:
         return f"fails: {found['lost']:.2f} dB below every frame alone, {allowed:g} allowed"
     return f"degrades as stated: {why}" if found["lost"] is not None and found["lost"] > ALLOWED_DB else "holds"
