@@ -18,6 +18,7 @@ from gscodec.gaussians import GaussianSequence
 from gscodec.metrics.image import psnr
 from gscodec.render.image import render_image, render_rgba
 from gscodec.train.carve import carve, meeting_point, project
+from gscodec.train.cluster import train_segment
 from gscodec.train.finetune import GroupModel, laplace_bits
 from gscodec.train.graph import NodeGraph, Pose, quat_to_matrix, rotvec_to_quat
 from gscodec.train.keyframe import Statistics, grow, prune, train_keyframe
@@ -25,7 +26,7 @@ from gscodec.train.model import from_gaussians
 from gscodec.train.motion import Tracker
 from gscodec.train.settings import TrainSettings, train_settings
 from gscodec.train.sweep import shell, sweep
-from gscodec.train.train import Checkpoint, initial_model, train_groups
+from gscodec.train.train import Checkpoint, initial_model, segments, train_groups
 from gscodec.train.views import Views
 
 SIZE = 64
@@ -246,6 +247,18 @@ def test_groups_come_out_whole_and_a_stopped_run_goes_on(capture, tmp_path):
     np.testing.assert_array_equal(first.frames[2].means, groups[0].frames[2].means)
     (rest,) = train_groups(capture, TINY, first_frame=3, checkpoints=tmp_path / "again")
     np.testing.assert_array_equal(rest.frames[1].means, groups[1].frames[1].means)
+
+
+def test_segments_are_trained_without_a_look_at_others(capture):
+    assert segments(5, 3, 0) == [range(5)]
+    assert segments(5, 3, 2) == [range(3), range(3, 5)], "a group may be longer than that"
+    settings = dataclasses.replace(TINY, gop=2)
+    whole = list(train_groups(capture, settings, random_access=3))
+    assert [len(g) for g in whole] == [2, 1, 2]
+    assert [g.parents is None for g in whole] == [True, False, True]
+    (alone,) = train_segment(lambda: capture, settings, 3, range(3, 5))
+    np.testing.assert_array_equal(alone.frames[1].means, whole[2].frames[1].means)
+    np.testing.assert_array_equal(alone.nodes.translations, whole[2].nodes.translations)
 
 
 def test_what_cannot_be_trained_is_said():

@@ -57,6 +57,11 @@ class Views:
         self._held.move_to_end(key)
         return self._held[key]
 
+    def restart(self) -> None:
+        """Draws anew, as a run that goes on from here will."""
+        self._order.clear()
+        self._rounds.clear()
+
     def draw(self, frame: int, scale: float = 1.0) -> Target:
         """The next view of `frame`; every camera once before any comes again, in an order that depends on the frame
         and not on what was drawn before (a resumed run draws the same)."""
