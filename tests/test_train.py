@@ -232,6 +232,13 @@ def test_canonical_rate_is_what_the_coder_pays_and_falls_along_its_gradient():
         assert after[name] < 0.97 * before[name], name
 
 
+def test_rate_of_one_gaussian_is_finite():
+    model = from_gaussians(blob(1))
+    rate = CanonicalRate(model.params["means"], steps_for(50, 1.0))
+    grads = rate.gradients(model.params, 1.0, torch.Generator().manual_seed(0))
+    assert all(torch.isfinite(g).all() for g in grads.values())
+
+
 def coded_bits(rate, model, quality):
     """Bits of each attribute's channels at the steps of `rate`."""
     group = code_group(Group([model.gaussians()]), quality, keep_all=True)

@@ -20,7 +20,8 @@ RATES = {"quats": 2e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 5e-3
 MEANS_RATE = (1.6e-3, 1.6e-5)  # start, end, times the radius of the subject
 DENSIFY_EVERY = 100
 DENSIFY_FROM, DENSIFY_UNTIL = 0.1, 0.6  # of the steps
-GROWTH = 0.12  # share of the Gaussians that one round may add, or take away while thinning
+GROWTH = 0.12  # share of the Gaussians that one round may add
+THINNING = 0.25  # share of the Gaussians that one round of thinning may take
 THIN_UNTIL = 0.8  # of the steps, from DENSIFY_UNTIL on: what is left of them repairs the picture
 IDLE = 5.0  # a Gaussian goes if the picture without it errs by less than so many shares of the error per Gaussian
 LEAST_ERROR = 1e-8  # of a picture, mean square
@@ -113,7 +114,7 @@ def prune(model: Model, stats: Statistics, *, thin: bool = False) -> None:
     keep &= (stats.weight > PRUNE_WEIGHT) | (stats.seen == 0)
     if thin:
         worth = stats.worth(opacities)
-        keep &= worth >= min(IDLE, torch.quantile(worth, GROWTH).item())
+        keep &= worth >= min(IDLE, torch.quantile(worth, THINNING).item())
     if keep.any():
         model.select(keep)
 

@@ -18,7 +18,8 @@ from gscodec.bitstream.quantization import Steps
 from gscodec.train.graph import quat_multiply
 
 NEAR, WINDOW = 4, 32  # contexts: so many nearest among so many before (spec 7.3)
-LEAST_SPREAD = 0.5  # steps
+GRID_MOST = 2**20  # steps along an axis: far floaters make them coarser
+LEAST_SPREAD, LEAST_WIDTH = 0.5, 0.05  # steps
 _H = 0.5**0.5
 _TURNS = torch.zeros(27, 4)  # [9 a + 3 b + c] the turn after which axes a, b, c are the first, second, third
 _TURNS[[5, 7, 11, 15, 19, 21]] = torch.tensor(
@@ -44,7 +45,8 @@ def laplace_bits(x: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
 def neighbours(means: torch.Tensor, step: float) -> torch.Tensor:
     """[N, 4] the nearest Gaussians among the 32 before each in Morton order, as contexts see them; itself where there
     is none."""
-    low = means.min(0).values
+    low, high = means.min(0).values, means.max(0).values
+    step = max(step, float((high - low).max()) / GRID_MOST)
     grid = torch.round((means - low) / step).numpy().astype(np.uint32)
     order = _native.morton_order(grid).astype(np.int64)
     p = grid[order].astype(np.float32)
@@ -103,7 +105,7 @@ class CanonicalRate:
         with torch.no_grad():  # the law's width follows the neighbours' own differences
             spread = (around - mean[:, None]).abs().mean(1) + LEAST_SPREAD
             width = spread * (x - mean).abs().mean(0) / spread.mean(0)
-        return laplace_bits(x - mean, width.log()).sum()
+        return laplace_bits(x - mean, width.clamp(min=LEAST_WIDTH).log()).sum()
 
     def gradients(
         self, params: dict[str, torch.Tensor], price: float, generator: torch.Generator
