@@ -21,6 +21,7 @@ MEANS_RATE = (1.6e-3, 1.6e-5)  # start, end, times the radius of the subject
 DENSIFY_EVERY = 100
 DENSIFY_FROM, DENSIFY_UNTIL = 0.1, 0.6  # of the steps
 GROWTH = 0.12  # share of the Gaussians that one round may add
+KEYFRAME_SHARE = 0.8  # of the Gaussians at most; the rest is for births
 PRUNE_OPACITY = 0.02
 PRUNE_WEIGHT = 0.02  # a Gaussian whose largest blending weight in any view is below this is not seen
 SPLIT_SHRINK = np.log(1.6)
@@ -40,6 +41,10 @@ class Statistics:
         self.pull += torch.as_tensor(result.grad2d)
         self.seen += weight > 0
         torch.maximum(self.weight, weight, out=self.weight)
+
+    def mean_pull(self) -> torch.Tensor:
+        """[N], over the steps that saw the Gaussian."""
+        return self.pull / self.seen.clamp(min=1)
 
 
 def train_keyframe(
@@ -75,7 +80,7 @@ def train_keyframe(
         model.adam(result.grads, {"means": rate, **{n: r * 0.1**fade for n, r in RATES.items()}})
         if densify and (step + 1) % DENSIFY_EVERY == 0:
             if DENSIFY_FROM * steps < step < DENSIFY_UNTIL * steps:
-                grow(model, stats, settings.gaussians_max, radius, rng)
+                grow(model, stats, int(KEYFRAME_SHARE * settings.gaussians_max), radius, rng)
             elif step >= DENSIFY_UNTIL * steps:
                 prune(model, stats)
             stats = Statistics(len(model))
@@ -98,7 +103,7 @@ def grow(model: Model, stats: Statistics, most: int, radius: float, rng: np.rand
     """One round of densification: the Gaussians with the strongest pull are split (large) or cloned (small)."""
     keep = torch.sigmoid(model.params["logit_opacities"]) > PRUNE_OPACITY
     keep &= (stats.weight > PRUNE_WEIGHT) | (stats.seen == 0)
-    pull = stats.pull / stats.seen.clamp(min=1)
+    pull = stats.mean_pull()
     pull[~keep] = 0
     room = max(0, min(int(GROWTH * len(model)), most - int(keep.sum())))
     chosen = torch.topk(pull, min(room, len(pull))).indices
