@@ -25,6 +25,7 @@ from gscodec.train.keyframe import Statistics, grow, prune, train_keyframe
 from gscodec.train.model import from_gaussians
 from gscodec.train.motion import Tracker
 from gscodec.train.settings import TrainSettings, train_settings
+from gscodec.train.sweep import shell, sweep
 from gscodec.train.train import Checkpoint, initial_model, segments, train_groups
 from gscodec.train.views import Views
 
@@ -88,6 +89,29 @@ def test_hull_lies_on_the_subject(capture):
     assert np.median(distance) == pytest.approx(1.1, abs=0.2), "a sphere of radius 1, and the width of its Gaussians"
     assert colors.min() >= 0
     assert colors.max() <= 1
+
+
+def test_sweep_finds_a_textured_wall():
+    """A wall y = 0 of coloured splats, seen from an arc in front of it: the points lie on it, the shell far behind."""
+    rng = np.random.default_rng(1)
+    n = 3000
+    wall = dataclasses.replace(
+        blob(n),
+        means=np.stack([rng.uniform(-2, 2, n), np.zeros(n), rng.uniform(-1.5, 1.5, n)], 1).astype(np.float32),
+        log_scales=np.full((n, 3), np.log(0.04), np.float32),
+        logit_opacities=np.full(n, 4, np.float32),
+        sh0=rng.uniform(-1.7, 1.7, (n, 3)).astype(np.float32),
+    )
+    K = np.array([[150.0, 0, 64], [0, 150.0, 48], [0, 0, 1]])
+    eyes = [(x, -3.0, z) for z in (-0.3, 0.3) for x in (-0.8, 0, 0.8)]
+    cameras = [Camera(f"cam{i}", K, look_at(eye, np.zeros(3), [0, 0, 1]), 128, 96) for i, eye in enumerate(eyes)]
+    views = [(c, render_image(wall, c, (0, 0, 0)), None) for c in cameras]
+    points, colors = sweep(views, 1000, 0)
+    assert len(points) == len(colors) == 1000
+    assert (np.abs(points[:, 1]) < 0.22).mean() > 0.9, "a plane and a half: they are 0.15 apart there"
+    behind, _ = shell(views)
+    assert len(behind) > 5
+    assert (behind[:, 1] > 8).all()
 
 
 def test_projection_is_the_renderers(capture):

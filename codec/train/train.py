@@ -25,7 +25,10 @@ from gscodec.train.keyframe import train_keyframe
 from gscodec.train.model import NAMES, Model, from_points
 from gscodec.train.motion import Tracker
 from gscodec.train.settings import TrainSettings
+from gscodec.train.sweep import shell, sweep
 from gscodec.train.views import Views
+
+SWEEP_LEAST = 0.1  # of the initial points that a plane sweep must find, to be a scene with texture
 
 
 @dataclass
@@ -44,7 +47,7 @@ class Progress:
 
 
 def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
-    """Gaussians from the visual hull of the masks, or at random where there are none.
+    """Gaussians from the visual hull of the masks, or a plane sweep where there are none, or at random.
 
     Raises:
         CaptureError: nothing to start from.
@@ -61,6 +64,10 @@ def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
         points, colors = carve(known, views, settings.initial_points)
         if len(points):
             return from_points(points, colors, opacity=0.5)
+    points, colors = sweep(views, settings.initial_points, settings.seed)
+    if len(points) >= SWEEP_LEAST * settings.initial_points:
+        surface = zip((points, colors), shell(views), strict=True)
+        return from_points(*(np.concatenate(pair) for pair in surface), opacity=0.5)
     points, colors = random_box(known, views, settings.initial_points, settings.seed)
     if len(points) == 0:
         raise CaptureError(f"{capture.name}: no point is seen by two cameras, expected cameras that overlap")

@@ -110,9 +110,9 @@ def shrink(target: Target, scale: float) -> Target:
 
 
 def compare(params: dict, target: Target, settings: TrainSettings, rng, workspace: Workspace) -> RenderLoss:
-    """Loss of Gaussians (see `render_loss`) against a target; behind a mask the background is random in each step, so
-    that opacity is learned and not painted."""
-    background = rng.uniform(0, 1, 3) if target.alpha is not None else np.zeros(3)
+    """Loss of Gaussians (see `render_loss`) against a target; the background is random in each step, so that opacity is
+    learned and not painted."""
+    background = rng.uniform(0, 1, 3)
     return render_loss(
         {name: p.detach() for name, p in params.items()},
         target.camera,
