@@ -329,7 +329,7 @@ def bench_train(
     def line(e: dict) -> str:
         size = "-" if e["kb_per_frame"] is None else f"{e['kb_per_frame']:.2f} kB/frame"
         return (
-            f"{e['capture']:<11}{e['recipe']:<8}{e['preset']:<7}{e['seconds_per_frame']:7.2f} s/frame  "
+            f"{e['capture']:<17}{e['recipe']:<12}{e['preset']:<7}{e['seconds_per_frame']:7.2f} s/frame  "
             f"{e['psnr_fg'] or e['psnr']:6.2f} dB  {e['gaussians']:>6} Gaussians  {size}"
         )
 
