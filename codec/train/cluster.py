@@ -41,7 +41,7 @@ def cluster_groups(
     ray = require("ray", "training on a cluster", "ray")
     try:
         _knock(address)
-        ray.init(address, log_to_driver=False)
+        ray.init(address, log_to_driver=False, logging_level="ERROR")
     except (OSError, ValueError) as e:
         raise UsageError(f"--ray {address}: no cluster there ({e}); start one with: ray start --head") from e
     try:
