@@ -24,8 +24,8 @@ def train_chart(result: dict):
     for row, capture in zip(figure.subplots(len(captures), 2, squeeze=False), captures, strict=True):
         entries = [e for e in result["entries"] if e["capture"] == capture]
         for axes, (key, label) in zip(row, PANELS.items(), strict=True):
-            _panel(axes, [e for e in entries if e[key]], key)
             axes.set(xlabel=label, ylabel="PSNR of the subject, dB", xscale="log")
+            _panel(axes, [e for e in entries if e[key]], key)
         row[0].set_title(capture, loc="left", weight="bold")
     machine = result["machine"]
     text = f"test cameras; {machine['cpu']}, {machine['cores']} cores; commit {result['commit']}"
@@ -34,6 +34,8 @@ def train_chart(result: dict):
 
 
 def _panel(axes, entries: Sequence[dict], key: str) -> None:
+    from matplotlib.ticker import LogLocator
+
     for recipe, (name, color) in LOOK.items():
         points = sorted((e[key], e["psnr_fg"], e["preset"]) for e in entries if e["recipe"] == recipe)
         if not points:
@@ -44,8 +46,9 @@ def _panel(axes, entries: Sequence[dict], key: str) -> None:
         for at, preset in zip(zip(x, y, strict=True), presets, strict=True):
             axes.annotate(preset, at, (4, -9), textcoords="offset points", fontsize=7, color=color)
     axes.grid(alpha=0.25)
+    axes.margins(0.14)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter("{x:g}")
-    axes.tick_params(axis="x", which="minor", labelsize=6)
+    axes.xaxis.set_minor_formatter("")
     if axes.has_data():
         axes.legend(frameon=False, fontsize=7)
