@@ -18,6 +18,7 @@ from gscodec.gaussians import GaussianSequence
 from gscodec.metrics.image import psnr
 from gscodec.render.image import render_image, render_rgba
 from gscodec.train.carve import carve, meeting_point, project
+from gscodec.train.changes import Changes
 from gscodec.train.cluster import train_segment
 from gscodec.train.finetune import GroupModel, laplace_bits
 from gscodec.train.graph import NodeGraph, Pose, quat_to_matrix, rotvec_to_quat
@@ -147,7 +148,8 @@ def test_keyframe_learns_a_view_it_has_not_seen(masks):
 def test_tracking_finds_the_turn(capture):
     truth = turning(300, frames=5)
     key = from_gaussians(truth.frame(0))
-    tracker = Tracker(key, Views(capture, 0), TINY, 1.0)
+    views = Views(capture, 0)
+    tracker = Tracker(key, views, TINY, 1.0, 0.01, Changes.since(views, 0))
     models, poses = [tracker.model], [tracker.pose]
     for frame in (1, 2):
         tracker.advance(frame)
@@ -158,7 +160,7 @@ def test_tracking_finds_the_turn(capture):
     assert missed < 0.25 * still, (missed, still)
     angle = 2 * np.arccos(np.abs(tracker.pose.turned[:, 0].numpy()).clip(0, 1))
     assert np.median(angle) == pytest.approx(0.2, abs=0.08), "0.1 rad a frame"
-    group = GroupModel(tracker.graph, None, models, poses, steps_for(50, 1.0))
+    group = GroupModel(tracker.graph, None, models, poses, steps_for(50, 1.0), torch.ones(len(key), dtype=torch.bool))
     assert psnr_of(group.gaussians(2), capture, 2) > psnr_of(truth.frame(0), capture, 2) + 4
     carried = np.abs(truth.frame(2).means - group.means[2].numpy()).mean()
     assert carried < 0.3 * still, "the nodes have found it, not the Gaussians each for itself"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from gscodec.errors import CaptureError
 from gscodec.gaussians import Group
 from gscodec.part_file import read_arrays, write_arrays
 from gscodec.train.carve import carve, random_box
+from gscodec.train.changes import Changes
 from gscodec.train.finetune import GroupModel, finetune
 from gscodec.train.graph import Pose
 from gscodec.train.keyframe import train_keyframe
@@ -28,6 +29,7 @@ from gscodec.train.settings import TrainSettings
 from gscodec.train.sweep import shell, sweep
 from gscodec.train.views import Views
 
+CUT_FLOOR = 0.004  # image loss that no frame is cut for: clean pictures fit far better than they need to
 SWEEP_LEAST = 0.1  # of the initial points that a plane sweep must find, to be a scene with texture
 
 
@@ -211,7 +213,7 @@ class _Run:
 
     def group(self, frames: range) -> Group:
         """Trains one group; it ends before `frames` does where the Gaussians no longer serve."""
-        track = _Track([], [])
+        track = _Track()
         self.views.restart()
         if self.subject is not None:
             self._follow(frames, track)
@@ -236,21 +238,21 @@ class _Run:
         radius = subject_radius(model.params["means"].numpy())
         on_step = self._report(f"keyframe {frame}")
         loss = train_keyframe(model, self.views, frame, s, steps=s.keyframe_steps, radius=radius, on_step=on_step)
-        return Subject(Tracker(model, self.views, s, radius), loss)
+        return Subject(Tracker(model, self.views, s, radius, loss, Changes.since(self.views, frame)), loss)
 
     def _follow(self, frames: range, track: _Track) -> None:
         """Adds the frames to `track` until the subject is lost."""
         subject = self.subject
         for frame in frames:
             loss = subject.tracker.advance(frame, self._report(f"track {frame}"))
-            if loss > self.settings.cut_ratio * subject.loss:
+            if loss is not None and loss > self.settings.cut_ratio * subject.loss + CUT_FLOOR:
                 break
             track.add(subject.tracker)
 
     def _finetuned(self, subject: Subject, frames: range, track: _Track) -> GroupModel:
         radius = subject.tracker.radius
         steps = steps_for(self.settings.quality, radius)
-        model = GroupModel(subject.tracker.graph, subject.canonical, track.models, track.poses, steps)
+        model = GroupModel(subject.tracker.graph, subject.canonical, track.models, track.poses, steps, track.moved())
         on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
         finetune(model, self.views, frames, self.settings, radius=radius, on_step=on_step)
         return model
@@ -258,11 +260,17 @@ class _Run:
 
 @dataclass
 class _Track:
-    """Frame by frame the Gaussians and the nodes."""
+    """Frame by frame the Gaussians, the nodes, and which Gaussians tracking has touched ([N] bool)."""
 
-    models: list[Model]
-    poses: list[Pose]
+    models: list[Model] = field(default_factory=list)
+    poses: list[Pose] = field(default_factory=list)
+    moving: list[torch.Tensor] = field(default_factory=list)
 
     def add(self, tracker: Tracker) -> None:
         self.models.append(tracker.model)
         self.poses.append(tracker.pose)
+        self.moving.append(tracker.moving)
+
+    def moved(self) -> torch.Tensor:
+        """[N] bool: touched in any frame."""
+        return torch.stack(self.moving).any(0)
