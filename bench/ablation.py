@@ -16,7 +16,7 @@ from unittest.mock import patch
 
 from gscodec.bench import train
 from gscodec.bench.machine import ROOT, update_entries
-from gscodec.train import finetune, motion
+from gscodec.train import changes, finetune, motion
 
 WHOLE = "whole recipe"
 FRAMES = 10
@@ -47,6 +47,7 @@ VARIANTS = {
     "cut ratio 3": Variant({"cut_ratio": 3.0}),
     "colours held in tracking": Variant(patches=((motion, "RATES", without(motion.RATES, "sh0", "shN")),)),
     "full-size pictures only": Variant(patches=((motion, "SMALL", 1.0),)),
+    "nothing held still": Variant(patches=((changes, "THRESHOLD", -1.0),)),
     "no noise on canonical values": Variant(
         patches=((finetune.GroupModel, "_relaxed", lambda group, generator: group.key.params),)
     ),
