@@ -96,6 +96,7 @@ def compare(name: str, scene: Scene, **budget) -> dict:
         "lost_most": max(loss, default=None),
         "lost_of_frame": [round(x, 2) for x in loss],
         "haze": ours.get("haze"),
+        "haze_most": max(r["haze"] for r in ours["per_frame"]),
         "haze_alone": theirs.get("haze"),
         "flicker": ours["flicker"],
         "flicker_alone": theirs["flicker"] if chosen.step == 1 else None,

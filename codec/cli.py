@@ -329,13 +329,35 @@ def bench_train(
     def line(e: dict) -> str:
         size = "-" if e["kb_per_frame"] is None else f"{e['kb_per_frame']:.2f} kB/frame"
         return (
-            f"{e['capture']:<11}{e['recipe']:<8}{e['preset']:<7}{e['seconds_per_frame']:7.2f} s/frame  "
+            f"{e['capture']:<17}{e['recipe']:<12}{e['preset']:<7}{e['seconds_per_frame']:7.2f} s/frame  "
             f"{e['psnr_fg'] or e['psnr']:6.2f} dB  {e['gaussians']:>6} Gaussians  {size}"
         )
 
     _show_entries(
         measure(capture, recipe, preset=preset, frames=frames, quality=quality, data=data, out=out), as_json, line
     )
+
+
+@bench.command("ablation")
+def bench_ablation(
+    variant: Annotated[str | None, typer.Option(help="Comma-separated variants, see bench/ablation.py.")] = None,
+    preset: Preset = "fast",
+    quality: Quality = 50.0,
+    out: Annotated[Path, typer.Option(help="The result file; its other entries stay.")] = Path(
+        "bench/results/ablation.json"
+    ),
+    as_json: Json = False,
+) -> None:
+    """Training without one of its losses and tools at a time, on the bundled capture."""
+    from gscodec.commands import bench_ablation as measure
+
+    def line(e: dict) -> str:
+        return (
+            f"{e['variant']:<30}{e['preset']:<7}{e['psnr_fg']:6.2f} dB, coded {e['psnr_fg_coded']:6.2f} dB  "
+            f"{e['kb_per_frame']:6.2f} kB/frame  {e['seconds_per_frame']:6.2f} s/frame"
+        )
+
+    _show_entries(measure(variant, preset=preset, quality=quality, out=out), as_json, line)
 
 
 @bench.command("stress")

@@ -323,6 +323,18 @@ def bench_train(
             yield from update(out, measure(capture, recipe, preset, frames, data, quality))
 
 
+def bench_ablation(variants: str | None, *, preset: str, quality: float, out: Path) -> Iterator[dict]:
+    """Yields what bench.ablation measures (comma-separated variants, None: all), and puts it into `out` as it comes.
+
+    Raises:
+        UsageError: an unknown variant.
+    """
+    require("torch", "measuring training")
+    from gscodec.bench.ablation import VARIANTS, measure
+
+    yield from measure(_names("--variant", variants, VARIANTS) or list(VARIANTS), preset, quality, out)
+
+
 def bench_stress(cases: str | None, *, out: Path) -> Iterator[dict]:
     """Yields what bench.stress measures (comma-separated cases, None: all), and puts it into `out` as it comes.
 
