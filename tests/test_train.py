@@ -12,18 +12,19 @@ from gscodec.bitstream.quantization import steps_for, subject_radius
 from gscodec.camera import Camera, look_at
 from gscodec.capture.capture import Capture
 from gscodec.capture.images import View
-from gscodec.encode.group import group_integers
+from gscodec.encode.group import code_group, group_integers
 from gscodec.errors import CaptureError, UsageError
-from gscodec.gaussians import GaussianSequence
+from gscodec.gaussians import GaussianSequence, Group
 from gscodec.metrics.image import psnr
 from gscodec.render.image import render_image, render_rgba
 from gscodec.train.carve import carve, meeting_point, project
 from gscodec.train.cluster import train_segment
-from gscodec.train.finetune import GroupModel, laplace_bits
+from gscodec.train.finetune import GroupModel
 from gscodec.train.graph import NodeGraph, Pose, quat_to_matrix, rotvec_to_quat
 from gscodec.train.keyframe import Statistics, grow, prune, train_keyframe
 from gscodec.train.model import from_gaussians
 from gscodec.train.motion import Tracker
+from gscodec.train.rate import CanonicalRate, laplace_bits
 from gscodec.train.settings import TrainSettings, train_settings
 from gscodec.train.sweep import shell, sweep
 from gscodec.train.train import Checkpoint, initial_model, segments, train_groups
@@ -215,6 +216,31 @@ def test_rate_term_tracks_the_coders_bits():
     np.testing.assert_allclose(predicted, coded, rtol=0.2)
 
 
+def test_canonical_rate_is_what_the_coder_pays_and_falls_along_its_gradient():
+    """Estimated and coded bits of each attribute; coded bits after a descent on nothing but the rate."""
+    model, steps = from_gaussians(blob(3000, sh_count=3)), steps_for(62, 1.0)
+    rate, noise = CanonicalRate(model.params["means"], steps), torch.Generator().manual_seed(0)
+    names = ("quats", "log_scales", "logit_opacities", "sh0", "shN")
+    estimated, before = rate.bits(model.params, noise), coded_bits(rate, model, 62)
+    for name in names:
+        assert estimated[name].item() == pytest.approx(before[name], rel=0.15), name
+    for _ in range(60):
+        model.adam(rate.gradients(model.params, 1.0, noise), {n: 0.1 * getattr(steps, n) for n in names})
+    after = coded_bits(rate, model, 62)
+    for name in names:
+        assert after[name] < 0.97 * before[name], name
+
+
+def coded_bits(rate, model, quality):
+    """Bits of each attribute's channels at the steps of `rate`."""
+    group = code_group(Group([model.gaussians()]), quality, keep_all=True)
+    for name, x in rate.channels(model.params).items():
+        integers = np.rint(x.numpy()[group.source].T).astype(np.int32)
+        group.integers["channels"][name]["values"] = integers - np.median(integers, 1, keepdims=True).astype(np.int32)
+    units = _native.encode_group(group.integers)[1]
+    return {u["attribute"]: 8 * u["bytes"] for u in units if u["type"] == "channels"}
+
+
 def test_growing_and_pruning_keep_the_moments_in_step():
     model = from_gaussians(blob(100))
     stats = Statistics(100)
@@ -226,6 +252,11 @@ def test_growing_and_pruning_keep_the_moments_in_step():
     model.params["logit_opacities"][:10] = -9
     prune(model, Statistics(len(model)))
     assert len(model) == 95
+    stats = Statistics(95)
+    stats.weight += 0.5
+    stats.pulse[:90] = 1
+    prune(model, stats, thin=True)
+    assert len(model) == 90, "what changes nothing in the picture is not worth its bits"
     model.adam({n: torch.ones_like(p) for n, p in model.params.items()}, {"means": 0.1})
     assert torch.isfinite(model.params["means"]).all()
 

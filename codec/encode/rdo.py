@@ -11,9 +11,7 @@ import numpy as np
 
 from gscodec.bitstream.transform import dct_basis
 
-BIT_PRICE = (
-    0.1  # of a bit, in units of the picture's error per Gaussian: the slope on statue, 0.42 dB per bit and Gaussian
-)
+BIT_PRICE = 0.03  # of a bit, in units of the picture's error per Gaussian: the slope on a trained capture
 FLOOR = 0.2  # share of the mean sensitivity that all have: few views say little of one, and errors that agree add up
 ZERO_BITS, NONZERO_BITS, LENGTH_BITS = (
     0.5,

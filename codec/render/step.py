@@ -25,6 +25,7 @@ class RenderLoss:
         grad2d: [N] f32, norm of the gradient by the projected mean in units of half the image (3DGS's densification
             measure).
         max_weight, sum_weight: [N] f32, largest and summed blending weight alpha * transmittance (for pruning).
+        pixels: of the image.
         radii: [N] f32, pixels, 0 for what is not visible.
         grad_gain: [3] f64, gradient of `gain`.
     """
@@ -34,6 +35,7 @@ class RenderLoss:
     mse: float
     ssim: float
     mask: float
+    pixels: int
     grads: dict
     grad2d: np.ndarray
     max_weight: np.ndarray
@@ -83,10 +85,11 @@ def render_loss(
     arrays = tuple(_numpy(params[name]) for name in PARAMETERS)
     grads, statistics = workspace.gradients(arrays)
     workspace.calls += 1
+    region = region or (0, 0, camera.width, camera.height)
     values = call(
         workspace.native.step,
         arrays,
-        view(camera, region or (0, 0, camera.width, camera.height)),
+        view(camera, region),
         (rgb(background), None if gain is None else rgb(gain)),
         tuple(None if t is None else np.ascontiguousarray(t) for t in (target_rgb, target_alpha, weight)),
         (ssim_lambda, mask_lambda),
@@ -95,7 +98,14 @@ def render_loss(
     named = {k: _like(g, params[k]) for k, g in zip(PARAMETERS, grads, strict=True)}
     radii, _ = workspace.native.radii()
     statistics = dict(zip(STATISTICS, statistics, strict=True))
-    return RenderLoss(*values[:5], grads=named, radii=radii, grad_gain=np.array(values[5]), **statistics)
+    return RenderLoss(
+        *values[:5],
+        pixels=region[2] * region[3],
+        grads=named,
+        radii=radii,
+        grad_gain=np.array(values[5]),
+        **statistics,
+    )
 
 
 def _numpy(array) -> np.ndarray:

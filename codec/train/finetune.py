@@ -5,7 +5,8 @@ It starts from the tracked frames, projected on the lowest temporal frequencies.
 attributes, so each Gaussian is seen by frames x views images instead of views. Coefficients are used as the decoder
 will have them (rounded, straight-through gradient); what does not pay is pulled to zero by the rate term: their
 entropy under noise-relaxed quantization at the stream's own step sizes, with a learned Laplace scale for each
-attribute and temporal frequency (V3's residual-entropy loss, made differentiable).
+attribute and temporal frequency (V3's residual-entropy loss, made differentiable). Canonical attributes have noise in
+place of their quantization, and a rate term of their own (rate.py).
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from gscodec.render.workspace import Workspace
 from gscodec.train import keyframe
 from gscodec.train.graph import NodeGraph, Pose, quat_conjugate, quat_multiply, quat_to_rotvec
 from gscodec.train.model import NAMES, Model
+from gscodec.train.rate import CanonicalRate, laplace_bits
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, compare
 
@@ -35,22 +37,8 @@ RESIDUAL_RATE = 0.05  # in steps of the stream a step of the optimiser
 LAPLACE_RATE = 0.02
 MEANS_RATE = 4e-5  # of the canonical means, times the radius
 CANONICAL_SHARE = 0.3  # of the keyframe's rates
+CANONICAL_PRICE = 3.0  # of a canonical bit, in bits of residuals
 RATE_EVERY = 4  # the rate term has every coefficient, an image few of them: once in so many steps, so much stronger
-
-
-def laplace_bits(x: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
-    """Bits of integers under a Laplace law of scale exp(log_scale), at real x (the relaxed quantizer's output).
-
-    Probability of the unit interval around x (Balle et al. 2017), computed without cancellation.
-    """
-    b = torch.exp(log_scale)
-    a = x.abs()
-    near = a.clamp(max=0.5)  # keeps the branch that is not taken, and its gradient, finite
-    inner = 1 - 0.5 * (torch.exp((near - 0.5) / b) + torch.exp(-(near + 0.5) / b))
-    tail = torch.exp(-(a - 0.5).clamp(min=0) / b) * 0.5 * (-torch.expm1(-1 / b))
-    p = torch.where(a < 0.5, inner, tail)
-    far = (a - 0.5).clamp(min=0) / b / np.log(2) + 1 - torch.log2(-torch.expm1(-1 / b))  # where p underflows
-    return torch.where(p > 1e-9, -torch.log2(p.clamp(min=1e-9)), far)
 
 
 def rounded(c: torch.Tensor) -> torch.Tensor:
@@ -90,7 +78,9 @@ class GroupModel:
         self.known = 0 if key is None else len(key)
         self.key = self._canonical(key, tracked)
         self.basis = torch.from_numpy(dct_basis(len(tracked))).float()  # [T, T]
-        self.canonical_steps = {n: getattr(steps, n) for n in ("log_scales", "quats", "logit_opacities", "sh0")}
+        names = ("means", "log_scales", "quats", "logit_opacities", "sh0")
+        self.canonical_steps = {n: getattr(steps, n) for n in names}
+        self.canonical_rate = CanonicalRate(self.key.params["means"], steps)
         self.unit = {name: trajectory_step(getattr(steps, name), len(tracked)) for name in FREQUENCIES}
         self.unit["sh0"] *= float(STEP_WEIGHTS[0])  # Y, Co, Cg share one step; RGB errors add up over them
         self.means, self.turned = zip(*(self._carry(p) for p in poses), strict=True)
@@ -102,11 +92,6 @@ class GroupModel:
         self.log_scales = {
             n: torch.full((len(c), 1, 1), -1.0, requires_grad=True) for n, c in self.coefficients.items()
         }
-
-    @property
-    def new(self) -> torch.Tensor:
-        """[N] bool: canonical attributes that this group is to find."""
-        return torch.arange(len(self.born)) >= self.known
 
     def _held(self, x: list[torch.Tensor]) -> torch.Tensor:
         """[T, N, ...]: before its birth a Gaussian is what it is at birth."""
@@ -166,8 +151,9 @@ class GroupModel:
     def frame(self, t: int, generator: torch.Generator | None = None) -> dict[str, torch.Tensor]:
         """Attributes of frame `t`, with noise on the canonical ones if there is a generator; differentiable in the
         coefficients."""
-        p = self.key.params if generator is None or not self.new.any() else self._relaxed(generator)
-        means = self._carry(self.poses[t])[0] if self.new.any() else self.means[t]
+        new = self.known < len(self.key)
+        p = self._relaxed(generator) if new and generator is not None else self.key.params
+        means = self.graph.carry(p["means"], self.poses[t])[0] if new else self.means[t]
         dq = self.residual("quats", t)
         opacities = p["logit_opacities"] + self.residual("logit_opacities", t)[:, 0]
         w = (1 - dq.square().sum(1, keepdim=True)).clamp(min=1e-6).sqrt()
@@ -231,7 +217,7 @@ class _Finetuner:
         rates += [(s, LAPLACE_RATE) for s in group.log_scales.values()]
         self.optimizer = torch.optim.Adam([{"params": [p], "base": r} for p, r in rates], betas=(0.9, 0.99), fused=True)
         canonical = {n: CANONICAL_SHARE * r for n, r in keyframe.RATES.items()}
-        self.canonical_rates = {"means": MEANS_RATE * radius, **canonical} if group.new.any() else {}
+        self.canonical_rates = {"means": MEANS_RATE * radius, **canonical} if group.known < len(group.key) else {}
 
     def step(self, t: int, fade: float) -> float:
         """One step on frame `t`, all rates times `fade`; returns the image loss."""
@@ -242,9 +228,11 @@ class _Finetuner:
         target = self.views.draw(self.frames[t])
         result = compare(params, target, self.settings, self.rng, self.workspace)
         heads, seeds = [params[n] for n in names], [result.grads[n] for n in names]
+        price = 0.0
         if self.rng.integers(RATE_EVERY) == 0:
             pixels = target.rgb.shape[0] * target.rgb.shape[1] * len(self.frames)
-            heads.append(RATE_EVERY * self.settings.rate_lambda / pixels * group.bits(self.noise))
+            price = RATE_EVERY * self.settings.rate_lambda / pixels
+            heads.append(price * group.bits(self.noise))
             seeds.append(torch.ones(()))
         self.optimizer.zero_grad()
         torch.autograd.backward(heads, seeds)
@@ -252,6 +240,9 @@ class _Finetuner:
         if self.canonical_rates:
             back = quat_conjugate(group.turned[t])
             grads = {**result.grads, "quats": quat_multiply(back, result.grads["quats"])}  # to the canonical pose
+            if price:
+                rate = group.canonical_rate.gradients(group.key.params, CANONICAL_PRICE * price, self.noise)
+                grads |= {n: grads[n] + g for n, g in rate.items()}
             for g in grads.values():
                 g[: group.known] = 0
             group.key.adam(grads, {n: r * fade for n, r in self.canonical_rates.items()})

@@ -20,8 +20,11 @@ RATES = {"quats": 2e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 5e-3
 MEANS_RATE = (1.6e-3, 1.6e-5)  # start, end, times the radius of the subject
 DENSIFY_EVERY = 100
 DENSIFY_FROM, DENSIFY_UNTIL = 0.1, 0.6  # of the steps
-GROWTH = 0.12  # share of the Gaussians that one round may add
 KEYFRAME_SHARE = 0.8  # of the Gaussians at most; the rest is for births
+GROWTH = 0.12  # share of the Gaussians that one round may add, or take away while thinning
+THIN_UNTIL = 0.8  # of the steps, from DENSIFY_UNTIL on: what is left of them repairs the picture
+IDLE = 5.0  # a Gaussian goes if the picture without it errs by less than so many shares of the error per Gaussian
+LEAST_ERROR = 1e-8  # of a picture, mean square
 PRUNE_OPACITY = 0.02
 PRUNE_WEIGHT = 0.02  # a Gaussian whose largest blending weight in any view is below this is not seen
 SPLIT_SHRINK = np.log(1.6)
@@ -34,6 +37,8 @@ class Statistics:
         self.pull = torch.zeros(count)  # sum of the screen-space gradient
         self.seen = torch.zeros(count)
         self.weight = torch.zeros(count)  # largest blending weight
+        self.pulse = torch.zeros(count)  # see `worth`
+        self.views = 0
 
     def add(self, result) -> None:
         """One step's statistics."""
@@ -41,6 +46,21 @@ class Statistics:
         self.pull += torch.as_tensor(result.grad2d)
         self.seen += weight > 0
         torch.maximum(self.weight, weight, out=self.weight)
+        self.pulse += torch.as_tensor(result.grads["logit_opacities"]).square() * (
+            3 * result.pixels / max(result.mse, LEAST_ERROR)
+        )
+        self.views += 1
+
+    def worth(self, opacities: torch.Tensor) -> torch.Tensor:
+        """[N] by how much the picture would err more without each Gaussian of `opacities` [N], in shares of its error
+        per Gaussian.
+
+        The pixel gradients of the absolute error are signs, as good as random where training has converged: the
+        squared gradient by a parameter is then the squared change of the picture by it (Hutchinson's estimator of a
+        diagonal). The logit of an opacity changes the picture by (1 - opacity) of what the whole Gaussian does.
+        """
+        views = max(self.views, 1)
+        return self.pulse * len(opacities) / views / (1 - opacities).clamp(min=1e-3).square()
 
     def mean_pull(self) -> torch.Tensor:
         """[N], over the steps that saw the Gaussian."""
@@ -82,7 +102,7 @@ def train_keyframe(
             if DENSIFY_FROM * steps < step < DENSIFY_UNTIL * steps:
                 grow(model, stats, int(KEYFRAME_SHARE * settings.gaussians_max), radius, rng)
             elif step >= DENSIFY_UNTIL * steps:
-                prune(model, stats)
+                prune(model, stats, thin=step < THIN_UNTIL * steps)
             stats = Statistics(len(model))
         if on_step:
             on_step(step, result.loss)
@@ -90,10 +110,15 @@ def train_keyframe(
 
 
 @torch.no_grad()
-def prune(model: Model, stats: Statistics) -> None:
-    """Drops Gaussians that are nearly transparent or hidden in every view they were tried in."""
-    keep = torch.sigmoid(model.params["logit_opacities"]) > PRUNE_OPACITY
+def prune(model: Model, stats: Statistics, *, thin: bool = False) -> None:
+    """Drops Gaussians that are nearly transparent or hidden in every view they were tried in; with `thin`, also those
+    that are not worth their bits."""
+    opacities = torch.sigmoid(model.params["logit_opacities"])
+    keep = opacities > PRUNE_OPACITY
     keep &= (stats.weight > PRUNE_WEIGHT) | (stats.seen == 0)
+    if thin:
+        worth = stats.worth(opacities)
+        keep &= worth >= min(IDLE, torch.quantile(worth, GROWTH).item())
     if keep.any():
         model.select(keep)
 

@@ -1,0 +1,68 @@
+"""Training's estimate of the bits of canonical attributes beside the coder's -> bench/results/rate_term.json.
+
+usage: GSCODEC_DATA=... python bench/rate_term.py
+
+The first frames of lumberjack are trained (preset fast) with rate terms of several weights. Each attribute is then
+estimated at the nominal steps of training, and coded as users would: with measured steps, rate-distortion optimised.
+Bits per Gaussian; the correlation is over all attributes and weights.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gscodec import _native
+from gscodec.bench.machine import RESULTS, write_result
+from gscodec.bitstream.quantization import steps_for, subject_radius
+from gscodec.capture import open_capture
+from gscodec.encode.group import group_integers
+from gscodec.train.model import from_gaussians
+from gscodec.train.rate import CanonicalRate
+from gscodec.train.settings import train_settings
+from gscodec.train.train import train_groups
+
+FRAMES, QUALITY = 4, 62.0
+WEIGHTS = (0.0, 0.02, 0.08, 0.32)
+
+
+def rows(capture, weight: float) -> list[dict]:
+    """One row per attribute, of a group that was trained with this weight of the rate term."""
+    settings = train_settings("fast", gop=FRAMES, rate_lambda=weight, quality=QUALITY)
+    group = next(train_groups(capture, settings))
+    model = from_gaussians(group.frames[0])
+    steps = steps_for(QUALITY, subject_radius(group.frames[0].means))
+    estimated = CanonicalRate(model.params["means"], steps).bits(model.params, torch.Generator().manual_seed(0))
+    cameras = [capture.cameras[i] for i in capture.indices("train")]
+    integers = group_integers(group, QUALITY, cameras=cameras)
+    count = len(integers["positions"])
+    return [
+        {
+            "rate_lambda": weight,
+            "attribute": unit["attribute"],
+            "estimated": round(estimated[unit["attribute"]].item() / len(model), 2),
+            "coded": round(8 * unit["bytes"] / count, 2),
+        }
+        for unit in _native.encode_group(integers)[1]
+        if unit["type"] == "channels"
+    ]
+
+
+def main() -> None:
+    """Writes the table."""
+    capture = replace(open_capture(Path(os.environ["GSCODEC_DATA"]) / "lumberjack"), frame_count=FRAMES)
+    table = [row for weight in WEIGHTS for row in rows(capture, weight)]
+    pair = [[row[k] for row in table] for k in ("estimated", "coded")]
+    correlation = round(float(np.corrcoef(*pair)[0, 1]), 4)
+    write_result(
+        RESULTS / "rate_term.json", {"frames": FRAMES, "quality": QUALITY, "correlation": correlation, "rows": table}
+    )
+    print(*table, f"correlation {correlation}", sep="\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""What a model costs in the stream, differentiable: the rate terms of training.
+
+Bits are code lengths of integers under Laplace laws, with uniform noise in place of rounding (Balle et al. 2017). A
+residual coefficient is held against zero. A canonical value is held against what the coder knows when it comes to it:
+the nearest Gaussians before it in Morton order (spec 7.3), all in the form that the encoder gives them (axes by falling
+scale, the quaternion's vector part where the real part is largest, colours as Y, Co, Cg). Positions have no term: they
+cost the same wherever they are.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gscodec import _native
+from gscodec.bitstream.color import STEP_WEIGHTS, TO_YCOCG
+from gscodec.bitstream.quantization import Steps
+from gscodec.train.graph import quat_multiply
+
+NEAR, WINDOW = 4, 32  # contexts: so many nearest among so many before (spec 7.3)
+LEAST_SPREAD = 0.5  # steps
+_H = 0.5**0.5
+_TURNS = torch.zeros(27, 4)  # [9 a + 3 b + c] the turn after which axes a, b, c are the first, second, third
+_TURNS[[5, 7, 11, 15, 19, 21]] = torch.tensor(
+    [[1, 0, 0, 0], [0, 0, _H, -_H], [0, _H, -_H, 0], [0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [0, _H, 0, -_H]]
+)
+
+
+def laplace_bits(x: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
+    """Bits of integers under a Laplace law of scale exp(log_scale), at real x (the relaxed quantizer's output).
+
+    Probability of the unit interval around x, computed without cancellation.
+    """
+    b = torch.exp(log_scale)
+    a = x.abs()
+    near = a.clamp(max=0.5)  # keeps the branch that is not taken, and its gradient, finite
+    inner = 1 - 0.5 * (torch.exp((near - 0.5) / b) + torch.exp(-(near + 0.5) / b))
+    tail = torch.exp(-(a - 0.5).clamp(min=0) / b) * 0.5 * (-torch.expm1(-1 / b))
+    p = torch.where(a < 0.5, inner, tail)
+    far = (a - 0.5).clamp(min=0) / b / np.log(2) + 1 - torch.log2(-torch.expm1(-1 / b))  # where p underflows
+    return torch.where(p > 1e-9, -torch.log2(p.clamp(min=1e-9)), far)
+
+
+def neighbours(means: torch.Tensor, step: float) -> torch.Tensor:
+    """[N, 4] the nearest Gaussians among the 32 before each in Morton order, as contexts see them; itself where there
+    is none."""
+    low = means.min(0).values
+    grid = torch.round((means - low) / step).numpy().astype(np.uint32)
+    order = _native.morton_order(grid).astype(np.int64)
+    p = grid[order].astype(np.float32)
+    n = len(p)
+    distance = np.full((n, WINDOW), np.inf, np.float32)
+    for back in range(1, min(WINDOW, n - 1) + 1):
+        distance[back:, back - 1] = ((p[back:] - p[:-back]) ** 2).sum(1)
+    back = distance.argsort(1, kind="stable")[:, :NEAR] + 1
+    index = np.arange(n)[:, None] - back
+    index = np.where(index < 0, np.arange(n)[:, None], index)
+    near = np.empty_like(index)
+    near[order] = order[index]
+    return torch.from_numpy(near)
+
+
+class CanonicalRate:
+    """Bits of the canonical attributes of N Gaussians that hardly move.
+
+    Args:
+        means: [N, 3], which make the order and the neighbours.
+        steps: of the stream.
+    """
+
+    def __init__(self, means: torch.Tensor, steps: Steps):
+        self.near = neighbours(means, steps.means)
+        colour = torch.from_numpy(STEP_WEIGHTS).float()
+        self.to_ycocg = torch.from_numpy(TO_YCOCG.T).float()
+        self.steps = {
+            "log_scales": steps.log_scales,
+            "quats": steps.quats,
+            "logit_opacities": steps.logit_opacities,
+            "sh0": steps.sh0 * colour,
+            "shN": steps.shN * colour,
+        }
+
+    def channels(self, params: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """[N, C] of each attribute in the form and the steps of the encoder; differentiable."""
+        order = params["log_scales"].detach().argsort(dim=1, descending=True, stable=True)
+        values = {
+            "log_scales": params["log_scales"].gather(1, order),
+            "quats": vector_part(params["quats"], order),
+            "logit_opacities": params["logit_opacities"][:, None],
+            "sh0": params["sh0"] @ self.to_ycocg,
+            "shN": params["shN"] @ self.to_ycocg,
+        }
+        return {n: (v / self.steps[n]).flatten(1) for n, v in values.items()}
+
+    def bits(self, params: dict[str, torch.Tensor], generator: torch.Generator) -> dict[str, torch.Tensor]:
+        """Estimated bits of each attribute, all Gaussians together."""
+        return {n: self._bits(x, generator) for n, x in self.channels(params).items() if x.shape[1]}
+
+    def _bits(self, x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        x = x + torch.rand(x.shape, generator=generator) - 0.5
+        around = x[self.near]
+        mean = around.mean(1)
+        with torch.no_grad():  # the law's width follows the neighbours' own differences
+            spread = (around - mean[:, None]).abs().mean(1) + LEAST_SPREAD
+            width = spread * (x - mean).abs().mean(0) / spread.mean(0)
+        return laplace_bits(x - mean, width.log()).sum()
+
+    def gradients(
+        self, params: dict[str, torch.Tensor], price: float, generator: torch.Generator
+    ) -> dict[str, torch.Tensor]:
+        """Gradients of `price` times all bits by the attributes that have any."""
+        leaves = {n: p.detach().clone().requires_grad_() for n, p in params.items()}
+        bits = self.bits(leaves, generator)
+        grads = torch.autograd.grad(price * sum(bits.values()), [leaves[n] for n in bits])
+        return dict(zip(bits, grads, strict=True))
+
+
+def vector_part(quats: torch.Tensor, order: torch.Tensor) -> torch.Tensor:
+    """[N, 3] vector part of quaternions [N, 4] in the form that the encoder codes, axes in `order` ([N, 3])."""
+    with torch.no_grad():
+        turn = _TURNS[order[:, 0] * 9 + order[:, 1] * 3 + order[:, 2]]
+        turned = quat_multiply(quats, turn)
+        turn = quat_multiply(turn, torch.eye(4)[turned.abs().argmax(1)])
+    q = quat_multiply(torch.nn.functional.normalize(quats, dim=1), turn)
+    return q[:, 1:] * torch.where(q[:, :1] < 0, -1.0, 1.0)
