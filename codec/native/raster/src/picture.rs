@@ -159,7 +159,8 @@ pub struct Pixels<'a> {
 impl Pixels<'_> {
     /// The tile at (x, y). With image = gain sum(w rgb) + T background and alpha = 1 - T, the remainder of the whole pixel,
     /// g . sum(w rgb) + T (g . background - g_alpha), is g . image - T g_alpha.
-    pub fn adjoint(&self, x: usize, y: usize, shade: Shade) -> Adjoint {
+    #[inline(always)] // into the kernel, whose wide instructions it needs
+    pub fn adjoint(&self, [x, y]: [usize; 2], shade: Shade) -> Adjoint {
         let mut a = Adjoint {
             transmittance: Plane::ZERO,
             remainder: Plane::ZERO,

@@ -45,8 +45,8 @@ impl GradientRows {
         write_columns(&self.logits, seen, &mut out.logit_opacities[at..to]);
         write_columns(&self.sh0, seen, &mut out.sh0[3 * at..3 * to]);
         write_columns(&self.grad2d, seen, &mut out.grad2d[at..to]);
-        out.sum_weight[at..to].copy_from_slice(&sums[9][..n]);
-        out.max_weight[at..to].copy_from_slice(&sums[10][..n]);
+        write_columns(&[sums[9]], seen, &mut out.sum_weight[at..to]);
+        write_columns(&[sums[10]], seen, &mut out.max_weight[at..to]);
         if k == 0 {
             return;
         }
@@ -66,29 +66,27 @@ impl GradientRows {
 const AHEAD: usize = 24;
 
 /// Adds up the pairs of `n` Gaussians, in the order of their tiles. Bit i of the mask is set if Gaussian first + i has any.
-fn gather(bins: &Bins, sums: &[Sums], first: usize, n: usize) -> ([Row; 12], u16) {
-    let (mut rows, mut seen) = ([[0.0; CHUNK]; 12], 0);
+#[inline(always)] // into the kernel, whose wide instructions it needs
+fn gather(bins: &Bins, sums: &[Sums], first: usize, n: usize, rows: &mut [Row; 12]) -> u16 {
+    let mut seen = 0;
     for lane in 0..n {
         let g = first + lane;
         bins.prefetch_places(g + 2 * AHEAD);
-        bins.places(g + AHEAD)
-            .iter()
-            .for_each(|&place| prefetch(sums, place as usize));
-        let mut total = [0.0f32; 12];
-        let places = bins.places(g);
-        for &place in places {
-            let s = &sums[place as usize].0;
+        bins.places(g + AHEAD, |place| prefetch(sums, place));
+        let mut total = Sums::ZERO.0;
+        bins.places(g, |place| {
+            let s = &sums[place].0;
             for k in 0..10 {
                 total[k] += s[k];
             }
             total[10] = total[10].max(s[10]);
-        }
-        seen |= u16::from(!places.is_empty()) << lane;
+            seen |= 1 << lane;
+        });
         for (row, v) in rows.iter_mut().zip(total) {
             row[lane] = v;
         }
     }
-    (rows, seen)
+    seen
 }
 
 /// Gradient by the camera-space mean and by M = J W R S, from those by the projected mean and the covariance.
@@ -216,7 +214,7 @@ fn chunk<V: Vector>(soa: &Soa, lens: &Lens, k: usize, sums: &[Row; 12], out: &mu
         geometry(&e, lens, &s, at, out);
         colour_backward::<V>(soa, lens, k, sums, at, out);
         // d ln(sigmoid(x)) / dx = 1 - sigmoid(x)
-        let logit = V::load(&soa.logits[at..]).max(c(-55.0));
+        let logit = V::load(&soa.logits[0][at..]).max(c(-55.0));
         let up = crate::project::exp(-logit);
         (V::load(&sums[0][at..]) * up / (c::<V>(1.0) + up)).store(&mut out.logits[0][at..]);
         let gx = s.mean2d[0] * c(0.5 * lens.full[0]);
@@ -234,13 +232,13 @@ fn project_backward_kernel<V: Vector>(
     range: Range<usize>,
     out: &mut Gradients,
 ) {
-    let (mut soa, mut rows) = (Soa::new(), GradientRows::new());
+    let (mut soa, mut rows, mut totals) = (Soa::new(), GradientRows::new(), [[0.0; CHUNK]; 12]);
     for first in range.clone().step_by(CHUNK) {
         let n = CHUNK.min(range.end - first);
-        let (sums, seen) = gather(bins, sums, first, n);
+        let seen = gather(bins, sums, first, n, &mut totals);
         soa.fill(splats, first);
-        chunk::<V>(&soa, lens, splats.sh_k, &sums, &mut rows);
-        rows.write(n, seen, &sums, first - range.start, splats.sh_k, out);
+        chunk::<V>(&soa, lens, splats.sh_k, &totals, &mut rows);
+        rows.write(n, seen, &totals, first - range.start, splats.sh_k, out);
     }
 }
 dispatch!(

@@ -375,9 +375,8 @@ impl Rasterizer {
                     continue;
                 }
                 let (x, y) = (column * TILE, row.start * TILE);
-                let mut adjoint = pixels.adjoint(x, y, shade);
                 let (pairs, hits) = (&bins.pairs[bins.first(t)..], &seen[bins.batches(t)..]);
-                backward(level, projected, pairs, [x as f32, y as f32], hits, &mut adjoint, own);
+                backward(level, projected, pairs, &pixels, [x, y], shade, hits, own);
             }
         });
     }

@@ -171,7 +171,8 @@ impl Level {
         let mut found = Vec::new();
         #[cfg(target_arch = "x86_64")]
         {
-            let fma = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+            let bits = is_x86_feature_detected!("bmi1") && is_x86_feature_detected!("bmi2") && is_x86_feature_detected!("popcnt");
+            let fma = bits && is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
             let f = is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq");
             if fma && f && is_x86_feature_detected!("avx512vl") && is_x86_feature_detected!("avx512bw") {
                 found.push(Level(Isa::Avx512));
@@ -220,11 +221,11 @@ macro_rules! dispatch {
         $vis fn $name(level: $crate::simd::Level, $($arg: $ty),*) $(-> $ret)? {
             #[cfg(target_arch = "x86_64")]
             {
-                #[target_feature(enable = "avx2,fma,avx512f,avx512dq,avx512vl,avx512bw")]
+                #[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt,avx512f,avx512dq,avx512vl,avx512bw")]
                 fn avx512($($arg: $ty),*) $(-> $ret)? {
                     $kernel::<$crate::simd::avx512::F32x16>($($arg),*)
                 }
-                #[target_feature(enable = "avx2,fma")]
+                #[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt")]
                 fn avx2($($arg: $ty),*) $(-> $ret)? {
                     $kernel::<$crate::simd::avx2::F32x8>($($arg),*)
                 }
