@@ -6,11 +6,13 @@ size of an image goes through torch, which is what makes a step cheap on a CPU.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gscodec.camera import Camera
+from gscodec.errors import UsageError
 from gscodec.render.workspace import PARAMETERS, STATISTICS, Region, Workspace, call, rgb, view
 
 
@@ -47,6 +49,29 @@ class RenderLoss:
         return self.radii > 0
 
 
+@dataclass(frozen=True)
+class Crop:
+    """A view, or a part of one, and what it should look like; see `render_loss`."""
+
+    camera: Camera
+    target_rgb: np.ndarray
+    target_alpha: np.ndarray | None = None
+    background: Sequence[float] = (0.0, 0.0, 0.0)
+    gain: Sequence[float] | None = None
+    weight: np.ndarray | None = None
+    region: Region | None = None
+
+    def native(self) -> tuple:
+        """As the native side takes it."""
+        whole = (0, 0, self.camera.width, self.camera.height)
+        target = (self.target_rgb, self.target_alpha, self.weight)
+        return (
+            view(self.camera, self.region or whole),
+            (rgb(self.background), None if self.gain is None else rgb(self.gain)),
+            tuple(None if t is None else np.ascontiguousarray(t) for t in target),
+        )
+
+
 def render_loss(
     params: dict,
     camera: Camera,
@@ -79,23 +104,39 @@ def render_loss(
     Raises:
         UsageError: shapes disagree, or the camera has distortion.
     """
+    crop = Crop(camera, target_rgb, target_alpha, background, gain, weight, region)
+    result = render_batch(params, [crop], ssim_lambda, mask_lambda, workspace)
+    return replace(result, grad_gain=result.grad_gain[0])
+
+
+def render_batch(
+    params: dict,
+    crops: Sequence[Crop],
+    ssim_lambda: float = 0.2,
+    mask_lambda: float = 0.0,
+    workspace: Workspace | None = None,
+) -> RenderLoss:
+    """Loss of several crops, of one view or of many, and its gradients: what `render_loss` gives for each, added up.
+
+    Of the result, loss, grads, grad2d and sum_weight are sums over the crops, max_weight and radii the largest; l1,
+    mse, ssim and mask are means, and grad_gain is [crops, 3].
+
+    Raises:
+        UsageError: shapes disagree, a camera has distortion, or there are no crops.
+    """
+    if not crops:
+        raise UsageError("a batch has at least one crop, got none")
     workspace = workspace or Workspace()
     arrays = tuple(_numpy(params[name]) for name in PARAMETERS)
     grads, statistics = workspace.gradients(arrays)
     workspace.calls += 1
-    values = call(
-        workspace.native.step,
-        arrays,
-        view(camera, region or (0, 0, camera.width, camera.height)),
-        (rgb(background), None if gain is None else rgb(gain)),
-        tuple(None if t is None else np.ascontiguousarray(t) for t in (target_rgb, target_alpha, weight)),
-        (ssim_lambda, mask_lambda),
-        (grads, statistics),
-    )
+    native = [crop.native() for crop in crops]
+    values, radii = call(workspace.native.step, arrays, native, (ssim_lambda, mask_lambda), (grads, statistics))
+    losses, gain = np.array([v[:5] for v in values]), np.array([v[5] for v in values])
     named = {k: _like(g, params[k]) for k, g in zip(PARAMETERS, grads, strict=True)}
-    radii, _ = workspace.native.radii()
     statistics = dict(zip(STATISTICS, statistics, strict=True))
-    return RenderLoss(*values[:5], grads=named, radii=radii, grad_gain=np.array(values[5]), **statistics)
+    loss, means = float(losses[:, 0].sum()), losses[:, 1:].mean(0).tolist()
+    return RenderLoss(loss, *means, grads=named, radii=radii, grad_gain=gain, **statistics)
 
 
 def _numpy(array) -> np.ndarray:

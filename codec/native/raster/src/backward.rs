@@ -131,7 +131,8 @@ fn visit<V: Vector>(visits: &Visits, k: usize, at: usize, s: &Local, adjoint: &m
     let draw = next.ge(c(TRANSMITTANCE_STOP));
     let weight = drawn.select(draw, zero);
     // where nothing is drawn, the pixel is finished or was so before
-    next.select(draw, t.negative()).store(&mut adjoint.transmittance.0[b][at..]);
+    next.select(draw, t.negative())
+        .store(&mut adjoint.transmittance.0[b][at..]);
     let d = g[0].mul_add(c(s.rgb[0]), g[1].mul_add(c(s.rgb[1]), g[2] * c(s.rgb[2])));
     let wd = weight * d;
     let rest = remainder - wd;

@@ -69,7 +69,11 @@ impl Band {
                 let tiles = [x0, x1, y0.max(top) - top, y1.min(bottom) - top];
                 let y = p.y - self.first as f32;
                 // the rows above are gone, and those below
-                let met = if p.met == MANY { MANY } else { p.met >> (2 * (tiles[2] + top - y0)) };
+                let met = if p.met == MANY {
+                    MANY
+                } else {
+                    p.met >> (2 * (tiles[2] + top - y0))
+                };
                 let met = if y1 > bottom && met != MANY { met & 0b11 } else { met };
                 self.splats.push(Projected { y, tiles, met, ..*p });
             }

@@ -14,8 +14,11 @@ use crate::scene::{RasterError, Region};
 use crate::simd::prefetch;
 use crate::tile::{BATCH, Ellipse, reach};
 
-/// Chunks of the sorted order; bounds the parallelism of binning.
+/// Chunks of the sorted order; bounds the parallelism of binning. Few Gaussians have fewer, but not fewer than the least:
+/// each chunk has a counter a tile.
 const CHUNKS: usize = 16;
+const CHUNKS_MIN: usize = 4;
+const CHUNK_SIZE: usize = 4096;
 /// Entry of a Gaussian whose ellipse meets no tile.
 const NOWHERE: u32 = u32::MAX;
 /// The most that `append` adds for a Gaussian whose tiles are known.
@@ -87,7 +90,7 @@ pub struct Bins {
     owned: Vec<AtomicU32>,
     /// of each chunk: for each Gaussian the positions of its pairs in `pairs`, << 1, with 1 added to the last; or NOWHERE
     lists: Vec<Vec<u32>>,
-    cursors: Vec<u32>, // [CHUNKS, tiles]
+    cursors: Vec<u32>, // [chunks, tiles]
 }
 
 /// Calls `visit(tile)` for those of the tiles that the ellipse of `p` meets at pixel centres.
@@ -139,7 +142,10 @@ fn append(p: &Projected, tiles: &Tiles, count: &mut [u32], list: &mut Vec<u32>, 
     if p.met != MANY && inside {
         let width = tiles.columns.len();
         let first = (y0 - tiles.rows.start) * width + x0 - tiles.columns.start;
-        for (i, tile) in [first, first + 1, first + width, first + width + 1].into_iter().enumerate() {
+        for (i, tile) in [first, first + 1, first + width, first + width + 1]
+            .into_iter()
+            .enumerate()
+        {
             let met = usize::from(p.met >> i & 1);
             list[end] = (tile as u32) << 1;
             count[tile * met] += met as u32;
@@ -216,10 +222,13 @@ impl Bins {
     /// The list from the entries of a visible Gaussian on.
     #[inline(always)]
     fn entries(&self, gaussian: usize) -> &[u32] {
-        let Some(owned) = self.owned.get(gaussian) else { return &[] };
+        let Some(owned) = self.owned.get(gaussian) else {
+            return &[];
+        };
         let owned = owned.load(Relaxed);
         let list = self.lists.get((owned >> OFFSET_BITS) as usize);
-        list.and_then(|list| list.get((owned & ((1 << OFFSET_BITS) - 1)) as usize..)).unwrap_or(&[])
+        list.and_then(|list| list.get((owned & ((1 << OFFSET_BITS) - 1)) as usize..))
+            .unwrap_or(&[])
     }
 
     /// Fetches what `places` will read.
@@ -254,12 +263,13 @@ impl Bins {
         let tiles = rectangle.len();
         self.tiles = rectangle;
         let rectangle = &self.tiles;
+        let chunks = (sorted.len() / CHUNK_SIZE).clamp(CHUNKS_MIN, CHUNKS);
         self.cursors.clear();
-        self.cursors.resize(CHUNKS * tiles, 0);
-        self.lists.resize_with(CHUNKS, Vec::new);
+        self.cursors.resize(chunks * tiles, 0);
+        self.lists.resize_with(chunks, Vec::new);
         self.owned.clear();
         self.owned.resize_with(projected.len(), || AtomicU32::new(HIDDEN));
-        let share = sorted.len().div_ceil(CHUNKS).max(1);
+        let share = sorted.len().div_ceil(chunks).max(1);
         let owned = &self.owned;
         self.lists.iter_mut().for_each(Vec::clear);
         let work = self
@@ -280,13 +290,13 @@ impl Bins {
                 let g = index(key);
                 owned[g].store((chunk as u32) << OFFSET_BITS | used as u32, Relaxed);
                 used = append(&projected[g], rectangle, count, list, used);
-                if used > limit / CHUNKS {
+                if used > limit / chunks {
                     break; // reported below
                 }
             }
             list.truncate(used);
         });
-        if self.lists.iter().any(|list| list.len() > limit / CHUNKS) {
+        if self.lists.iter().any(|list| list.len() > limit / chunks) {
             return Err(RasterError::TooMany {
                 what: "Gaussian-tile pairs",
                 limit,
@@ -303,7 +313,7 @@ impl Bins {
         let mut sum = 0;
         for t in 0..tiles {
             self.starts.push(sum);
-            for chunk in 0..CHUNKS {
+            for chunk in 0..self.lists.len() {
                 sum += std::mem::replace(&mut self.cursors[chunk * tiles + t], sum);
             }
         }

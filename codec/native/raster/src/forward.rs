@@ -24,6 +24,11 @@ impl Canvas {
             rgb: [Plane::ZERO; 3],
             live: 0,
         };
+        if width >= TILE && height >= TILE {
+            canvas.transmittance = Plane([[1.0; BLOCK]; BLOCKS]);
+            canvas.live = u16::MAX;
+            return canvas;
+        }
         for y in 0..height.min(TILE) {
             for x in 0..width.min(TILE) {
                 let (b, k) = swizzle(x, y);

@@ -47,6 +47,11 @@ impl Projected {
     pub fn visible(&self) -> bool {
         self.rx >= 0.0
     }
+
+    /// Larger half side of the box in pixels, 0 for the invisible.
+    pub fn radius(&self) -> f32 {
+        if self.visible() { self.rx.max(self.ry) } else { 0.0 }
+    }
 }
 
 /// u^2 = log2(e)/2 * (whitened distance)^2
@@ -298,17 +303,22 @@ fn meet<V: Vector>(ellipse: &Ellipse<V>, [x, y]: [V; 2], [x0, x1, y0, y1]: [V; 4
     let side = TILE as f32;
     let (left, top) = (x0.mul_add(c(side), -x), y0.mul_add(c(side), -y));
     let peak = ellipse.peak();
+    let (columns, rows) = (x1 - x0, y1 - y0);
     let mut bits = c::<V>(MAGIC);
     for i in 0..2 {
         let first = top + c(i as f32 * side + 0.5);
         let (some, from, to) = ellipse.span(peak, first, first + c(side - 1.0));
+        let some = some & rows.ge(c(i as f32));
         for j in 0..2 {
             let west = left + c(j as f32 * side + 0.5);
-            let hit = some & to.ge(west * ellipse.l11) & ((west + c(side - 1.0)) * ellipse.l11).ge(from);
+            let hit = some
+                & columns.ge(c(j as f32))
+                & to.ge(west * ellipse.l11)
+                & ((west + c(side - 1.0)) * ellipse.l11).ge(from);
             bits = bits + c::<V>((1 << (2 * i + j)) as f32).select(hit, c(0.0));
         }
     }
-    let many = (x1 - x0).ge(c(2.0)) | (y1 - y0).ge(c(2.0));
+    let many = columns.ge(c(2.0)) | rows.ge(c(2.0));
     c::<V>(MAGIC + f32::from(MANY)).select(many, bits)
 }
 

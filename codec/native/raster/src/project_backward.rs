@@ -38,25 +38,36 @@ impl GradientRows {
     /// To the `n` Gaussians `at ..` of `out`; 0 for those without a bit in `seen`.
     #[inline(always)]
     fn write(&self, n: usize, seen: u16, sums: &[Row; 12], at: usize, k: usize, out: &mut Gradients) {
-        let to = at + n;
-        write_columns(&self.means, seen, &mut out.means[3 * at..3 * to]);
-        write_columns(&self.quats, seen, &mut out.quats[4 * at..4 * to]);
-        write_columns(&self.log_scales, seen, &mut out.log_scales[3 * at..3 * to]);
-        write_columns(&self.logits, seen, &mut out.logit_opacities[at..to]);
-        write_columns(&self.sh0, seen, &mut out.sh0[3 * at..3 * to]);
-        write_columns(&self.grad2d, seen, &mut out.grad2d[at..to]);
-        write_columns(&[sums[9]], seen, &mut out.sum_weight[at..to]);
-        write_columns(&[sums[10]], seen, &mut out.max_weight[at..to]);
+        let (to, add) = (at + n, out.add);
+        write_columns(&self.means, seen, add, &mut out.means[3 * at..3 * to]);
+        write_columns(&self.quats, seen, add, &mut out.quats[4 * at..4 * to]);
+        write_columns(&self.log_scales, seen, add, &mut out.log_scales[3 * at..3 * to]);
+        write_columns(&self.logits, seen, add, &mut out.logit_opacities[at..to]);
+        write_columns(&self.sh0, seen, add, &mut out.sh0[3 * at..3 * to]);
+        write_columns(&self.grad2d, seen, add, &mut out.grad2d[at..to]);
+        write_columns(&[sums[9]], seen, add, &mut out.sum_weight[at..to]);
+        let largest = out.max_weight[at..to].iter_mut();
+        for (lane, (old, &new)) in largest.zip(&sums[10]).enumerate() {
+            let new = if seen >> lane & 1 == 1 { new } else { 0.0 };
+            *old = if add { old.max(new) } else { new };
+        }
         if k == 0 {
             return;
         }
         for (lane, out) in out.sh_n[3 * k * at..3 * k * to].chunks_exact_mut(3 * k).enumerate() {
             if seen >> lane & 1 == 0 {
-                out.fill(0.0);
+                if !add {
+                    out.fill(0.0);
+                }
                 continue;
             }
             for (out, rows) in out.as_chunks_mut::<3>().0.iter_mut().zip(&self.sh_n) {
-                *out = [rows[0][lane], rows[1][lane], rows[2][lane]];
+                let new = [rows[0][lane], rows[1][lane], rows[2][lane]];
+                *out = if add {
+                    std::array::from_fn(|ch| out[ch] + new[ch])
+                } else {
+                    new
+                };
             }
         }
     }

@@ -72,12 +72,12 @@ fn columns<const D: usize>(rows: &mut [Row; D], flat: &[f32]) {
     }
 }
 
-/// D rows -> [n, D], the mirror of `columns`; 0 where `seen` has no bit.
+/// D rows -> [n, D], the mirror of `columns`; 0 where `seen` has no bit; `add`: to what is there.
 #[inline(always)]
-pub fn write_columns<const D: usize>(rows: &[Row; D], seen: u16, flat: &mut [f32]) {
-    let keep = |d: usize, lane: usize| if seen >> lane & 1 == 1 { rows[d][lane] } else { 0.0 };
+pub fn write_columns<const D: usize>(rows: &[Row; D], seen: u16, add: bool, flat: &mut [f32]) {
     if let ([whole], []) = flat.as_chunks_mut::<D>().0.as_chunks_mut::<CHUNK>()
         && seen == u16::MAX
+        && !add
     {
         for lane in 0..CHUNK {
             for d in 0..D {
@@ -88,7 +88,8 @@ pub fn write_columns<const D: usize>(rows: &[Row; D], seen: u16, flat: &mut [f32
     }
     for (lane, item) in flat.chunks_exact_mut(D).enumerate() {
         for d in 0..D {
-            item[d] = keep(d, lane);
+            let value = if seen >> lane & 1 == 1 { rows[d][lane] } else { 0.0 };
+            item[d] = if add { item[d] + value } else { value };
         }
     }
 }
