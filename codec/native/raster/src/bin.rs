@@ -132,6 +132,14 @@ fn for_tiles(p: &Projected, tiles: &Tiles, mut visit: impl FnMut(usize)) {
     }
 }
 
+/// Makes room for `more` entries; by a quarter, since twice as much would be felt in the memory of a picture.
+#[inline(always)]
+fn grow(list: &mut Vec<u32>, more: usize) {
+    if list.capacity() - list.len() < more {
+        list.reserve_exact(more + list.len() / 4);
+    }
+}
+
 /// A Gaussian's entries of a chunk's list, tile << 1 | last, from `used` on; counts them. Returns their end. There is room for
 /// FEW, and no branch for those that are met: which ones cannot be foretold.
 #[inline(always)]
@@ -153,6 +161,7 @@ fn append(p: &Projected, tiles: &Tiles, count: &mut [u32], list: &mut Vec<u32>, 
         }
     } else {
         list.truncate(used);
+        grow(list, (x1 + 1 - x0.min(x1)) * (y1 + 1 - y0.min(y1)) + FEW);
         for_tiles(p, tiles, |tile| {
             count[tile] += 1;
             list.push((tile as u32) << 1);
@@ -282,7 +291,8 @@ impl Bins {
             let mut used = 0;
             for (i, key) in keys.iter().enumerate() {
                 if list.len() < used + FEW {
-                    list.resize((2 * used).max(8 * FEW), 0);
+                    grow(list, 8 * FEW);
+                    list.resize(list.capacity(), 0);
                 }
                 if let Some(next) = keys.get(i + AHEAD) {
                     prefetch(projected, index(next));
