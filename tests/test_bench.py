@@ -52,4 +52,5 @@ def test_charts_are_drawn_from_the_results_alone(tmp_path):
 def test_a_missing_file_is_said(tmp_path):
     said = []
     assert list(run(("statue",), data=tmp_path, say=said.append)) == []
-    assert said == ["statue: left out, splats/statue.ply is not in the data folder"]
+    missing = tmp_path / "splats" / "statue.ply"
+    assert said == [f"statue: left out, {missing} is not there; the data folder (GSCODEC_DATA) must have it"]
