@@ -266,7 +266,8 @@ def bench_raster(
     simd: Annotated[str | None, typer.Option(help="Comma-separated instruction sets.")] = None,
     threads: Annotated[str | None, typer.Option(help="Comma-separated numbers of threads.")] = None,
     repeats: Annotated[int, typer.Option(help="Runs of which the median counts.")] = 15,
-    data: Annotated[Path | None, typer.Option(envvar="GSCODEC_DATA", help="Folder with the splats' files.")] = None,
+    data: Annotated[Path | None, typer.Option(envvar="GSCODEC_DATA", help="Folder with captures and splats.")] = None,
+    work: Annotated[Path, typer.Option(help="Where the trained lumberjack is made and kept.")] = Path("build/bench"),
     out: Annotated[Path | None, typer.Option(help="Also write machine, commit, settings and entries here.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -280,7 +281,7 @@ def bench_raster(
             f"step {e['step_ms']:8.2f} ms"
         )
 
-    _show_entries(measure(scenes, simd, threads, repeats=repeats, data=data, out=out), as_json, line)
+    _show_entries(measure(scenes, simd, threads, repeats=repeats, data=data, work=work, out=out), as_json, line)
 
 
 @bench.command("rd")

@@ -82,4 +82,5 @@ def test_cameras_are_taken_out_of_training(tmp_path):
 def test_a_missing_file_is_said(tmp_path):
     said = []
     assert list(run(("statue",), data=tmp_path, say=said.append)) == []
-    assert said == ["statue: left out, splats/statue.ply is not in the data folder"]
+    missing = tmp_path / "splats" / "statue.ply"
+    assert said == [f"statue: left out, {missing} is not there; the data folder (GSCODEC_DATA) must have it"]
