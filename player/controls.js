@@ -18,7 +18,7 @@ const options = (list) => list.map(([value, text]) => `<option value="${value}">
 export const MARKUP = `
 <div class="frame">
   <div class="stage" tabindex="0" role="application" aria-label="Volumetric video: drag to turn, two fingers or right button to move, wheel or pinch to zoom">
-    <canvas></canvas>
+    <div class="view"><canvas></canvas></div>
     <pre class="stats" hidden></pre>
     <div class="notes" role="status"></div>
     <div class="busy" hidden></div>
@@ -35,6 +35,7 @@ export const MARKUP = `
     <select data-set="speed" title="Speed" aria-label="Speed">${options([0.25, 0.5, 1, 2].map((v) => [v, `${v}×`]))}</select>
     <select data-set="layers" title="Layers" aria-label="Layers" hidden></select>
     <select data-set="quality" title="Quality" aria-label="Quality">${options([["auto", "Auto"], [1, "Full"], [0.7, "70 %"], [0.5, "50 %"], [0.35, "35 %"]])}</select>
+    <select data-set="renderer" title="Drawn by" aria-label="Drawn by">${options([["auto", "CPU or GPU"], ["cpu", "CPU"], ["gpu", "GPU"]])}</select>
     ${button("loop", "Loop (L)", 'aria-pressed="false"')}
     ${button("reset", "Reset the camera (R)")}
     ${button("stats", "Statistics (S)", 'aria-pressed="false"')}
@@ -66,16 +67,16 @@ export function onKeys(host, act) {
   });
 }
 
-// Drags and wheel on the canvas; calls orbit(dx, dy), pan(dx, dy) in shares of the shorter side, zoom(factor).
-export function onDrag(canvas, { orbit, pan, zoom }) {
+// Drags and wheel on the picture; calls orbit(dx, dy), pan(dx, dy) in shares of the shorter side, zoom(factor).
+export function onDrag(view, { orbit, pan, zoom }) {
   const fingers = new Map();
-  const unit = () => Math.max(Math.min(canvas.clientWidth, canvas.clientHeight), 1);
-  canvas.addEventListener("pointerdown", (e) => {
-    canvas.setPointerCapture(e.pointerId);
+  const unit = () => Math.max(Math.min(view.clientWidth, view.clientHeight), 1);
+  view.addEventListener("pointerdown", (e) => {
+    view.setPointerCapture(e.pointerId);
     fingers.set(e.pointerId, e);
-    canvas.classList.add("dragging");
+    view.classList.add("dragging");
   });
-  canvas.addEventListener("pointermove", (e) => {
+  view.addEventListener("pointermove", (e) => {
     const before = fingers.get(e.pointerId);
     if (!before) return;
     const [dx, dy] = [(e.clientX - before.clientX) / unit(), (e.clientY - before.clientY) / unit()];
@@ -89,13 +90,13 @@ export function onDrag(canvas, { orbit, pan, zoom }) {
     fingers.set(e.pointerId, e);
   });
   for (const name of ["pointerup", "pointercancel"]) {
-    canvas.addEventListener(name, (e) => {
+    view.addEventListener(name, (e) => {
       fingers.delete(e.pointerId);
-      if (!fingers.size) canvas.classList.remove("dragging");
+      if (!fingers.size) view.classList.remove("dragging");
     });
   }
-  canvas.addEventListener("contextmenu", (e) => e.preventDefault());
-  canvas.addEventListener("wheel", (e) => {
+  view.addEventListener("contextmenu", (e) => e.preventDefault());
+  view.addEventListener("wheel", (e) => {
     e.preventDefault();
     zoom(Math.exp(-e.deltaY * (e.deltaMode ? 0.05 : 0.0015)));
   }, { passive: false });

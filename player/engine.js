@@ -1,7 +1,9 @@
 // From groups to pictures: which groups are fetched, decoded and held, which worker does what, and when a picture is whole.
 //
 //   source --payload--> group worker (decode, evaluate, project) --ellipses of a band--> raster worker --pixels--> canvas
+//                                                                \--what the view shows--> GPU, on a canvas above
 
+import { Gpu, gpuName } from "./gpu.js";
 import { ALL, Native, load } from "./native.js";
 import { Ladder } from "./ladder.js";
 import { Source } from "./source.js";
@@ -28,6 +30,8 @@ export class Engine extends EventTarget {
   #pictures = new Map(); // id -> {bands, parts, ...}
   #next = 1;
   #shown = 0;
+  #gpu = null;
+  #how = "cpu";
 
   constructor(canvas, base, src) {
     super();
@@ -75,6 +79,47 @@ export class Engine extends EventTarget {
     this.source.close();
     for (const g of this.groups.values()) g.abort?.abort();
     for (const w of [...this.#workers, ...this.#rasters]) w.terminate();
+    this.#leaveGpu();
+  }
+
+  // Who draws from now on: "cpu", "gpu", or "auto", the GPU if there is a real one. Rejects if the GPU cannot be used.
+  async use(how) {
+    this.#how = how;
+    if (how === "cpu" || (how === "auto" && gpuName() === null)) return this.#leaveGpu();
+    if (this.#gpu) return;
+    const canvas = document.createElement("canvas");
+    canvas.hidden = true;
+    const [low, high] = [this.bounds.slice(0, 3), this.bounds.slice(3)];
+    const origin = low.map((v, i) => (v + high[i]) / 2);
+    const gpu = await Gpu.create(canvas, this.base, { origin, background: this.source.config.background });
+    if (this.closed || this.#gpu || this.#how !== how) return gpu.close();
+    this.canvas.after(canvas);
+    canvas.addEventListener("webglcontextlost", () => this.#loseGpu("its context was lost"));
+    this.#gpu = Object.assign(gpu, { canvas, origin });
+  }
+
+  #leaveGpu() {
+    const gpu = this.#gpu;
+    this.#gpu = null;
+    gpu?.canvas.remove();
+    gpu?.close();
+    for (const [id, picture] of this.#pictures) if (picture.gpu) this.#pictures.delete(id);
+    this.canvas.hidden = false;
+  }
+
+  #loseGpu(why) {
+    if (!this.#gpu) return;
+    this.#leaveGpu();
+    this.dispatchEvent(new CustomEvent("nogpu", { detail: why }));
+  }
+
+  // For people.
+  get drawnBy() {
+    return this.#gpu?.name ?? `CPU, ${this.#rasters.length} workers`;
+  }
+
+  get onGpu() {
+    return this.#gpu !== null;
   }
 
   get fps() {
@@ -215,6 +260,9 @@ export class Engine extends EventTarget {
       this.stats.project = m.ms;
       const picture = this.#pictures.get(m.id);
       if (picture) picture.bands = m.bands;
+    } else if (m.type === "packed") {
+      this.stats.project = m.ms;
+      this.#paint(m);
     } else if (m.type === "failed") {
       if (m.id !== undefined) this.#pictures.delete(m.id);
       if (m.fatal) return this.#dead(m);
@@ -231,10 +279,27 @@ export class Engine extends EventTarget {
     const group = this.groupOf(t);
     const entry = this.groups.get(group);
     const id = this.#next++;
-    this.#pictures.set(id, { t, view, parts: [], blend: 0, gaussians: entry.header.gaussians });
+    const gpu = this.#gpu;
+    this.#pictures.set(id, { t, view, gpu, parts: [], blend: 0, gaussians: entry.header.gaussians });
     const local = t - this.source.groups[group].start_frame;
-    entry.worker.postMessage({ type: "draw", id, group, t: local, view, background: this.source.config.background });
+    const how = gpu ? { type: "pack", origin: gpu.origin } : { type: "draw", background: this.source.config.background };
+    entry.worker.postMessage({ ...how, id, group, t: local, view });
     return id;
+  }
+
+  async #paint({ id, buffer }) {
+    const picture = this.#pictures.get(id);
+    if (!picture) return; // the GPU was left meanwhile
+    const start = performance.now();
+    try {
+      await picture.gpu.draw(picture.view, new Uint32Array(buffer));
+    } catch (e) {
+      return this.#loseGpu(e.message);
+    }
+    if (!this.#pictures.delete(id)) return;
+    picture.blend = performance.now() - start;
+    [this.canvas.hidden, picture.gpu.canvas.hidden] = [true, false];
+    this.#tell(id, picture);
   }
 
   #onRaster(worker, m) {
@@ -250,13 +315,18 @@ export class Engine extends EventTarget {
     for (const { worker, pixels } of picture.parts) worker.postMessage(pixels, [pixels]);
   }
 
-  #show(id, { parts, view, t, blend, gaussians }) {
-    this.#shown = id;
+  #show(id, picture) {
+    const { parts, view } = picture;
     const [width, height] = view;
     if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
     for (const { pixels, first, rows } of parts) {
       this.context.putImageData(new ImageData(new Uint8ClampedArray(pixels), width, rows), 0, first);
     }
+    this.#tell(id, picture);
+  }
+
+  #tell(id, { t, view, blend, gaussians }) {
+    this.#shown = id;
     Object.assign(this.stats, { blend, gaussians });
     this.dispatchEvent(new CustomEvent("picture", { detail: { id, t, view } }));
   }

@@ -102,6 +102,13 @@ export class Native {
     return bands;
   }
 
+  // What the view shows, as Spark takes it (see pack.rs), relative to an origin: a view into the memory of the instance.
+  pack(view, origin) {
+    this.put(new Uint8Array(view.buffer, view.byteOffset, view.byteLength));
+    this.check(this.x.pack(...origin));
+    return this.bytes(this.x.output(), this.x.output_length());
+  }
+
   // Returns [rows, width, 4], a view into the memory of the instance.
   draw(splats, width, rows, background) {
     this.bytes(this.x.splats(splats.length / this.x.splat_size()), splats.length).set(splats);

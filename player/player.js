@@ -1,7 +1,8 @@
 // <gsv-player src="URL"> plays a .gsv file: the clock, the size of the picture, and what the viewer is told.
 //
-// Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the picture fills the element); quality="auto" or 0.1 to 1;
-// layers="2": only the first so many, else "all".
+// Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the picture fills the
+// element); quality="auto" or 0.1 to 1; layers="2": only the first so many, else "all"; renderer="cpu" or "gpu", else the GPU
+// if there is a real one.
 // Properties: paused, frame, frameCount, fps, camera, stats. Methods: play(), pause(), show(frame). Events: ready, picture,
 // ended, error.
 
@@ -18,10 +19,11 @@ const STILL = 250; // ms without a movement after which the picture is drawn sha
 const STALL = 300; // ms without a picture after which the viewer is told to wait
 
 export class GsvPlayer extends HTMLElement {
-  static observedAttributes = ["src", "loop", "speed", "quality", "size", "layers"];
+  static observedAttributes = ["src", "loop", "speed", "quality", "size", "layers", "renderer"];
   paused = true;
   speed = 1;
   quality = "auto";
+  renderer = "auto";
   #position = 0; // frames, with a fraction
   #last = 0; // time of the last tick
   #moved = 0; // of the last change of the camera
@@ -49,7 +51,7 @@ export class GsvPlayer extends HTMLElement {
       this.#moved = performance.now();
       this.$("[data-set=view]").value = this.camera.reference ? String(this.camera.references.indexOf(this.camera.reference)) : "orbit";
     };
-    onDrag(this.$("canvas"), {
+    onDrag(this.$(".view"), {
       orbit: move((x, y) => this.camera.orbit(x, y)),
       pan: move((x, y) => this.camera.pan(x, y)),
       zoom: move((f) => this.camera.zoom(f)),
@@ -74,7 +76,11 @@ export class GsvPlayer extends HTMLElement {
     if (name === "speed" && Number(value) > 0) this.speed = Number(value);
     if (name === "quality" && value) this.quality = value === "auto" ? value : Math.min(Math.max(Number(value) || 1, 0.1), 1);
     if (name === "layers") this.engine?.show(this.#layers);
-    for (const set of ["speed", "quality"]) this.$(`[data-set=${set}]`).value = String(this[set]);
+    if (name === "renderer") {
+      this.renderer = ["cpu", "gpu"].includes(value) ? value : "auto";
+      if (this.stats.gaussians) this.#render();
+    }
+    for (const set of ["speed", "quality", "renderer"]) this.$(`[data-set=${set}]`).value = String(this[set]);
   }
 
   get #layers() {
@@ -142,13 +148,14 @@ export class GsvPlayer extends HTMLElement {
     this.$(".error").hidden = true;
     this.$(".notes").replaceChildren();
     this.$(".busy").hidden = false;
-    Object.assign(this, { camera: null, paused: true });
+    Object.assign(this, { camera: null, paused: true, shown: null });
     [this.#position, this.#scale, this.#drawn] = [0, null, ""];
     const engine = (this.engine = new Engine(this.$("canvas"), BASE, this.getAttribute("src")));
     engine.layers = this.#layers;
     const { source } = engine;
     const on = (target, type, f) => target.addEventListener(type, (e) => this.engine === engine && f(e.detail));
     on(engine, "damaged", (d) => this.#damaged(d));
+    on(engine, "nogpu", (why) => this.#note("gpu", `The GPU cannot be used (${why}): the CPU draws.`));
     on(engine, "fatal", (message) => this.#fail("The player has stopped", `${message}.`));
     on(engine, "decoded", ({ header }) => this.#begin(engine, header));
     on(engine, "picture", (detail) => this.#pictured(detail));
@@ -271,7 +278,7 @@ export class GsvPlayer extends HTMLElement {
 
   #draw(now) {
     const view = this.#view(this.paused && now - this.#moved > STILL);
-    const what = `${this.frame} ${view} ${this.engine.layers}`;
+    const what = `${this.frame} ${view} ${this.engine.layers} ${this.engine.onGpu}`;
     if (what === this.#drawn) return;
     this.#drawn = what;
     this.engine.draw(this.frame, view);
@@ -279,10 +286,23 @@ export class GsvPlayer extends HTMLElement {
 
   #pictured(detail) {
     const now = performance.now();
+    if (!this.shown) this.#render(); // not before: the first picture does not wait for it
+    this.shown = detail;
     this.#times.push(now);
     this.#busySince = 0;
     this.dispatchEvent(new CustomEvent("picture", { detail }));
     if (!this.paused) this.#adapt(now);
+  }
+
+  // The GPU, or the CPU.
+  async #render() {
+    const { engine } = this;
+    this.#note("gpu", null);
+    try {
+      await engine.use(this.renderer);
+    } catch (e) {
+      if (this.engine === engine) this.#note("gpu", `The GPU cannot be used (${e.message}): the CPU draws.`);
+    }
   }
 
   // Finds the size at which this device keeps up, from how long the slowest stage of a picture takes.
@@ -346,13 +366,14 @@ export class GsvPlayer extends HTMLElement {
 
   #figures() {
     const { source } = this.engine;
-    const [s, { width, height }] = [this.stats, this.$("canvas")];
+    const [s, [width, height]] = [this.stats, this.shown?.view ?? [0, 0]];
     const group = source.groups[this.engine.groupOf(this.frame)];
     const rate = group ? (8e-6 * group.size * this.fps) / group.frames : 0;
     return [
       ["fps", `${s.fps} of ${this.fps.toFixed(1)}`],
       ["frame", `${this.frame} of ${this.frameCount}`],
       ["picture", `${width} x ${height}`],
+      ["drawn by", this.engine.drawnBy],
       ["Gaussians", s.gaussians.toLocaleString("en")],
       ["decode", `${s.decode.toFixed(1)} ms/frame`],
       ["project", `${s.project.toFixed(1)} ms`],

@@ -203,6 +203,7 @@ def test_a_growing_file(browser, tmp_path, gsv):
 
 
 def test_an_old_browser_is_told(browser, server):
+    browser.call("Page.enable")
     script = browser.call("Page.addScriptToEvaluateOnNewDocument", source="WebAssembly.validate = () => false")
     browser.goto(server.url)
     assert "SIMD" in error_text(browser)
