@@ -1,10 +1,10 @@
-"""Headless Chromium for the tests and measurements of the player, driven by Playwright; the browser is the system's own."""
+"""Headless Chromium, the system's own, for the tests and measurements of the player; driven by Playwright."""
 
 from __future__ import annotations
 
+import base64
 import os
 import shutil
-from pathlib import Path
 
 from playwright.sync_api import Error, sync_playwright
 
@@ -116,6 +116,7 @@ class Browser:
         self.page.mouse.move(x, y)
         self.page.mouse.wheel(0, delta)
 
-    def screenshot(self, path: Path) -> None:
-        """Writes the window as a PNG."""
-        self.page.screenshot(path=path)
+    def screenshot(self, box: dict | None = None) -> bytes:
+        """PNG of the window, or of the part `box` (x, y, width, height) of it; at the size that `resize` has set."""
+        clip = {"clip": box | {"scale": 1}} if box else {}
+        return base64.b64decode(self.call("Page.captureScreenshot", **clip)["data"])

@@ -7,11 +7,11 @@ the folder that GSCODEC_DATA names the moving statue, 40 frames (statue: without
 101,275 Gaussians) and 300 frames (long, for the memory).
 
 Of each stream:
-  first_picture_ms   from the start of the navigation to the first picture, page and stream from this machine, nothing cached
-  fps_clock          pictures a second when 60 are wanted; the display's clock allows no more than 60
+  first_picture_ms   from the start of the navigation, page and stream from this machine, nothing cached
+  fps_clock          pictures a second when 60 are wanted, median of 3 times 4 s; the display allows no more
   fps_free           pictures a second of all frames in order, asked for as fast as they come
   project_ms, blend_ms   medians of a picture: evaluating and projecting it, the slower one of the raster workers
-  decode             ms a frame (decoding a group, evaluating and projecting nothing): wasm in a page and native, one core each
+  decode, evaluate   ms a frame: a group decoded, its frames evaluated; wasm in a page and native, on one core each
   memory_mb          largest proportional set size of the page's process while the stream plays once
 """
 
@@ -77,16 +77,19 @@ DECODE = """async ([limit]) => {
     const { config, groups } = native.describe();
     const runs = [];
     for (let run = 0; run < 3; run++) {
-        const start = performance.now();
-        let frames = 0;
+        let [decode, evaluate, frames] = [0, 0, 0];
         for (const [i, g] of groups.slice(0, limit).entries()) {
             const payload = file.slice(g.offset, g.offset + g.size);
+            const start = performance.now();
             const back = native.reference(payload);
             native.decode(i, payload, config.level, back ? i - back : undefined);
+            const decoded = performance.now();
             for (let t = 0; t < g.frames; t++) native.frame(i, t);
+            decode += decoded - start;
+            evaluate += performance.now() - decoded;
             frames += g.frames;
         }
-        runs.push((performance.now() - start) / frames);
+        runs.push([decode / frames, evaluate / frames]);
     }
     return runs;
 }"""
@@ -97,13 +100,17 @@ from gscodec.decode import open_stream
 runs = []
 for _ in range(3):
     stream = open_stream(sys.argv[1])
-    start, frames = time.perf_counter(), 0
+    decode = evaluate = frames = 0
     for i, g in enumerate(stream.groups[: int(sys.argv[2])]):
+        start = time.perf_counter()
         group = stream.group(i)
+        decoded = time.perf_counter()
         for t in range(g["frames"]):
             group.frame(t)
+        decode += decoded - start
+        evaluate += time.perf_counter() - decoded
         frames += g["frames"]
-    runs.append(1e3 * (time.perf_counter() - start) / frames)
+    runs.append([1e3 * decode / frames, 1e3 * evaluate / frames])
 print(json.dumps(runs))
 """
 
@@ -139,15 +146,16 @@ def first_pictures(browsers: Browsers, url: str) -> list[float]:
     return times
 
 
-def clocked(browser: Browser, url: str, seconds: float = 5) -> float:
+def clocked(browser: Browser, url: str, seconds: int = 4) -> float:
     """Pictures a second while 60 are wanted."""
     browser.page.add_init_script(KEEP)
     browser.goto(f"{url}?size={SIZE}")
     browser.wait(FIRST)
     browser.eval(f"{PLAYER}.speed = 60 / {PLAYER}.fps")
-    time.sleep(1.5)
-    count = "new Promise((done) => { let n = 0; const p = " + PLAYER + "; p.addEventListener('picture', () => n++);"
-    return browser.eval(count + f"setTimeout(() => done(n), {1000 * seconds}); }})") / seconds
+    time.sleep(2)
+    count = f"new Promise((done) => {{ let n = 0; {PLAYER}.addEventListener('picture', () => n++);"
+    count += f"setTimeout(() => done(n), {1000 * seconds}); }})"
+    return statistics.median(browser.eval(count) / seconds for _ in range(3))
 
 
 def renderer_memory(stop: threading.Event, found: list[float]) -> None:
@@ -176,14 +184,17 @@ def memory(browser: Browser, url: str) -> float:
 
 
 def decode_times(browser: Browser, url: str, path: Path, groups: int = 2) -> dict:
-    """ms a frame of decoding and evaluating, medians of three."""
+    """Milliseconds a frame and their ratio, medians of three runs."""
     browser.goto(url + "?src=none.gsv")
     wasm = browser.page.evaluate(DECODE, [groups])
     env = dict(os.environ, RAYON_NUM_THREADS="1")
     command = [sys.executable, "-c", NATIVE, str(path), str(groups)]
     native = json.loads(subprocess.run(command, env=env, check=True, capture_output=True, text=True).stdout)
-    wasm_ms, native_ms = statistics.median(wasm), statistics.median(native)
-    return {"wasm_ms": round(wasm_ms, 2), "native_ms": round(native_ms, 2), "ratio": round(wasm_ms / native_ms, 2)}
+    result = {}
+    for i, what in enumerate(("decode", "evaluate")):
+        page, here = (statistics.median(run[i] for run in runs) for runs in (wasm, native))
+        result[what] = {"wasm_ms": round(page, 2), "native_ms": round(here, 2), "ratio": round(page / here, 2)}
+    return result
 
 
 def measure(browsers: Browsers, name: str, path: Path) -> dict:
@@ -196,12 +207,15 @@ def measure(browsers: Browsers, name: str, path: Path) -> dict:
         return result | {"memory_mb": round(memory(browsers.start("--disable-gpu"), server.url))}
     firsts = first_pictures(browsers, server.url)
     browser = browsers.start("--disable-gpu")
-    result |= {"first_picture_ms": round(statistics.median(firsts)), "fps_clock": round(clocked(browser, server.url), 1)}
+    result |= {
+        "first_picture_ms": round(statistics.median(firsts)),
+        "fps_clock": round(clocked(browser, server.url), 1),
+    }
     free = browser.page.evaluate(FREE, [150])
     result["fps_free"] = round(len(free["blend"]) / free["seconds"], 1)
     for key in ("project", "blend"):
         result[f"{key}_ms"] = round(statistics.median(free[key]), 2)
-    result["decode"] = decode_times(browser, server.url, path)
+    result |= decode_times(browser, server.url, path)
     server.shutdown()
     return result
 

@@ -1,9 +1,9 @@
 """`make player`: codec/native -> player/native.wasm, and the hash of what it was built from (native.sha256).
 `make spark`: three.js and Spark, of the versions and hashes in spark/package-lock.json -> spark.js, and its hashes.
 
-All are committed, so that a checkout and the wheel play offline and without toolchains; a test fails when a hash is stale.
-The first needs the wasm32-unknown-unknown target (rustup fetches it), or the sources of the standard library: where rustup
-cannot be used, Debian's rustc-web, cargo-web and rust-web-src will do. The second needs npm.
+All are committed, so that a checkout and the wheel play offline and without toolchains; a test fails when a hash is
+stale. The first needs the wasm32-unknown-unknown target (rustup fetches it), or the sources of the standard library:
+where rustup cannot be used, Debian's rustc-web, cargo-web and rust-web-src will do. The second needs npm.
 """
 
 from __future__ import annotations

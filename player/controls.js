@@ -34,7 +34,7 @@ export const MARKUP = `
     <select data-set="view" title="Camera" aria-label="Camera" hidden></select>
     <select data-set="speed" title="Speed" aria-label="Speed">${options([0.25, 0.5, 1, 2].map((v) => [v, `${v}×`]))}</select>
     <select data-set="layers" title="Layers" aria-label="Layers" hidden></select>
-    <select data-set="quality" title="Quality" aria-label="Quality">${options([["auto", "Auto"], [1, "Full"], [0.7, "70 %"], [0.5, "50 %"], [0.35, "35 %"]])}</select>
+    <select data-set="quality" title="Quality" aria-label="Quality">${options([["auto", "Auto quality"], [1, "Full"], [0.7, "70 %"], [0.5, "50 %"], [0.35, "35 %"]])}</select>
     <select data-set="renderer" title="Drawn by" aria-label="Drawn by">${options([["auto", "CPU or GPU"], ["cpu", "CPU"], ["gpu", "GPU"]])}</select>
     ${button("loop", "Loop (L)", 'aria-pressed="false"')}
     ${button("reset", "Reset the camera (R)")}

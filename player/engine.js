@@ -4,8 +4,9 @@
 //                                                                \--what the view shows--> GPU, on a canvas above
 
 import { Gpu, gpuName } from "./gpu.js";
-import { ALL, Native, load } from "./native.js";
+import { ALL, AUTO, Native, load } from "./native.js";
 import { Ladder } from "./ladder.js";
+import { LayerChoice } from "./layers.js";
 import { Source } from "./source.js";
 
 const IN_FLIGHT = 2; // pictures at work: one is projected while the one before is blended
@@ -21,9 +22,11 @@ function start(url) {
 }
 
 export class Engine extends EventTarget {
-  groups = new Map(); // group -> {state: fetching | decoding | ready | failed, worker, header, abort}
+  groups = new Map(); // group -> {state: fetching | decoding | ready | failed, worker, header, layers, abort}
   failed = new Map(); // group -> message
-  layers = ALL; // of each group that are fetched and drawn
+  layers = AUTO; // of each group that are fetched and drawn
+  choice = new LayerChoice();
+  #chosen = new Map(); // sync group -> layers of it and of those predicted from it
   stats = { decode: 0, project: 0, blend: 0, gaussians: 0, link: 0 };
   #workers = [];
   #rasters = [];
@@ -175,6 +178,20 @@ export class Engine extends EventTarget {
     }
   }
 
+  // How many layers of group i are wanted; chosen anew where nothing before is needed for more of them.
+  #layersOf(i) {
+    if (this.layers !== AUTO) return this.layers;
+    const { groups } = this.source;
+    let start = i;
+    while (start > 0 && !groups[start].sync) start--;
+    if (start === i || !this.#chosen.has(start)) {
+      const { ends, size, frames } = groups[i];
+      const rates = (ends ?? [size]).map((bytes) => (8e-6 * bytes * this.fps) / frames);
+      this.#chosen.set(start, ends ? this.choice.choose(rates, this.stats.link) : ALL);
+    }
+    return this.#chosen.get(start);
+  }
+
   // The group that plays after i; damaged ones are passed over.
   #after(i, loop) {
     const n = this.source.groups.length;
@@ -189,10 +206,10 @@ export class Engine extends EventTarget {
   async #decode(i) {
     if (this.failed.has(i)) return;
     const abort = new AbortController();
-    const entry = { state: "fetching", abort };
+    const layers = this.#layersOf(i);
+    const entry = { state: "fetching", layers, abort };
     this.groups.set(i, entry);
     try {
-      const { layers } = this;
       const payload = await this.source.payload(i, abort.signal, layers);
       const reference = await this.#reference(i, payload, abort.signal, layers);
       if (this.groups.get(i) !== entry) return;
@@ -225,7 +242,7 @@ export class Engine extends EventTarget {
     try {
       let seconds = 0;
       for (let k = this.#after(i, loop); k !== null && k > i && seconds < AHEAD; k = this.#after(k, false)) {
-        await this.source.payload(k, undefined, this.layers);
+        await this.source.payload(k, undefined, this.#layersOf(k));
         seconds += this.source.groups[k].frames / this.fps;
       }
     } catch {

@@ -18,7 +18,8 @@ export function gpuName() {
 
 function nameOf(gl) {
   const info = gl.getExtension("WEBGL_debug_renderer_info");
-  return gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+  const name = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+  return /^ANGLE \([^,]*, (.*?)(?: \(0x|,|$)/.exec(name)?.[1] ?? name; // of "ANGLE (maker, name (0x..) .., driver)"
 }
 
 export class Gpu {

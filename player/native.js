@@ -7,6 +7,7 @@ const SIMD = [0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 1
 const HEADER = 1 << 14; // bytes that have the header of a group
 export const NONE = 255; // no slot
 export const ALL = 255; // layers
+export const AUTO = 0; // as many layers as link and device carry
 
 export async function load(url) {
   if (typeof WebAssembly !== "object" || !WebAssembly.validate(new Uint8Array(SIMD))) {

@@ -1,7 +1,7 @@
 // <gsv-player src="URL"> plays a .gsv file: the clock, the size of the picture, and what the viewer is told.
 //
 // Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the picture fills the
-// element); quality="auto" or 0.1 to 1; layers="2": only the first so many, else "all"; renderer="cpu" or "gpu", else the GPU
+// element); quality="auto" or 0.1 to 1; layers="2" or "all", else as many as link and device carry; renderer="cpu" or "gpu", else the GPU
 // if there is a real one.
 // Properties: paused, frame, frameCount, fps, camera, stats. Methods: play(), pause(), show(frame). Events: ready, picture,
 // ended, error.
@@ -9,7 +9,7 @@
 import { Camera } from "./camera.js";
 import { MARKUP, clock, onDrag, onKeys, setIcon } from "./controls.js";
 import { Engine } from "./engine.js";
-import { ALL } from "./native.js";
+import { ALL, AUTO } from "./native.js";
 
 const BASE = new URL(".", import.meta.url);
 const PIXELS_MAX = 4e6; // of a still picture
@@ -84,8 +84,8 @@ export class GsvPlayer extends HTMLElement {
   }
 
   get #layers() {
-    const n = Number(this.getAttribute("layers"));
-    return n >= 1 ? n : ALL;
+    const value = this.getAttribute("layers");
+    return Number(value) >= 1 ? Number(value) : value === "all" ? ALL : AUTO;
   }
 
   get loop() {
@@ -195,12 +195,13 @@ export class GsvPlayer extends HTMLElement {
 
   // The first group is decoded: there is something to look at.
   #begin(engine, header) {
+    this.header = header;
     if (this.camera) return;
     const layers = this.$("[data-set=layers]");
     layers.hidden = header.layers < 2;
     const choices = Array.from({ length: header.layers - 1 }, (_, k) => new Option(`${k + 1} of ${header.layers} layers`, k + 1));
-    layers.replaceChildren(new Option("All layers", "all"), ...choices);
-    layers.value = this.#layers === ALL ? "all" : String(Math.min(this.#layers, header.layers - 1));
+    layers.replaceChildren(new Option("Auto layers", "auto"), new Option("All layers", "all"), ...choices);
+    layers.value = { [ALL]: "all", [AUTO]: "auto" }[this.#layers] ?? String(Math.min(this.#layers, header.layers - 1));
     const { config } = engine.source;
     this.camera = new Camera(engine.bounds, config.up, config.cameras);
     const select = this.$("[data-set=view]");
@@ -253,7 +254,10 @@ export class GsvPlayer extends HTMLElement {
       this.#position = groups[i].start_frame;
       return i;
     }
-    if (engine.source.complete) this.#fail("This file is damaged", `None of its groups can be decoded (group ${group}: ${engine.failed.get(group)}).`);
+    if (!engine.source.complete) return null;
+    this.#position = this.$(".seek input").value = 0;
+    const [first, why] = engine.failed.entries().next().value;
+    this.#fail("This file is damaged", `None of its groups can be decoded (group ${first}: ${why}).`);
     return null;
   }
 
@@ -309,12 +313,16 @@ export class GsvPlayer extends HTMLElement {
   #adapt(now) {
     if (now - this.#adapted < 500) return;
     this.#adapted = now;
-    const { blend, project } = this.engine.stats;
-    const share = (Math.max(blend, project) * Math.min(this.fps * this.speed, 60)) / 1000;
+    const { blend, project, decode } = this.engine.stats;
+    const each = Math.min(this.fps * this.speed, 60) / 1000;
+    const share = Math.max(blend, project) * each;
     const { clientWidth, clientHeight } = this.$(".stage");
     const least = Math.min(1, Math.sqrt(PIXELS_MIN / Math.max(clientWidth * clientHeight, 1)));
+    const coarser = this.quality === "auto" && !this.hasAttribute("size") && this.#scale > least;
     if (share > 0.95) this.#scale = Math.max(least, this.#scale * 0.85);
     else if (share < 0.5) this.#scale = Math.min(1, this.#scale * 1.08);
+    const load = Math.max(coarser ? 0 : share, (decode * this.fps * this.speed) / 1000);
+    this.engine.choice.look(load, this.header.layers, now);
   }
 
   // What the viewer is told
@@ -359,7 +367,10 @@ export class GsvPlayer extends HTMLElement {
     this.slow = this.paused || drawn > 0.8 * wanted || !this.$(".busy").hidden ? 0 : (this.slow ?? 0) + 1;
     const text = `This device draws ${drawn} of ${Math.round(wanted)} frames a second.`;
     this.#note("slow", this.slow > 20 ? text : null);
-    const { source } = this.engine;
+    const { source, layers, choice, groups } = this.engine;
+    const shown = groups.get(this.engine.groupOf(this.frame));
+    const fewer = layers === AUTO && choice.reason && shown?.layers < shown?.header?.layers;
+    this.#note("layers", fewer ? `${shown.layers} of ${shown.header.layers} layers: ${choice.reason} no more just now.` : null);
     const lower = source.quality && source.rung < source.rungs - 1;
     this.#note("rung", lower ? `Quality ${source.quality}: the link or this device carries no more just now.` : null);
   }

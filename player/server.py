@@ -26,6 +26,7 @@ FILES = {
     "spark.js": "text/javascript; charset=utf-8",
     "source.js": "text/javascript; charset=utf-8",
     "ladder.js": "text/javascript; charset=utf-8",
+    "layers.js": "text/javascript; charset=utf-8",
     "worker.js": "text/javascript; charset=utf-8",
     "native.js": "text/javascript; charset=utf-8",
     "camera.js": "text/javascript; charset=utf-8",

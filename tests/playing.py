@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 
+import cv2
 import numpy as np
 from synthetic import blob, moved
 
@@ -150,6 +151,15 @@ def canvas(browser) -> np.ndarray:
     }})()"""
     w, h, data = browser.eval(script)
     return np.frombuffer(base64.b64decode(data), np.uint8).reshape(h, w, 4)[..., :3]
+
+
+def screenshot(browser, element: str) -> np.ndarray:
+    """[H, W, 3] u8: what the screen shows where an element is."""
+    box = browser.eval(
+        f"(({{ x, y, width, height }}) => ({{ x, y, width, height }}))({element}.getBoundingClientRect())"
+    )
+    png = np.frombuffer(browser.screenshot(box), np.uint8)
+    return cv2.imdecode(png, cv2.IMREAD_COLOR)[..., ::-1]
 
 
 def camera_of(view: list[float]) -> Camera:
