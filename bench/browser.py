@@ -54,7 +54,7 @@ class Browser:
         self.errors: list[str] = []
         self.page = chromium.new_context(viewport={"width": 1280, "height": 800}).new_page()
         self.page.set_default_timeout(1000 * PATIENCE)
-        self.page.on("pageerror", lambda e: self.errors.append(str(e)))
+        self.page.on("pageerror", lambda e: self.errors.append(e.stack or str(e)))
         self.page.on("console", lambda m: self.errors.append(m.text) if m.type == "error" else None)
         self._devtools = self.page.context.new_cdp_session(self.page)
 

@@ -8,7 +8,7 @@ the folder that GSCODEC_DATA names the moving statue, 40 frames (statue: without
 
 Of each stream:
   first_picture_ms   from the start of the navigation, page and stream from this machine, nothing cached
-  fps_clock          pictures a second when 60 are wanted, median of 3 times 4 s; the display allows no more
+  fps_clock          pictures a second when 60 are wanted, median of 3 times 2 s; the display allows no more
   fps_free           pictures a second of all frames in order, asked for as fast as they come
   project_ms, blend_ms   medians of a picture: evaluating and projecting it, the slower one of the raster workers
   decode, evaluate   ms a frame: a group decoded, its frames evaluated; wasm in a page and native, on one core each
@@ -146,7 +146,7 @@ def first_pictures(browsers: Browsers, url: str) -> list[float]:
     return times
 
 
-def clocked(browser: Browser, url: str, seconds: int = 4) -> float:
+def clocked(browser: Browser, url: str, seconds: int = 2) -> float:
     """Pictures a second while 60 are wanted."""
     browser.page.add_init_script(KEEP)
     browser.goto(f"{url}?size={SIZE}")
@@ -211,7 +211,7 @@ def measure(browsers: Browsers, name: str, path: Path) -> dict:
         "first_picture_ms": round(statistics.median(firsts)),
         "fps_clock": round(clocked(browser, server.url), 1),
     }
-    free = browser.page.evaluate(FREE, [150])
+    free = browser.page.evaluate(FREE, [100])
     result["fps_free"] = round(len(free["blend"]) / free["seconds"], 1)
     for key in ("project", "blend"):
         result[f"{key}_ms"] = round(statistics.median(free[key]), 2)

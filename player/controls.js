@@ -8,6 +8,7 @@ const ICONS = {
   loop: "M7 7h10v3l4-4-4-4v3H5v6h2zm10 10H7v-3l-4 4 4 4v-3h12v-6h-2z",
   reset: "M12 5V1L7 6l5 5V7a5 5 0 1 1-5 5H5a7 7 0 1 0 7-7z",
   stats: "M4 20h3V10H4zm6.5 0h3V4h-3zM17 20h3v-7h-3z",
+  vr: "M3 7h18v10h-6l-2-3h-2l-2 3H3zm4.5 3a2 2 0 1 0 0 4 2 2 0 0 0 0-4zm9 0a2 2 0 1 0 0 4 2 2 0 0 0 0-4z",
   full: "M5 5h5v2H7v3H5zm9 0h5v5h-2V7h-3zM5 14h2v3h3v2H5zm12 0h2v5h-5v-2h3z",
 };
 
@@ -39,6 +40,7 @@ export const MARKUP = `
     ${button("loop", "Loop (L)", 'aria-pressed="false"')}
     ${button("reset", "Reset the camera (R)")}
     ${button("stats", "Statistics (S)", 'aria-pressed="false"')}
+    ${button("vr", "Virtual reality", "hidden")}
     ${button("full", "Full screen (F)")}
   </div>
 </div>`;

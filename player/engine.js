@@ -121,6 +121,10 @@ export class Engine extends EventTarget {
     return this.#gpu?.name ?? `CPU, ${this.#rasters.length} workers`;
   }
 
+  get gpu() {
+    return this.#gpu;
+  }
+
   get onGpu() {
     return this.#gpu !== null;
   }
@@ -311,7 +315,8 @@ export class Engine extends EventTarget {
     try {
       await picture.gpu.draw(picture.view, new Uint32Array(buffer));
     } catch (e) {
-      return this.#loseGpu(e.message);
+      if (this.#gpu === picture.gpu) this.#loseGpu(e?.message ?? "it stopped");
+      return;
     }
     if (!this.#pictures.delete(id)) return;
     picture.blend = performance.now() - start;

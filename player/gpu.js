@@ -31,6 +31,8 @@ export class Gpu {
   #sorter;
   #splats;
   #mesh;
+  #world;
+  #head = null; // the camera of a session
 
   // origin: middle of the scene, which packed Gaussians are relative to; background: 3 numbers
   static async create(canvas, base, { origin, background }) {
@@ -62,8 +64,41 @@ export class Gpu {
     this.#splats = new spark.PackedSplats();
     this.#mesh = new spark.SplatMesh({ packedSplats: this.#splats });
     this.#mesh.position.set(...origin);
+    this.#world = new spark.Group(); // a session places it before the viewer
+    this.#world.matrixAutoUpdate = false;
+    this.#world.add(this.#mesh);
     this.#scene = new spark.Scene();
-    this.#scene.add(this.#sorter, this.#mesh);
+    this.#scene.add(this.#sorter, this.#world);
+  }
+
+  // Shows the scene in a headset until the session ends: from where the view (18 numbers) looks, `metres` for a unit of it.
+  // Calls tick() for each picture of the session: meanwhile the window's own clock may stand still.
+  async enter(session, view, metres, tick) {
+    const { xr } = this.#renderer;
+    xr.enabled = true;
+    xr.setReferenceSpaceType("local"); // its origin is the head at the start
+    await xr.setSession(session);
+    this.#head = new this.#spark.PerspectiveCamera();
+    const { Matrix4 } = this.#spark;
+    this.#world.matrix.copy(this.#toCamera(view)).premultiply(new Matrix4().makeScale(metres, metres, metres));
+    this.#sorter.autoUpdate = true;
+    this.#renderer.setAnimationLoop(() => {
+      tick();
+      this.#renderer.render(this.#scene, this.#head);
+    });
+    session.addEventListener("end", () => {
+      this.#renderer.setAnimationLoop(null);
+      this.#world.matrix.identity();
+      this.#sorter.autoUpdate = xr.enabled = false;
+      this.#head = null;
+    });
+  }
+
+  // Where the head is, in units of the scene; null outside of a session.
+  get head() {
+    if (!this.#head) return null;
+    const { position } = this.#head;
+    return position.clone().applyMatrix4(this.#world.matrix.clone().invert()).toArray();
   }
 
   // Shows Gaussians that `Native.pack` made for the view (18 numbers); resolves when they are on the canvas, one after another.
@@ -78,21 +113,29 @@ export class Gpu {
     this.#splats.numSplats = n;
     this.#splats.needsUpdate = true;
     this.#mesh.updateVersion();
+    if (this.#head) return; // the session draws, and sorts meanwhile
     this.#look(view);
     await this.#sorter.update({ scene: this.#scene, camera: this.#camera });
+    if (this.#head) return;
     const [width, height] = view;
     this.#renderer.setSize(width, height, false);
     this.#renderer.render(this.#scene, this.#camera);
   }
 
   // A pinhole camera with OpenCV axes -> OpenGL.
-  #look([w, h, fx, fy, cx, cy, ...m]) {
+  #look(view) {
+    const [w, h, fx, fy, cx, cy] = view;
     const { projectionMatrix, projectionMatrixInverse, matrix } = this.#camera;
     const depth = [-(FAR + NEAR) / (FAR - NEAR), (-2 * FAR * NEAR) / (FAR - NEAR)];
     projectionMatrix.set((2 * fx) / w, 0, 1 - (2 * cx) / w, 0, 0, (2 * fy) / h, (2 * cy) / h - 1, 0, 0, 0, ...depth, 0, 0, -1, 0);
     projectionMatrixInverse.copy(projectionMatrix).invert();
-    matrix.set(...m, 0, 0, 0, 1).premultiply(new this.#spark.Matrix4().makeScale(1, -1, -1)).invert();
+    matrix.copy(this.#toCamera(view)).invert();
     this.#camera.updateMatrixWorld(true);
+  }
+
+  #toCamera([, , , , , , ...m]) {
+    const { Matrix4 } = this.#spark;
+    return new Matrix4().set(...m, 0, 0, 0, 1).premultiply(new Matrix4().makeScale(1, -1, -1));
   }
 
   close() {

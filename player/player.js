@@ -16,6 +16,7 @@ const PIXELS_MAX = 4e6; // of a still picture
 const PIXELS_START = 420_000; // of a moving one, before anything has been measured
 const PIXELS_MIN = 180_000; // below that, fewer pixels save little: the Gaussians stay
 const STILL = 250; // ms without a movement after which the picture is drawn sharp
+const TALL = 2; // metres, of a scene in a headset
 const STALL = 300; // ms without a picture after which the viewer is told to wait
 
 export class GsvPlayer extends HTMLElement {
@@ -57,6 +58,7 @@ export class GsvPlayer extends HTMLElement {
       zoom: move((f) => this.camera.zoom(f)),
     });
     this.$("[data-do=full]").hidden = !document.fullscreenEnabled;
+    navigator.xr?.isSessionSupported("immersive-vr").then((yes) => (this.$("[data-do=vr]").hidden = !yes), () => {});
     this.$("[data-set=speed]").value = "1";
   }
 
@@ -164,7 +166,7 @@ export class GsvPlayer extends HTMLElement {
     on(source, "error", (e) => this.#fail("The file cannot be read on", sentence(e.message)));
     on(source, "groups", () => this.#grown());
     try {
-      this.#request = requestAnimationFrame((now) => this.#tick(now));
+      this.#request = requestAnimationFrame(() => this.#tick());
       await engine.open();
       if (this.engine !== engine) return;
       if (source.missing) {
@@ -213,9 +215,14 @@ export class GsvPlayer extends HTMLElement {
 
   // The clock
 
-  #tick(now) {
-    this.#request = requestAnimationFrame((t) => this.#tick(t));
+  #tick() {
+    this.#request = requestAnimationFrame(() => this.#tick());
+    if (!this.engine?.gpu?.head) this.#step();
+  }
+
+  #step() {
     const { engine } = this;
+    const now = performance.now();
     const passed = Math.min(now - this.#last, 250) / 1000;
     this.#last = now;
     if (!engine?.source?.groups.length || !this.$(".error").hidden) return;
@@ -269,6 +276,8 @@ export class GsvPlayer extends HTMLElement {
 
   // View of a picture that fills the element; a moving one may be coarser.
   #view(sharp) {
+    const head = this.engine.gpu?.head;
+    if (head) return this.camera.wide(head.map((v) => this.#near(v)));
     const fixed = /^(\d+)x(\d+)$/.exec(this.getAttribute("size") ?? "");
     if (fixed) return this.camera.view(Number(fixed[1]), Number(fixed[2]));
     const stage = this.$(".stage");
@@ -278,6 +287,12 @@ export class GsvPlayer extends HTMLElement {
     this.#scale ??= Math.min(1, Math.sqrt(PIXELS_START / (w * h)));
     const scale = this.quality === "auto" ? (sharp ? most : Math.min(this.#scale, most)) : this.quality * most;
     return this.camera.view(Math.round(w * scale), Math.round(h * scale));
+  }
+
+  // To a hundredth of the size of the scene: what the head does within that needs no other Gaussians.
+  #near(v) {
+    const step = this.camera.radius / 50;
+    return Math.round(v / step) * step;
   }
 
   #draw(now) {
@@ -306,6 +321,20 @@ export class GsvPlayer extends HTMLElement {
       await engine.use(this.renderer);
     } catch (e) {
       if (this.engine === engine) this.#note("gpu", `The GPU cannot be used (${e.message}): the CPU draws.`);
+    }
+  }
+
+  // Into a headset: the scene becomes as large as a person, and is drawn on the GPU.
+  async #enter() {
+    const { engine, camera } = this;
+    try {
+      const session = await navigator.xr.requestSession("immersive-vr");
+      await engine.use("gpu");
+      if (!engine.gpu) return session.end();
+      await engine.gpu.enter(session, camera.level(), TALL / (2 * camera.radius), () => this.#step());
+      session.addEventListener("end", () => (this.#drawn = "", this.#render()));
+    } catch (e) {
+      this.#note("gpu", `Virtual reality cannot be used here (${e.message}).`);
     }
   }
 
@@ -452,6 +481,7 @@ export class GsvPlayer extends HTMLElement {
         this.$(".stats").hidden = !hidden;
         this.$("[data-do=stats]").setAttribute("aria-pressed", hidden);
       },
+      vr: () => this.#enter(),
       full: () => (document.fullscreenElement ? document.exitFullscreen() : this.requestFullscreen()),
       retry: () => this.#open(),
     };
