@@ -6,6 +6,7 @@ import json
 import os
 import platform
 import subprocess
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -34,3 +35,11 @@ def write_result(path: Path, result: dict) -> None:
     part = path.with_name(path.name + ".part")
     part.write_text(json.dumps({"machine": machine(), "commit": commit(), **result}, indent=1) + "\n")
     os.replace(part, path)
+
+
+def update_entries(path: Path, entries: Iterable[dict], key: Callable[[dict], object]) -> Iterator[dict]:
+    """Yields `entries` and puts each into the list of that name in `path`, in place of an older one of the same key."""
+    for entry in entries:
+        old = json.loads(path.read_text())["entries"] if path.exists() else []
+        write_result(path, {"entries": [e for e in old if key(e) != key(entry)] + [entry]})
+        yield entry

@@ -1,6 +1,6 @@
 """Quality against time and size of training: our presets, and every frame trained alone.
 
-One entry of bench/results/train.json per (capture, recipe, preset): capture, recipe, preset, seconds_per_frame, psnr,
+One entry of bench/results/train.json per (case, recipe, preset): case, recipe, preset, seconds_per_frame, psnr,
 psnr_fg, ssim, gaussians, kb_per_frame, flicker, all on the test cameras. What gscodec trains is measured twice: before
 coding ("model", no size) and decoded from the stream ("gscodec"). "alone" trains a keyframe for every frame it is asked
 for, with the keyframe budget of the preset: what tracking is to be compared with. "v3" is V3's recipe at about the time
@@ -9,24 +9,75 @@ that our preset medium takes (baselines/v3.py). Both have no size of their own.
 
 from __future__ import annotations
 
-import json
+import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from gscodec.bench.machine import write_result
+from gscodec.bench.machine import update_entries
+from gscodec.capture import Capture
 from gscodec.errors import UsageError
+from gscodec.gaussians import Gaussians, Group
 
-CAPTURES = ("lumberjack", "stage")
 RECIPES = ("gscodec", "alone", "v3")
 KEYS = ("psnr", "psnr_fg", "ssim", "gaussians", "kb_per_frame", "flicker")
 
 
-def measure(capture_name: str, recipe: str, preset: str, frames: str | None, data: Path, quality: float) -> Iterator:
-    """Entries of one recipe on one capture.
+@dataclass(frozen=True)
+class Case:
+    """A capture and how it is used.
+
+    Attributes:
+        folder: in the data folder.
+        test: names of the cameras that are tested on instead of the capture's own, which are then left out.
+        scale: of the images.
+        frames: how many of them, where all would take too long.
+    """
+
+    folder: str
+    test: tuple[str, ...] = ()
+    scale: float = 1.0
+    frames: int | None = None
+
+    def open(self, data: Path) -> Capture:
+        """The capture.
+
+        Raises:
+            UsageError: it is not in the data folder, or a camera is not in it.
+        """
+        from gscodec.capture import open_capture
+
+        folder = Path(data) / self.folder
+        if not folder.is_dir():
+            raise UsageError(f"{folder} does not exist")
+        capture = open_capture(folder).frames(0, self.frames).scaled(self.scale)
+        return capture if not self.test else tested_on(capture, self.test)
+
+
+CASES = {
+    "lumberjack": Case("lumberjack"),
+    "lumberjack-upper": Case("lumberjack", test=("cam16", "cam17", "cam18", "cam19")),  # the upper ring left out
+    "stage": Case("stage"),
+    "pose2sim": Case("pose2sim", test=("cam04",), scale=0.25, frames=10),
+}
+
+
+def tested_on(capture: Capture, names: tuple[str, ...]) -> Capture:
+    """The capture with the cameras `names` to test on and its other training cameras to train on."""
+    unknown = set(names) - {c.name for c in capture.cameras}
+    if unknown:
+        known = ", ".join(c.name for c in capture.cameras)
+        raise UsageError(f"{capture.name}: no camera {', '.join(sorted(unknown))}, there are {known}")
+    kept = [i for i, c in enumerate(capture.cameras) if c.name in names or c.split == "train"]
+    cameras = [replace(c, split="test" if c.name in names else "train") for c in (capture.cameras[i] for i in kept)]
+    return replace(capture, cameras=cameras, read=lambda camera, t: capture.read(kept[camera], t))
+
+
+def measure(case: str, recipe: str, preset: str, frames: str | None, data: Path, quality: float) -> Iterator[dict]:
+    """Entries of one recipe on one case.
 
     Args:
         frames: "A:B" or "A:B:STEP", None: all.
@@ -34,17 +85,16 @@ def measure(capture_name: str, recipe: str, preset: str, frames: str | None, dat
     Raises:
         UsageError: the capture is not in the data folder.
     """
-    from gscodec.capture import open_capture
+    from gscodec.train.settings import train_settings
 
-    folder = Path(data) / capture_name
-    if not folder.is_dir():
-        raise UsageError(f"{folder} does not exist")
-    capture = open_capture(folder)
+    capture = CASES[case].open(data)
     chosen = range(capture.frame_count)[slice(*(int(x) if x else None for x in (frames or ":").split(":")))]
+    settings = train_settings(preset, quality=quality)
     run = {"gscodec": _ours, "alone": _alone, "v3": _v3}[recipe]
-    for name, seconds, size, result in run(capture, chosen, preset, quality):
+    for name, seconds, size, models in run(capture, chosen, settings):
+        result = evaluate(part(capture, chosen), models)
         yield {
-            "capture": capture_name,
+            "capture": case,
             "recipe": name,
             "preset": preset,
             "quality": quality if name == "gscodec" else None,
@@ -55,64 +105,71 @@ def measure(capture_name: str, recipe: str, preset: str, frames: str | None, dat
         } | {"kb_per_frame": size / 1000 / len(chosen) if size else None}
 
 
-def _ours(capture, frames: range, preset: str, quality: float):
-    import tempfile
-
-    from gscodec.decode import open_stream
-    from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
-    from gscodec.train.settings import train_settings
-    from gscodec.train.train import train_groups
-
+def _ours(capture: Capture, frames: range, settings) -> Iterator[tuple]:
     if frames.step != 1:
         raise UsageError("gscodec follows what moves: it needs every frame, expected a range without a step")
-    part = _part(capture, frames)
-    settings = train_settings(preset, quality=quality)
-    kept, start = [], time.perf_counter()
-    for group in train_groups(part, settings):
-        kept.append(group)
-    trained = time.perf_counter() - start
-    yield "model", trained, None, _evaluate(part, [g for group in kept for g in group.frames])
-    config = stream_config(fps=part.fps, sh_degree=0, gaussians=settings.gaussians_max, frames=settings.gop)
+    groups, trained = sequence(part(capture, frames), settings)
+    yield "model", trained, None, [g for group in groups for g in group.frames]
+    size, decoded, seconds = coded(part(capture, frames), groups, settings)
+    yield "gscodec", trained + seconds, size, decoded
+
+
+def _alone(capture: Capture, frames: range, settings) -> Iterator[tuple]:
+    models, seconds = every_frame_alone(capture, frames, settings)
+    yield "alone", seconds, None, models
+
+
+def _v3(capture: Capture, frames: range, settings) -> Iterator[tuple]:
+    from gscodec.bench.baselines.v3 import train_v3
+
+    start = time.perf_counter()
+    models = train_v3(part(capture, frames), range(len(frames)), settings)
+    yield "v3", time.perf_counter() - start, None, models
+
+
+def sequence(capture: Capture, settings) -> tuple[list[Group], float]:
+    """Our training; its groups and the seconds it took."""
+    from gscodec.train.train import train_groups
+
+    start = time.perf_counter()
+    return list(train_groups(capture, settings)), time.perf_counter() - start
+
+
+def coded(capture: Capture, groups: list[Group], settings) -> tuple[int, list[Gaussians], float]:
+    """Bytes of the stream that these groups make, its frames decoded, and the seconds that coding took."""
+    from gscodec.decode import open_stream
+    from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
+
+    config = stream_config(fps=capture.fps, sh_degree=0, gaussians=settings.gaussians_max, frames=settings.gop)
+    cameras = [c for c in capture.cameras if c.split == "train"]
     with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "out.gsv"
-        start = time.perf_counter()
-        cameras = [c for c in part.cameras if c.split == "train"]
-        encode_groups(lambda *_: iter(kept), out, config, EncodeSettings(quality), fingerprint={}, cameras=cameras)
-        coded = time.perf_counter() - start
-        stream = open_stream(out)
-        decoded = [stream.frame(t) for t in range(len(frames))]
-        yield "gscodec", trained + coded, out.stat().st_size, _evaluate(part, decoded)
+        out, start = Path(folder) / "out.gsv", time.perf_counter()
+        quality = EncodeSettings(settings.quality)
+        encode_groups(lambda *_: iter(groups), out, config, quality, fingerprint={}, cameras=cameras)
+        seconds, stream = time.perf_counter() - start, open_stream(out)
+        return out.stat().st_size, [stream.frame(t) for t in range(stream.frame_count)], seconds
 
 
-def _alone(capture, frames: range, preset: str, quality: float):
+def every_frame_alone(capture: Capture, frames: range, settings) -> tuple[list[Gaussians], float]:
+    """A keyframe for each of `frames`, and the seconds that took."""
     import torch
 
     from gscodec.bitstream.quantization import subject_radius
     from gscodec.train.keyframe import train_keyframe
-    from gscodec.train.settings import train_settings
     from gscodec.train.train import initial_model
     from gscodec.train.views import Views
 
     torch.set_num_threads(1)
-    settings, models, start = train_settings(preset), [], time.perf_counter()
+    models, start = [], time.perf_counter()
     for frame in frames:
         model = initial_model(capture, frame, settings)
         radius = subject_radius(model.params["means"].numpy())
         train_keyframe(model, Views(capture, 0), frame, settings, steps=settings.keyframe_steps, radius=radius)
         models.append(model.gaussians())
-    yield "alone", time.perf_counter() - start, None, _evaluate(_part(capture, frames), models)
+    return models, time.perf_counter() - start
 
 
-def _v3(capture, frames: range, preset: str, quality: float):
-    from gscodec.bench.baselines.v3 import train_v3
-    from gscodec.train.settings import train_settings
-
-    part, start = _part(capture, frames), time.perf_counter()
-    models = train_v3(part, range(len(frames)), train_settings(preset))
-    yield "v3", time.perf_counter() - start, None, _evaluate(part, models)
-
-
-def _part(capture, frames: range):
+def part(capture: Capture, frames: range) -> Capture:
     """The capture with only these frames."""
     return replace(
         capture,
@@ -123,7 +180,8 @@ def _part(capture, frames: range):
     )
 
 
-def _evaluate(capture, frames: list) -> dict:
+def evaluate(capture: Capture, frames: list[Gaussians]) -> dict:
+    """Figures on the test cameras (metrics/evaluate.py)."""
     from gscodec.metrics.evaluate import evaluate_capture
 
     result = evaluate_capture(lambda t: frames[t], capture, "test", with_vmaf=False)
@@ -132,8 +190,4 @@ def _evaluate(capture, frames: list) -> dict:
 
 def update(out: Path, entries: Iterator[dict]) -> Iterator[dict]:
     """Puts entries into the result file, in place of older ones of the same run, as they come."""
-    key = lambda e: (e["capture"], e["recipe"], e["preset"], e["quality"], e["frames"])  # noqa: E731
-    for entry in entries:
-        old = json.loads(out.read_text())["entries"] if out.exists() else []
-        write_result(out, {"entries": [e for e in old if key(e) != key(entry)] + [entry]})
-        yield entry
+    return update_entries(out, entries, lambda e: [e[k] for k in ("capture", "recipe", "preset", "quality", "frames")])

@@ -68,6 +68,13 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
 
+def fibonacci_directions(count: int, turn: float = 0.0) -> np.ndarray:
+    """[count, 3] f64 unit vectors, evenly over the sphere; `turn` of all about z, radians."""
+    i = np.arange(count)
+    z, angle = 1 - (2 * i + 1) / count, i * GOLDEN_ANGLE + turn
+    return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], 1)
+
+
 def cameras_around(
     points: np.ndarray, count: int, *, name: str, size: int = 512, focal: float = 1.2, turn: float = 0.0
 ) -> list[Camera]:
@@ -83,9 +90,7 @@ def cameras_around(
     distance = radius / np.sin(np.arctan(0.5 * size / f))
     K = np.array([[f, 0, size / 2], [0, f, size / 2], [0, 0, 1]])
     cameras = []
-    for i in range(count):
-        z, angle = 1 - (2 * i + 1) / count, i * GOLDEN_ANGLE + turn
-        direction = np.array([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z])
+    for i, direction in enumerate(fibonacci_directions(count, turn)):
         eye = center + direction * distance * (0.5 if i % 2 else 1)
         cameras.append(Camera(f"{name}{i:02}", K, look_at(eye, center, (0, 0, 1)), size, size, split="test"))
     return cameras

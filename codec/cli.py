@@ -36,6 +36,9 @@ Stream = Annotated[Path, typer.Argument(metavar="OUT.gsv", help="A .gsv file.")]
 Frames = Annotated[str | None, typer.Option(metavar="A:B", help="Only frames A to B-1.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Gop = Annotated[int, typer.Option(help="Frames in a group.")]
+RandomAccess = Annotated[
+    int, typer.Option(metavar="N", help="Frames from one independent group to the next at most; 0: no prediction.")
+]
 Preset = Annotated[str, typer.Option(help="Training budget: fast, medium or slow.")]
 Quality = Annotated[float, typer.Option(help="0 (small) to 100 (fine).")]
 
@@ -67,10 +70,11 @@ def encode(
     frames: Frames = None,
     gop: Gop = 20,
     keep_all: Annotated[bool, typer.Option("--keep-all", help="Keep Gaussians that nobody can see.")] = False,
-    random_access: Annotated[
-        int, typer.Option(metavar="N", help="Frames from one independent group to the next at most; 0: no prediction.")
-    ] = 60,
+    random_access: RandomAccess = 60,
     layers: Annotated[int, typer.Option(help="Layers of importance; the first ones alone are a coarser picture.")] = 1,
+    ray: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Train on this Ray cluster; its machines see SEQ too.")
+    ] = None,
     report: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the report there.")] = None,
 ) -> None:
     """Capture or Gaussian sequence to a stream. A second run resumes; Ctrl-C leaves a playable file."""
@@ -80,7 +84,7 @@ def encode(
 
     with Bar() as bar:
         settings = EncodeSettings(quality, _bits(bitrate), keep_all, random_access, layers)
-        result = encode_input(seq, out, settings, preset=preset, frames=frames, gop=gop, bar=bar)
+        result = encode_input(seq, out, settings, preset=preset, frames=frames, gop=gop, cluster=ray, bar=bar)
     if report:
         report.write_text(json.dumps(result.to_json(), indent=1))
     if result.groups == 0:
@@ -112,6 +116,7 @@ def train(
     preset: Preset = "medium",
     frames: Frames = None,
     gop: Gop = 20,
+    random_access: RandomAccess = 60,
     quality: Quality = 50.0,
 ) -> None:
     """Capture to one .ply per frame, the first half of encode."""
@@ -119,7 +124,8 @@ def train(
     from gscodec.progress import Bar
 
     with Bar() as bar:
-        count = train_to_folder(capture, folder, preset=preset, frames=frames, gop=gop, quality=quality, bar=bar)
+        options = {"preset": preset, "frames": frames, "gop": gop, "random_access": random_access, "quality": quality}
+        count = train_to_folder(capture, folder, **options, bar=bar)
     _out.print(f"{folder}: {count} frames")
 
 
@@ -242,8 +248,8 @@ bench = typer.Typer(help="Measurements, as JSON that charts are drawn from.", no
 app.add_typer(bench, name="bench")
 
 
-def _show_entries(entries: Iterable[dict], as_json: bool, line: Callable[[dict], str]) -> None:
-    """Prints measurements: a line for each as it comes, or the JSON of all."""
+def _show_entries(entries: Iterable[dict], as_json: bool, line: Callable[[dict], str]) -> list[dict]:
+    """Prints measurements, a line for each as it comes, or the JSON of all, and returns them."""
     found = []
     for e in entries:
         found.append(e)
@@ -251,6 +257,7 @@ def _show_entries(entries: Iterable[dict], as_json: bool, line: Callable[[dict],
             _out.print(line(e))
     if as_json:
         print(json.dumps(found, indent=1))
+    return found
 
 
 @bench.command("raster")
@@ -305,7 +312,7 @@ def bench_rd(
 
 @bench.command("train")
 def bench_train(
-    capture: Annotated[str | None, typer.Option(help="Comma-separated: lumberjack, stage.")] = None,
+    capture: Annotated[str | None, typer.Option(help="Comma-separated cases, see bench/train.py.")] = None,
     recipe: Annotated[str | None, typer.Option(help="Comma-separated: gscodec, alone (every frame), v3.")] = None,
     preset: Preset = "medium",
     frames: Annotated[str | None, typer.Option(metavar="A:B:STEP", help="Only these frames.")] = None,
@@ -329,6 +336,29 @@ def bench_train(
     _show_entries(
         measure(capture, recipe, preset=preset, frames=frames, quality=quality, data=data, out=out), as_json, line
     )
+
+
+@bench.command("stress")
+def bench_stress(
+    case: Annotated[str | None, typer.Option(help="Comma-separated cases, see bench/stress_scenes.py.")] = None,
+    out: Annotated[Path, typer.Option(help="The result file; its other entries stay.")] = Path(
+        "bench/results/stress.json"
+    ),
+    as_json: Json = False,
+) -> None:
+    """Training on small captures of what breaks 4D methods; fails if one does worse than bench/stress.py states."""
+    from gscodec.commands import bench_stress as measure
+
+    def line(e: dict) -> str:
+        if "psnr_fg" not in e or e["psnr_fg"] is None:
+            return f"{e['case']:<20}{e['verdict']}"
+        return (
+            f"{e['case']:<20}{e['psnr_fg']:6.2f} dB, alone {e['psnr_fg_alone']:6.2f}  {e['gaussians']:>5} Gaussians  "
+            f"{e['kb_per_frame']:6.2f} kB/frame, alone {e['kb_per_frame_alone']:6.2f}  {e['verdict']}"
+        )
+
+    if any(e["verdict"].startswith("fails") for e in _show_entries(measure(case, out=out), as_json, line)):
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -359,9 +389,7 @@ def main() -> None:
     """Entry point of the `gscodec` command."""
     warnings.showwarning = _say
     try:
-        app(standalone_mode=False)
-    except typer.Exit as e:
-        sys.exit(e.exit_code)
+        sys.exit(app(standalone_mode=False))  # what a command returns, None, or the code of a typer.Exit
     except (typer.Abort, KeyboardInterrupt):
         print("stopped", file=sys.stderr)
         sys.exit(130)

@@ -6,9 +6,11 @@ eval:   stream + capture or splats -> metrics                       bench:  scen
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ from gscodec.encode.encode import EncodeReport, EncodeSettings, encode_groups, s
 from gscodec.errors import UsageError, require
 from gscodec.frames import frame_range
 from gscodec.gaussians import GaussianSequence, Group
+from gscodec.part_file import part_file
 from gscodec.progress import Bar
 
 AXES = ("x", "y", "z")
@@ -31,9 +34,10 @@ def encode_input(
     preset: str,
     frames: str | None,
     gop: int,
+    cluster: str | None = None,
     bar: Bar,
 ) -> EncodeReport:
-    """Encodes a capture or splats at `source` into the file `out`.
+    """Encodes a capture or splats at `source` into the file `out`. `cluster`: address of the Ray cluster that trains.
 
     Raises:
         UsageError, CaptureError: see the message.
@@ -48,8 +52,10 @@ def encode_input(
     kind = detect_input(source)
     out.parent.mkdir(parents=True, exist_ok=True)
     if kind == "splats":
+        if cluster:
+            raise UsageError(f"--ray {cluster}: {source} holds splats, which need no training; leave --ray away")
         return _encode_splats(source, out, settings, frames, gop, bar)
-    return _encode_capture(source, out, settings, preset, frames, gop, bar)
+    return _encode_capture(source, out, settings, preset, frames, gop, cluster, bar)
 
 
 def _encode_splats(source, out, settings, frames, gop, bar) -> EncodeReport:
@@ -109,7 +115,7 @@ def _restrict(sequence: GaussianSequence, frames: str | None) -> GaussianSequenc
     return sequence.with_groups(groups)
 
 
-def _encode_capture(source, out, settings, preset, frames, gop, bar) -> EncodeReport:
+def _encode_capture(source, out, settings, preset, frames, gop, cluster, bar) -> EncodeReport:
     require("torch", "training a capture")
     from gscodec.train.settings import train_settings
     from gscodec.train.train import Checkpoint, train_groups
@@ -117,6 +123,25 @@ def _encode_capture(source, out, settings, preset, frames, gop, bar) -> EncodeRe
     capture = _open_capture(source, frames)
     recipe = train_settings(preset, gop=gop, quality=settings.quality)
     work = out.with_name(out.name + ".work")
+
+    def groups(_, first_frame: int) -> Iterator[Group]:
+        if cluster:
+            from gscodec.train.cluster import cluster_groups
+
+            opened = partial(_open_capture, source.resolve(), frames)
+            on_progress = lambda done: bar.update("train on the cluster", done, capture.frame_count)  # noqa: E731
+            return cluster_groups(
+                cluster, opened, recipe, settings.random_access, first_frame=first_frame, on_progress=on_progress
+            )
+        return train_groups(
+            capture,
+            recipe,
+            first_frame=first_frame,
+            random_access=settings.random_access,
+            checkpoints=work,
+            on_progress=lambda p: bar.update(p.stage, p.done, p.total),
+        )
+
     config = stream_config(
         fps=capture.fps,
         sh_degree=0,
@@ -126,13 +151,7 @@ def _encode_capture(source, out, settings, preset, frames, gop, bar) -> EncodeRe
         up=up_axis(capture.cameras),
     )
     report = encode_groups(
-        lambda _, frames_done: train_groups(
-            capture,
-            recipe,
-            first_frame=frames_done,
-            checkpoints=work,
-            on_progress=lambda p: bar.update(p.stage, p.done, p.total),
-        ),
+        groups,
         out,
         config,
         settings,
@@ -162,19 +181,46 @@ def up_axis(cameras: list[Camera]) -> str:
 
 
 def train_to_folder(
-    source: Path, folder: Path, *, preset: str, frames: str | None, gop: int, quality: float, bar: Bar
+    source: Path,
+    folder: Path,
+    *,
+    preset: str,
+    frames: str | None,
+    gop: int,
+    random_access: int,
+    quality: float,
+    bar: Bar,
 ) -> int:
-    """Trains a capture and writes one .ply per frame and sequence.json; returns the number of frames."""
+    """Trains a capture and writes one .ply per frame and sequence.json; returns the number of frames.
+
+    What an earlier run with the same settings left unfinished goes on where it stopped.
+    """
     require("torch", "training a capture")
     from gscodec.splats import SequenceWriter
     from gscodec.train.settings import train_settings
-    from gscodec.train.train import train_groups
+    from gscodec.train.train import Checkpoint, train_groups
 
     capture = _open_capture(source, frames)
     recipe = train_settings(preset, gop=gop, quality=quality)
-    writer = SequenceWriter(folder, capture.fps, capture.cameras)
-    for group in train_groups(capture, recipe, on_progress=lambda p: bar.update(p.stage, p.done, p.total)):
+    work, unfinished = folder / "work", folder / "unfinished.json"
+    facts = {"input": str(source.resolve()), "frames": frames, "random_access": random_access}
+    made_by = json.dumps(facts | asdict(recipe))
+    same = unfinished.is_file() and unfinished.read_text() == made_by
+    writer = SequenceWriter(folder, capture.fps, capture.cameras, resume=same)
+    with part_file(unfinished) as part:
+        part.write_text(made_by)
+    groups = train_groups(
+        capture,
+        recipe,
+        first_frame=writer.frame_count,
+        random_access=random_access,
+        checkpoints=work,
+        on_progress=lambda p: bar.update(p.stage, p.done, p.total),
+    )
+    for group in groups:
         writer.add(group)
+    unfinished.unlink()
+    Checkpoint(work).clear()
     return writer.frame_count
 
 
@@ -268,13 +314,26 @@ def bench_train(
         UsageError: an unknown capture or recipe, or no data folder.
     """
     require("torch", "measuring training")
-    from gscodec.bench.train import CAPTURES, RECIPES, measure, update
+    from gscodec.bench.train import CASES, RECIPES, measure, update
 
     if data is None:
         raise UsageError("bench train needs the data folder, set --data or GSCODEC_DATA")
-    for capture in _names("--capture", captures, CAPTURES) or CAPTURES:
+    for capture in _names("--capture", captures, CASES) or CASES:
         for recipe in _names("--recipe", recipes, RECIPES) or RECIPES:
             yield from update(out, measure(capture, recipe, preset, frames, data, quality))
+
+
+def bench_stress(cases: str | None, *, out: Path) -> Iterator[dict]:
+    """Yields what bench.stress measures (comma-separated cases, None: all), and puts it into `out` as it comes.
+
+    Raises:
+        UsageError: an unknown case.
+    """
+    require("torch", "measuring training")
+    from gscodec.bench.stress import measure
+    from gscodec.bench.stress_scenes import SCENES
+
+    yield from measure(_names("--case", cases, SCENES) or list(SCENES), out)
 
 
 def _names(option: str, text: str | None, known) -> list[str] | None:

@@ -11,7 +11,7 @@ import gscodec.player
 
 ROOT = Path(gscodec.__file__).parent
 FOLDERS = {"bench": Path(gscodec.bench.__file__).parent, "player": Path(gscodec.player.__file__).parent}
-BASE = {"errors", "gaussians", "camera", "frames", "sampling", "_native"}
+BASE = {"errors", "gaussians", "camera", "frames", "sampling", "part_file", "_native"}
 ALLOWED = {
     "bench": BASE | {"bitstream", "capture", "decode", "encode", "metrics", "render", "splats", "train"},
     "bitstream": BASE,

@@ -18,13 +18,16 @@ from gscodec.gaussians import GaussianSequence
 from gscodec.metrics.image import psnr
 from gscodec.render.image import render_image, render_rgba
 from gscodec.train.carve import carve, meeting_point, project
+from gscodec.train.changes import Changes
+from gscodec.train.cluster import train_segment
 from gscodec.train.finetune import GroupModel, laplace_bits
 from gscodec.train.graph import NodeGraph, Pose, quat_to_matrix, rotvec_to_quat
 from gscodec.train.keyframe import Statistics, grow, prune, train_keyframe
 from gscodec.train.model import from_gaussians
 from gscodec.train.motion import Tracker
 from gscodec.train.settings import TrainSettings, train_settings
-from gscodec.train.train import Checkpoint, initial_model, train_groups
+from gscodec.train.sweep import shell, sweep
+from gscodec.train.train import Checkpoint, initial_model, segments, train_groups
 from gscodec.train.views import Views
 
 SIZE = 64
@@ -89,6 +92,29 @@ def test_hull_lies_on_the_subject(capture):
     assert colors.max() <= 1
 
 
+def test_sweep_finds_a_textured_wall():
+    """A wall y = 0 of coloured splats, seen from an arc in front of it: the points lie on it, the shell far behind."""
+    rng = np.random.default_rng(1)
+    n = 3000
+    wall = dataclasses.replace(
+        blob(n),
+        means=np.stack([rng.uniform(-2, 2, n), np.zeros(n), rng.uniform(-1.5, 1.5, n)], 1).astype(np.float32),
+        log_scales=np.full((n, 3), np.log(0.04), np.float32),
+        logit_opacities=np.full(n, 4, np.float32),
+        sh0=rng.uniform(-1.7, 1.7, (n, 3)).astype(np.float32),
+    )
+    K = np.array([[150.0, 0, 64], [0, 150.0, 48], [0, 0, 1]])
+    eyes = [(x, -3.0, z) for z in (-0.3, 0.3) for x in (-0.8, 0, 0.8)]
+    cameras = [Camera(f"cam{i}", K, look_at(eye, np.zeros(3), [0, 0, 1]), 128, 96) for i, eye in enumerate(eyes)]
+    views = [(c, render_image(wall, c, (0, 0, 0)), None) for c in cameras]
+    points, colors = sweep(views, 1000, 0)
+    assert len(points) == len(colors) == 1000
+    assert (np.abs(points[:, 1]) < 0.22).mean() > 0.9, "a plane and a half: they are 0.15 apart there"
+    behind, _ = shell(views)
+    assert len(behind) > 5
+    assert (behind[:, 1] > 8).all()
+
+
 def test_projection_is_the_renderers(capture):
     camera = capture.cameras[0]
     g = blob(1)
@@ -122,7 +148,8 @@ def test_keyframe_learns_a_view_it_has_not_seen(masks):
 def test_tracking_finds_the_turn(capture):
     truth = turning(300, frames=5)
     key = from_gaussians(truth.frame(0))
-    tracker = Tracker(key, Views(capture, 0), TINY, 1.0)
+    views = Views(capture, 0)
+    tracker = Tracker(key, views, TINY, 1.0, 0.01, Changes.since(views, 0))
     models, poses = [tracker.model], [tracker.pose]
     for frame in (1, 2):
         tracker.advance(frame)
@@ -133,7 +160,7 @@ def test_tracking_finds_the_turn(capture):
     assert missed < 0.25 * still, (missed, still)
     angle = 2 * np.arccos(np.abs(tracker.pose.turned[:, 0].numpy()).clip(0, 1))
     assert np.median(angle) == pytest.approx(0.2, abs=0.08), "0.1 rad a frame"
-    group = GroupModel(tracker.graph, None, models, poses, steps_for(50, 1.0))
+    group = GroupModel(tracker.graph, None, models, poses, steps_for(50, 1.0), torch.ones(len(key), dtype=torch.bool))
     assert psnr_of(group.gaussians(2), capture, 2) > psnr_of(truth.frame(0), capture, 2) + 4
     carried = np.abs(truth.frame(2).means - group.means[2].numpy()).mean()
     assert carried < 0.3 * still, "the nodes have found it, not the Gaussians each for itself"
@@ -222,6 +249,18 @@ def test_groups_come_out_whole_and_a_stopped_run_goes_on(capture, tmp_path):
     np.testing.assert_array_equal(first.frames[2].means, groups[0].frames[2].means)
     (rest,) = train_groups(capture, TINY, first_frame=3, checkpoints=tmp_path / "again")
     np.testing.assert_array_equal(rest.frames[1].means, groups[1].frames[1].means)
+
+
+def test_segments_are_trained_without_a_look_at_others(capture):
+    assert segments(5, 3, 0) == [range(5)]
+    assert segments(5, 3, 2) == [range(3), range(3, 5)], "a group may be longer than that"
+    settings = dataclasses.replace(TINY, gop=2)
+    whole = list(train_groups(capture, settings, random_access=3))
+    assert [len(g) for g in whole] == [2, 1, 2]
+    assert [g.parents is None for g in whole] == [True, False, True]
+    (alone,) = train_segment(lambda: capture, settings, 3, range(3, 5))
+    np.testing.assert_array_equal(alone.frames[1].means, whole[2].frames[1].means)
+    np.testing.assert_array_equal(alone.nodes.translations, whole[2].nodes.translations)
 
 
 def test_what_cannot_be_trained_is_said():

@@ -1,6 +1,7 @@
 """Groups -> payloads: each independent, or predicted from the last independent one where that is cheaper.
 
-The coder remembers the last independent group as it was coded, and where the Gaussians of the groups since came from.
+The coder remembers the last independent group as it was coded, and where the Gaussians of the groups since came from;
+`state` is that memory as arrays, from which a later run goes on as if it had never stopped.
 """
 
 from __future__ import annotations
@@ -29,11 +30,15 @@ class CodedGroup:
     independent: bool
 
 
+def _decoded(payload: bytes):
+    return _native.DecodedGroup(payload, len(_native.levels()))
+
+
 @dataclass(frozen=True)
 class _Reference:
     coded: Coded
     decoded: object  # _native.DecodedGroup
-    bytes: int
+    payload: bytes
     frames: int  # of it and of the groups since
     back: int  # groups since, itself included
     index: np.ndarray  # of each Gaussian of the group before: which one it is in the reference, -1: none
@@ -59,7 +64,7 @@ class GroupCoder:
             return self._independent(group, quality)
         integers = predict_group(group, parents, r.back, r.coded, quality=quality, **self._options)
         payload, units = _native.encode_group(integers, r.decoded)
-        if len(payload) > DOUBT * r.bytes:
+        if len(payload) > DOUBT * len(r.payload):
             other = self._independent(group, quality)
             if len(other.payload) <= len(payload):
                 return other
@@ -70,10 +75,23 @@ class GroupCoder:
         coded = code_group(group, quality, layers=self._layers, **self._options)
         payload, units = _native.encode_group(coded.integers)
         if self._random_access > len(group):
-            decoded = _native.DecodedGroup(payload, len(_native.levels()))
             index = np.arange(len(group.frames[0]))
-            self._reference = _Reference(coded, decoded, len(payload), len(group), 1, index)
+            self._reference = _Reference(coded, _decoded(payload), payload, len(group), 1, index)
         return CodedGroup(payload, units, len(coded.source), True)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What the next group may be predicted from; empty if from nothing."""
+        r = self._reference
+        if r is None:
+            return {}
+        numbers = {"frames": np.array(r.frames), "back": np.array(r.back)}
+        return {**numbers, "index": r.index, "payload": np.frombuffer(r.payload, np.uint8), **r.coded.state()}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Goes on behind the groups after which another coder had this `state`."""
+        if "payload" in state:
+            payload, numbers = state["payload"].tobytes(), (int(state["frames"]), int(state["back"]))
+            self._reference = _Reference(Coded.restored(state), _decoded(payload), payload, *numbers, state["index"])
 
     def _parents(self, group: Group) -> np.ndarray | None:
         """[N] int, which Gaussian of the reference each one is, -1: none; None: nothing is known."""

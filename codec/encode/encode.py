@@ -1,7 +1,7 @@
 """GaussianSequence -> .gsv: the loop over groups, with progress, interruption and resume.
 
 Groups come one at a time from `groups` (a trainer yields them as they are done), are turned to integers, to bytes, and
-appended. A run that stops goes on where it stopped, with an independent group.
+appended. A run that stops goes on where it stopped, to the same bytes.
 """
 
 from __future__ import annotations
@@ -137,7 +137,10 @@ def encode_groups(
         random_access=settings.random_access,
         cameras=[c for c in cameras if c.split == "train"],
     )
-    rate = RateControl(settings.bitrate, config["fps"], settings.quality) if settings.bitrate else None
+    state = writer.state()
+    coder.restore(state)
+    quality = float(state.get("quality", settings.quality))
+    rate = RateControl(settings.bitrate, config["fps"], quality) if settings.bitrate else None
     report = EncodeReport(seconds={"input": 0.0, "code": 0.0})
     clock = time.perf_counter
     try:
@@ -150,7 +153,8 @@ def encode_groups(
             else:
                 coded = coder.code(group, settings.quality)
             report.seconds["code"] += clock() - mark
-            writer.append(coded.payload, len(group), sync=coded.independent)
+            state = coder.state() | ({"quality": np.array(rate.quality)} if rate else {})
+            writer.append(coded.payload, len(group), sync=coded.independent, state=state)
             _account(report, writer, coded)
             if on_group:
                 on_group(report)

@@ -94,16 +94,25 @@ def dequantize_channels(channels: dict) -> np.ndarray:
     return (offsets + steps * channels["values"].T.astype(np.float32)).astype(np.float64)
 
 
+@dataclass(frozen=True)
 class Grid:
-    """The integer lattice of positions: origin and step of the group."""
+    """The integer lattice of positions: origin [3] f32 and step of the group, in bits a coordinate."""
 
-    def __init__(self, means: np.ndarray, step: float):
+    origin: np.ndarray
+    step: float
+    bits: int
+
+    @staticmethod
+    def around(means: np.ndarray, step: float) -> Grid:
+        """The lattice that holds `means` [N, 3]."""
         low = means.min(0) if len(means) else np.zeros(3)
         extent = float((means.max(0) - low).max()) if len(means) else 0.0
-        step = max(step, extent / (2**GRID_BITS_MAX - 2))  # far floaters: coarser rather than an error
-        self.step = float(np.float32(step))
-        self.origin = low.astype(np.float32)
-        self.bits = max(1, int(np.ceil(extent / self.step + 1)).bit_length())
+        step = float(np.float32(max(step, extent / (2**GRID_BITS_MAX - 2))))  # far floaters: coarser, not an error
+        return Grid(low.astype(np.float32), step, max(1, int(np.ceil(extent / step + 1)).bit_length()))
+
+    def header(self) -> dict:
+        """Its entries in the input of `encode_group`."""
+        return {"origin": self.origin.tolist(), "grid_step": self.step, "grid_bits": self.bits}
 
     def to_integers(self, means: np.ndarray) -> np.ndarray:
         """[N, 3] world -> [N, 3] u32."""
@@ -163,6 +172,31 @@ class Coded:
     steps: dict[str, np.ndarray]
     node_step: float
 
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that predicting needs, as arrays: what a later run goes on from."""
+        whole = {n: np.asarray(getattr(self, n)) for n in ("source", "turn", "order", "node_step")}
+        grid = {f"grid.{n}": np.asarray(v) for n, v in vars(self.grid).items()}
+        channels = {
+            f"channels.{n}.{key}": np.asarray(v) for n, c in self.integers["channels"].items() for key, v in c.items()
+        }
+        layers = np.asarray(self.integers["layers"])
+        steps = {f"steps.{n}": v for n, v in self.steps.items()}
+        return {**whole, **grid, **channels, **steps, "layers": layers, "positions": self.integers["positions"]}
+
+    @staticmethod
+    def restored(state: dict[str, np.ndarray]) -> Coded:
+        """Inverse of `state`."""
+        grid = Grid(state["grid.origin"], float(state["grid.step"]), int(state["grid.bits"]))
+        steps = {n.removeprefix("steps."): v for n, v in state.items() if n.startswith("steps.")}
+        channels: dict[str, dict] = {}
+        for name, v in state.items():
+            if name.startswith("channels."):
+                _, attribute, key = name.split(".")
+                channels.setdefault(attribute, {})[key] = v if key == "values" else v.tolist()
+        lists = {"layers": state["layers"].tolist(), "positions": state["positions"], "channels": channels}
+        whole = (state[n] for n in ("source", "turn", "order"))
+        return Coded(grid.header() | lists, *whole, grid, steps, float(state["node_step"]))
+
 
 def code_group(
     group: Group, quality: float, *, keep_all: bool = False, layers: int = 1, cameras: list[Camera] = ()
@@ -185,7 +219,7 @@ def code_group(
     nominal = steps_for(quality, subject_radius(s.means[middle]))
     steps = _steps(s.take(source), measured.take(source), error, nominal)
     rest = middle if group.nodes is None else 0
-    grid = Grid(s.means[rest, source], float(steps["means"][0]))
+    grid = Grid.around(s.means[rest, source], float(steps["means"][0]))
     source = source[_native.morton_order(grid.to_integers(s.means[rest, source]))]
     nodes, x, quats = _rest_pose(s.take(source), rest, grid, nominal.node_translation, group.nodes)
     positions = grid.to_integers(x)
@@ -200,9 +234,7 @@ def code_group(
     channels["quats"] = inside_unit_ball(channels["quats"])
     out = {
         "frames": frames,
-        "origin": grid.origin.tolist(),
-        "grid_step": grid.step,
-        "grid_bits": grid.bits,
+        **grid.header(),
         "layers": np.bincount(layer, minlength=layers).tolist(),
         "positions": positions,
         "channels": channels,

@@ -22,7 +22,7 @@ class RateControl:
     """Codes groups so that the file has `bitrate` bits per second at `fps`."""
 
     def __init__(self, bitrate: float, fps: float, quality: float = 50.0):
-        self._bytes_per_frame, self._quality = bitrate / 8 / fps, quality
+        self._bytes_per_frame, self.quality = bitrate / 8 / fps, quality  # that of the last group
 
     def code(self, coder: GroupCoder, group: Group, frames: int, size: int) -> tuple[GroupCoder, CodedGroup]:
         """Codes `group` behind `frames` frames that took `size` bytes.
@@ -31,7 +31,7 @@ class RateControl:
             `coder` as it is after this group, and the group.
         """
         budget = max(self._bytes_per_frame * (frames + len(group)) - size, LEAST * self._bytes_per_frame * len(group))
-        quality, tried = self._quality, []  # of (how far off, quality, log of size over budget, coder, group)
+        quality, tried = self.quality, []  # of (how far off, quality, log of size over budget, coder, group)
         while len(tried) < TRIES:
             after = copy.copy(coder)
             coded = after.code(group, quality)
@@ -42,7 +42,7 @@ class RateControl:
             quality = min(max(self._next(tried), 0.0), 100.0)
             if any(quality == t[1] for t in tried):
                 break
-        _, self._quality, _, after, coded = min(tried, key=lambda t: t[0])
+        _, self.quality, _, after, coded = min(tried, key=lambda t: t[0])
         return after, coded
 
     @staticmethod

@@ -1,8 +1,9 @@
 """The growing file: group payloads -> OUT.gsv.part, playable at any moment, then OUT.gsv with its index.
 
 OUT.gsv.part holds the init segment and whole fragments; OUT.gsv.part.json says what made it, so that a second run goes
-on where the first one stopped, and only if input and settings are the same. `finish` writes the indexed file beside
-it and renames; a file under the final name is always complete.
+on where the first one stopped, and only if input and settings are the same; OUT.gsv.part.N.npz is what the coder knows
+after N groups. It is there before group N is, and until group N + 1 is, so that a run killed at any moment can go on.
+`finish` writes the indexed file beside it and renames; a file under the final name is always complete.
 """
 
 from __future__ import annotations
@@ -11,10 +12,14 @@ import json
 import mmap
 import os
 import shutil
+from glob import escape
 from pathlib import Path
+
+import numpy as np
 
 from gscodec import _native
 from gscodec.errors import BitstreamError
+from gscodec.part_file import part_file, read_arrays, write_arrays
 
 
 class StreamWriter:
@@ -29,20 +34,22 @@ class StreamWriter:
     def __init__(self, out: Path, config: dict, fingerprint: dict):
         self.out, self.config = Path(out), config
         self.part = self.out.with_name(self.out.name + ".part")
-        self.state = self.out.with_name(self.out.name + ".part.json")
+        self._made_by = self.out.with_name(self.out.name + ".part.json")
         self.init = _native.init_segment(config)
         self.fragments: list[tuple[int, int, bool, list[int]]] = []  # size, frames, sync, bytes up to each layer's end
         fingerprint = json.loads(json.dumps(fingerprint))
         if not self._resume(fingerprint):
+            self._forget()
             self.part.write_bytes(self.init)
-            self.state.write_text(json.dumps(fingerprint))
+            with part_file(self._made_by) as part:
+                part.write_text(json.dumps(fingerprint))
         self._file = open(self.part, "ab")
 
     def _resume(self, fingerprint: dict) -> bool:
-        if not (self.part.exists() and self.state.exists()):
+        if not (self.part.exists() and self._made_by.exists()):
             return False
         try:
-            if json.loads(self.state.read_text()) != fingerprint:
+            if json.loads(self._made_by.read_text()) != fingerprint:
                 return False
             with open(self.part, "rb") as f, mmap.mmap(f.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 if data[: len(self.init)] != self.init:
@@ -73,17 +80,34 @@ class StreamWriter:
         """Size of the file so far, without its index."""
         return len(self.init) + sum(s for s, *_ in self.fragments)
 
-    def append(self, payload: bytes, frames: int, *, sync: bool = True) -> None:
-        """Writes one group of `frames` frames; it is on disk when this returns."""
+    def _state(self, groups: int) -> Path:
+        return self.out.with_name(f"{self.out.name}.part.{groups}.npz")
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What `append` was told after the last group; empty where there is none, or no longer."""
+        return read_arrays(self._state(self.groups)) or {}
+
+    def append(self, payload: bytes, frames: int, *, sync: bool = True, state: dict[str, np.ndarray] | None = None):
+        """Writes one group of `frames` frames; it is written when this returns. `state`: what `state` is to give to a
+        run that goes on behind it."""
+        if state is not None:
+            write_arrays(self._state(self.groups + 1), state)
         data = _native.fragment(payload, self.groups + 1, self.frames, frames, sync, self.config)
         self._file.write(data)
         self._file.flush()
         head = len(data) - len(payload)
         self.fragments.append((len(data), frames, sync, [head + e for e in layer_ends(_native.units(payload))]))
+        self._state(self.groups - 1).unlink(missing_ok=True)
+
+    def _forget(self) -> None:
+        """Removes what a later run could go on from."""
+        for path in self.out.parent.glob(f"{escape(self.part.name)}*"):
+            path.unlink(missing_ok=True)
 
     def finish(self, *, keep_part: bool = False) -> None:
         """Writes OUT.gsv: init segment, index, fragments. `keep_part` leaves what a later run needs to go on."""
         self._file.close()
+        os.truncate(self.part, self.bytes)  # Ctrl-C may have come in the middle of a fragment
         indexed = self.out.with_name(self.out.name + ".indexed")
         with open(self.part, "rb") as source, open(indexed, "wb") as target:
             target.write(_native.finish(self.init, self.fragments))
@@ -91,8 +115,7 @@ class StreamWriter:
             shutil.copyfileobj(source, target, 1 << 20)
         os.replace(indexed, self.out)
         if not keep_part:
-            self.part.unlink()
-            self.state.unlink()
+            self._forget()
 
     def close(self) -> None:
         """Leaves the .part as it is."""

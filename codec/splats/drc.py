@@ -11,7 +11,7 @@ import numpy as np
 
 from gscodec.errors import CaptureError, require
 from gscodec.gaussians import Gaussians
-from gscodec.splats.part_file import part_file
+from gscodec.part_file import part_file
 
 BITS, LEVEL = 16, 10  # quantization of an axis; effort
 OPACITY, LIGHT = 4.0, 1.0  # logit; coefficient of the colour

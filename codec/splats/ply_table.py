@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gscodec.errors import CaptureError
-from gscodec.splats.part_file import part_file
+from gscodec.part_file import part_file
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",

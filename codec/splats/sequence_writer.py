@@ -17,7 +17,7 @@ import numpy as np
 
 from gscodec.camera import Camera
 from gscodec.gaussians import GaussianSequence, Group
-from gscodec.splats.part_file import part_file
+from gscodec.part_file import part_file
 from gscodec.splats.ply import write_ply
 
 HIDDEN = -30.0  # logit opacity that no renderer shows
@@ -37,7 +37,9 @@ class SequenceWriter:
         self._folder = Path(folder)
         self._folder.mkdir(parents=True, exist_ok=True)
         listed = self._folder / NAME
-        self.groups = json.loads(listed.read_text())["groups"] if resume and listed.is_file() else []
+        if not resume:
+            listed.unlink(missing_ok=True)  # the folder is no longer what it says
+        self.groups = json.loads(listed.read_text())["groups"] if listed.is_file() else []
         self._head = {"fps": fps, "cameras": [_camera(c) for c in cameras]}
 
     @property

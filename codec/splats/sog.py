@@ -18,9 +18,9 @@ import numpy as np
 
 from gscodec.errors import CaptureError, require
 from gscodec.gaussians import SH_COUNTS, Gaussians
+from gscodec.part_file import part_file
 from gscodec.splats.codebook import codebook, palette
 from gscodec.splats.compressed_ply import logit, sigmoid
-from gscodec.splats.part_file import part_file
 from gscodec.splats.smallest_three import join_smallest_three, split_smallest_three
 
 PALETTE_WIDTH = 64  # SH palette entries per row of its map

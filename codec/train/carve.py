@@ -49,7 +49,7 @@ def _inside(points: np.ndarray, views) -> np.ndarray:
     return (seen >= max(2, SEEN_SHARE * len(views))) & (missed <= MISSES)
 
 
-def _colors(points: np.ndarray, views) -> np.ndarray:
+def colors_of(points: np.ndarray, views) -> np.ndarray:
     """[N, 3] 0..1: median over the views that look at the subject there (occlusion is left to training)."""
     colors = np.full((len(views), len(points), 3), np.nan, np.float32)
     for i, (camera, rgb, alpha) in enumerate(views):
@@ -98,7 +98,7 @@ def carve(cameras, views, count: int) -> tuple[np.ndarray, np.ndarray]:
         if 0.7 * count < len(surface) < 1.4 * count or len(surface) == 0:
             break
         step *= np.sqrt(len(surface) / count)
-    return surface, _colors(surface, views)
+    return surface, colors_of(surface, views)
 
 
 def random_box(cameras, views, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -124,4 +124,4 @@ def random_box(cameras, views, count: int, seed: int) -> tuple[np.ndarray, np.nd
         seen += (depth > 0.01) & (p >= 0).all(1) & (p < [c.width, c.height]).all(1)
     points = points[seen >= min(2, len(cameras))]
     points = points[rng.permutation(len(points))[:count]]
-    return points, _colors(points, views)
+    return points, colors_of(points, views)

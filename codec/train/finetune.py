@@ -28,6 +28,7 @@ from gscodec.train.views import Views, compare
 
 # attribute -> temporal frequencies that may be used; what is not listed is constant in a group
 FREQUENCIES = {"means": 10, "quats": 4, "log_scales": 3, "logit_opacities": 3, "sh0": 6}
+STARTS = 0.5  # steps: a residual that is there from the start, of a Gaussian that has moved in an earlier group
 ROUND_DOWN = 0.1  # a coefficient below 0.6 steps is not coded, as the encoder does it
 RESIDUAL_RATE = 0.05  # in steps of the stream a step of the optimiser
 LAPLACE_RATE = 0.02
@@ -63,9 +64,18 @@ class GroupModel:
         key: canonical Gaussians in the keyframe's pose; None makes it the mean of the tracked frames.
         tracked: T tracked models; poses: T poses of the nodes of `graph`.
         steps: the stream's quantization.
+        moved: [N] bool, Gaussians that tracking has touched; the others have no residuals, unless they start with some.
     """
 
-    def __init__(self, graph: NodeGraph, key: Model | None, tracked: list[Model], poses: list[Pose], steps: Steps):
+    def __init__(
+        self,
+        graph: NodeGraph,
+        key: Model | None,
+        tracked: list[Model],
+        poses: list[Pose],
+        steps: Steps,
+        moved: torch.Tensor,
+    ):
         self.graph, self.poses = graph, poses
         self.fixed = key is not None
         self.key = key or _mean_of(graph, tracked, poses)
@@ -75,6 +85,10 @@ class GroupModel:
         self.unit["sh0"] *= float(STEP_WEIGHTS[0])  # Y, Co, Cg share one step; RGB errors add up over them
         self.means, self.turned = zip(*(self._carry(p) for p in poses), strict=True)
         self.coefficients = self._project(tracked)  # in units of the quantization step
+        self.free = torch.stack([(c.detach().abs() > STARTS).any(2).any(0) for c in self.coefficients.values()]).any(0)
+        self.free |= moved
+        for c in self.coefficients.values():
+            c.register_hook(lambda grad: grad * self.free[:, None])
         self.log_scales = {
             n: torch.full((len(c), 1, 1), -1.0, requires_grad=True) for n, c in self.coefficients.items()
         }

@@ -17,6 +17,7 @@ from gscodec.sampling import farthest_points
 NODES = 256  # 1000 track as well
 BLENDED = 4  # nodes that carry one Gaussian
 EDGES = 8  # neighbours of a node in the rigidity term
+HELD = 0.1  # weight from which a node has a hold on a Gaussian
 GRID = 1e-3  # of the radius: the lattice on which neighbours and weights are computed
 
 
@@ -144,6 +145,11 @@ class NodeGraph:
         blend = _Weighted.apply(rows, self._blend, self._gather)
         means = (blend[:, :9].view(-1, 3, 3) * x[:, None]).sum(2) + blend[:, 9:12]
         return means, torch.nn.functional.normalize(blend[:, 12:], dim=1)
+
+    def carriers(self, chosen: torch.Tensor) -> torch.Tensor:
+        """[M] bool: nodes that carry a Gaussian of `chosen` ([N] bool) with a weight of more than `HELD`."""
+        weights = self._gather[:, chosen.numpy()]
+        return torch.from_numpy((weights > HELD).getnnz(axis=1) > 0)
 
     def rigidity(self, pose: Pose) -> torch.Tensor:
         """Mean weighted length by which the edges between nodes miss their rotated selves (Sorkine and Alexa 2007)."""

@@ -5,6 +5,8 @@ Gaussians' own attributes. The colours must be free while the nodes move: shadin
 with fixed colours the motion follows the shading instead of the surface (lumberjack: 22.5 dB after 6 frames, with free
 colours 26.1). The first half of the steps looks at small pictures, where large motion is near and a step is cheap.
 
+What does not change in the pictures (changes.py) does not move: its Gaussians and nodes stay as they are, to the bit.
+
 A hash grid and MLP (V3) on top of the nodes gave nothing here, so that there is none: the nodes are what the stream can
 carry. V3's recipe, with the grid, is a baseline in bench/baselines/v3.py.
 """
@@ -18,12 +20,14 @@ import numpy as np
 import torch
 
 from gscodec.render.workspace import Workspace
+from gscodec.train.changes import Changes
 from gscodec.train.graph import NodeGraph, Pose, quat_conjugate, quat_multiply, rotvec_to_quat
 from gscodec.train.model import NAMES, Model
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, compare
 
-FIRST_STEPS = 2  # the first frame after a keyframe has no velocity to start from, and takes so many times the steps
+ROUNDS = 4  # at most, of `motion_steps` each: as many as a frame needs to come near the loss of the one before
+PAYS, LOSS_FLOOR = 1.2, 0.001  # what is near
 SMALL = 0.5  # scale of the pictures in the first half of the steps
 LOSS_WINDOW = 20  # steps over which a loss is averaged: about every view once
 TURN_RATE, MOVE_RATE = 2e-2, 3e-3  # of the nodes: radians, radii
@@ -31,6 +35,7 @@ MASK_LAMBDA = 3.0  # the silhouette counts more than in a keyframe: it does not 
 # The Gaussians' own: what light changes is quick, place and shape are slow, so that the nodes take the motion.
 RATES = {"quats": 6e-4, "log_scales": 6e-3, "logit_opacities": 2e-2, "sh0": 5e-2, "shN": 2.5e-3}
 MEANS_RATE = 3e-5  # radii
+VISIBLE = 0.05  # blending weight from which a camera sees a Gaussian
 
 
 class Tracker:
@@ -39,18 +44,24 @@ class Tracker:
     Args:
         key: the keyframe's Gaussians.
         radius: of the subject, world units.
+        loss: image loss of the keyframe, without the mask's.
+        changes: what has been fitted so far.
 
     Attributes:
         own: the Gaussians as they would be in the keyframe's pose; `means` is what they moved besides the nodes.
         pose: the nodes in the last frame.
+        moving: [N] bool, Gaussians that were free to change in the last frame.
+        loss: image loss of the last frame that had changed.
     """
 
-    def __init__(self, key: Model, views: Views, settings: TrainSettings, radius: float):
+    def __init__(self, key: Model, views: Views, settings: TrainSettings, radius: float, loss: float, changes: Changes):
         self.views, self.radius = views, radius
         self.settings = replace(settings, mask_lambda=MASK_LAMBDA * settings.mask_lambda)
         self.graph = NodeGraph(key.params["means"], radius)
         self.pose = Pose.rest(self.graph)
         self.own = Model({**key.params, "means": torch.zeros_like(key.params["means"])})
+        self.loss, self.changes = loss, changes
+        self.moving = torch.zeros(len(key), dtype=torch.bool)
         self.workspace = Workspace()
 
     def carried(self, own: Model, pose: Pose) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
@@ -64,43 +75,72 @@ class Tracker:
         """The Gaussians in the last frame."""
         return Model(self.carried(self.own, self.pose)[0])
 
-    def advance(self, frame: int, on_step: Callable[[int, float], None] | None = None) -> float:
-        """Moves model and pose on to `frame`, the next one; returns the image loss at the end, without the mask's."""
-        fresh = not self.pose.move.any()
-        steps = self.settings.motion_steps * (FIRST_STEPS if fresh else 1)
+    def advance(self, frame: int, on_step: Callable[[int, float], None] | None = None) -> float | None:
+        """Moves model and pose on to `frame`, the next one; returns the image loss at the end, without the mask's, or
+        None where nothing has changed."""
+        self.moving = torch.from_numpy(self._moving(frame))
+        if not self.moving.any():
+            self.pose = replace(self.pose, turn=0 * self.pose.turn, move=0 * self.pose.move)
+            return None
         fit = _Fit(self, np.random.default_rng([self.settings.seed, frame, 1]))
-        losses = []
+        bound, loss = PAYS * self.loss + LOSS_FLOOR, np.inf
+        for turn in range(ROUNDS):
+            before, loss = loss, self._round(fit, frame, SMALL if turn == 0 else 1.0, on_step)
+            if loss < bound or loss > 0.9 * before:
+                break
+        self.own, self.pose = fit.result()
+        self.loss = loss
+        return loss
+
+    def _round(self, fit: _Fit, frame: int, scale: float, on_step) -> float:
+        """`motion_steps` views, the first half of them at `scale` of their size; returns the image loss at the end."""
+        losses, steps = [], self.settings.motion_steps
         for step in range(steps):
-            scale = SMALL if 2 * step < steps else 1.0
-            losses.append(fit.step(self.views.draw(frame, scale), 0.1 ** (step / steps)))
+            target = self.views.draw(frame, scale if 2 * step < steps else 1.0)
+            losses.append(fit.step(target, 0.1 ** (step / steps)))
             if on_step:
                 on_step(step, losses[-1])
-        self.own, self.pose = fit.result()
         return float(np.mean(losses[-LOSS_WINDOW:]))
+
+    def _moving(self, frame: int) -> np.ndarray:
+        """[N] bool: Gaussians that `frame` shows otherwise."""
+        masks, model = self.changes.advance(frame), self.model
+        if not any(m.any() for m in masks):
+            return np.zeros(len(model), bool)
+        rng, visible = np.random.default_rng(self.settings.seed), []
+        for camera in self.views.train_cameras:
+            target = self.views.target(camera, frame, SMALL)
+            result = compare(model.params, target, self.settings, rng, self.workspace)
+            visible.append(result.max_weight > VISIBLE)
+        return self.changes.behind(masks, model.params["means"].numpy(), visible)
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays, for a checkpoint."""
         own = {f"own.{n}": p.numpy() for n, p in self.own.params.items()}
         pose = {f"pose.{f.name}": getattr(self.pose, f.name).numpy() for f in fields(Pose)}
-        return {"radius": np.array(self.radius), "key_means": self.graph.means.numpy(), **own, **pose}
+        fitted = {f"fitted.{i}": picture for i, picture in enumerate(self.changes.fitted)}
+        return {
+            "radius_loss": np.array([self.radius, self.loss]),
+            "key_means": self.graph.means.numpy(),
+            **own,
+            **pose,
+            **fitted,
+        }
 
     @staticmethod
     def restored(state: dict[str, np.ndarray], views: Views, settings: TrainSettings) -> Tracker:
         """Inverse of `state`."""
         own = Model({n: torch.from_numpy(state[f"own.{n}"]) for n in NAMES})
-        tracker = Tracker(
-            Model({**own.params, "means": torch.from_numpy(state["key_means"])}),
-            views,
-            settings,
-            float(state["radius"]),
-        )
+        key = Model({**own.params, "means": torch.from_numpy(state["key_means"])})
+        changes = Changes(views, [state[f"fitted.{i}"] for i in range(len(views.train_cameras))])
+        tracker = Tracker(key, views, settings, *state["radius_loss"].tolist(), changes)
         tracker.own = own
         tracker.pose = Pose(*(torch.from_numpy(state[f"pose.{f.name}"]) for f in fields(Pose)))
         return tracker
 
 
 class _Fit:
-    """The optimisation of one frame, from constant velocity.
+    """The optimisation of one frame, from constant velocity, of the Gaussians that are moving and their nodes.
 
     Means are always the keyframe's, carried by the whole motion since, plus what each Gaussian moved besides: what the
     stream can say with nodes is said with nodes, and does not creep into the Gaussians step by step.
@@ -108,8 +148,10 @@ class _Fit:
 
     def __init__(self, tracker: Tracker, rng: np.random.Generator):
         self.t, self.rng = tracker, rng
-        self.turn = tracker.pose.turn.clone().requires_grad_()
-        self.move = tracker.pose.move.clone().requires_grad_()
+        self.moving = tracker.moving.float()
+        self.carriers = tracker.graph.carriers(tracker.moving).float()[:, None]
+        self.turn = (tracker.pose.turn * self.carriers).requires_grad_()
+        self.move = (tracker.pose.move * self.carriers).requires_grad_()
         rates = [(self.turn, TURN_RATE), (self.move, MOVE_RATE * tracker.radius)]
         self.optimizer = torch.optim.Adam([{"params": [p], "base": r} for p, r in rates], betas=(0.9, 0.99), fused=True)
         self.own = Model(tracker.own.params)
@@ -131,10 +173,13 @@ class _Fit:
         self.optimizer.zero_grad()
         heads, seeds = [params["means"], params["quats"], rigid], [grads["means"], grads["quats"], torch.ones(())]
         torch.autograd.backward(heads, seeds)
+        self.turn.grad *= self.carriers
+        self.move.grad *= self.carriers
         self.optimizer.step()
         back = quat_multiply(quat_conjugate(turned.detach()), grads["quats"])
         rates = {"means": MEANS_RATE * t.radius, **RATES}
-        self.own.adam({**grads, "quats": back}, {n: r * fade for n, r in rates.items()})
+        own = {n: g * self.moving.view(-1, *[1] * (g.dim() - 1)) for n, g in {**grads, "quats": back}.items()}
+        self.own.adam(own, {n: r * fade for n, r in rates.items()})
         return result.loss - t.settings.mask_lambda * result.mask
 
     @torch.no_grad()

@@ -46,7 +46,7 @@ class TrainSettings:
 
 
 PRESETS = {
-    "fast": {"keyframe_steps": 700, "motion_steps": 50, "finetune_steps": 40, "gaussians_max": 8000},
+    "fast": {"keyframe_steps": 700, "motion_steps": 100, "finetune_steps": 40, "gaussians_max": 8000},
     "medium": {},
     "slow": {"keyframe_steps": 4000, "motion_steps": 250, "finetune_steps": 300, "gaussians_max": 25000},
 }

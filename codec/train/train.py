@@ -6,10 +6,9 @@ checkpoint holds what the next one starts from; a run that stops goes on there.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +17,20 @@ import torch
 from gscodec.bitstream.quantization import steps_for, subject_radius
 from gscodec.errors import CaptureError
 from gscodec.gaussians import Group
+from gscodec.part_file import read_arrays, write_arrays
 from gscodec.train.carve import carve, random_box
+from gscodec.train.changes import Changes
 from gscodec.train.finetune import GroupModel, finetune
 from gscodec.train.graph import Pose
 from gscodec.train.keyframe import train_keyframe
 from gscodec.train.model import NAMES, Model, from_points
 from gscodec.train.motion import Tracker
 from gscodec.train.settings import TrainSettings
+from gscodec.train.sweep import shell, sweep
 from gscodec.train.views import Views
+
+CUT_FLOOR = 0.004  # image loss that no frame is cut for: clean pictures fit far better than they need to
+SWEEP_LEAST = 0.1  # of the initial points that a plane sweep must find, to be a scene with texture
 
 
 @dataclass
@@ -44,7 +49,7 @@ class Progress:
 
 
 def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
-    """Gaussians from the visual hull of the masks, or at random where there are none.
+    """Gaussians from the visual hull of the masks, or a plane sweep where there are none, or at random.
 
     Raises:
         CaptureError: nothing to start from.
@@ -61,6 +66,10 @@ def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
         points, colors = carve(known, views, settings.initial_points)
         if len(points):
             return from_points(points, colors, opacity=0.5)
+    points, colors = sweep(views, settings.initial_points, settings.seed)
+    if len(points) >= SWEEP_LEAST * settings.initial_points:
+        surface = zip((points, colors), shell(views), strict=True)
+        return from_points(*(np.concatenate(pair) for pair in surface), opacity=0.5)
     points, colors = random_box(known, views, settings.initial_points, settings.seed)
     if len(points) == 0:
         raise CaptureError(f"{capture.name}: no point is seen by two cameras, expected cameras that overlap")
@@ -77,31 +86,23 @@ class Checkpoint:
         return self.folder / f"before_{next_frame:06d}.npz"
 
     def save(self, next_frame: int, subject: Subject | None) -> None:
-        """Writes the subject as it is before `next_frame`, atomically, and drops older ones; None needs no file."""
+        """Writes the subject as it is before `next_frame`, atomically; None needs no file. Of the older ones the last
+        stays, since the stream may not have the group between them yet."""
         if self.folder is None or subject is None:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
-        old = list(self.folder.glob("before_*.npz"))
-        part = self.folder / "writing.npz"
-        np.savez(part, **subject.state())
-        os.replace(part, self._path(next_frame))
-        for path in old[:-1]:  # the newest but one stays: the stream may not have the last group yet
+        write_arrays(self._path(next_frame), subject.state())
+        for path in sorted(p for p in self.folder.glob("before_*.npz") if p < self._path(next_frame))[:-1]:
             path.unlink()
 
     def load(self, next_frame: int) -> dict | None:
         """The state that `save` wrote for `next_frame`, or None."""
-        if self.folder is None or not self._path(next_frame).exists():
-            return None
-        try:
-            with np.load(self._path(next_frame)) as z:
-                return dict(z)
-        except (OSError, ValueError, KeyError):
-            return None
+        return None if self.folder is None else read_arrays(self._path(next_frame))
 
     def clear(self) -> None:
-        """Removes the folder once the run is complete."""
+        """Removes the folder: the run is complete, or another one begins."""
         if self.folder is not None and self.folder.is_dir():
-            for path in self.folder.glob("*.npz"):
+            for path in self.folder.glob("before_*"):
                 path.unlink()
             self.folder.rmdir()
 
@@ -137,16 +138,19 @@ def train_groups(
     settings: TrainSettings,
     *,
     first_frame: int = 0,
+    random_access: int = 0,
     checkpoints: Path | None = None,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> Iterator[Group]:
     """Trains `capture` from `first_frame` on and yields each group when it is done.
 
     A group continues the Gaussians of the one before (`Group.parents`) as long as they serve; where the image loss of a
-    tracked frame is `cut_ratio` times the keyframe's, the group ends and the next one starts anew.
+    tracked frame is `cut_ratio` times the keyframe's, the group ends and the next one starts anew. So does every
+    segment of `random_access` frames: segments depend on nothing but their own frames.
 
     Args:
         first_frame: where an earlier run stopped; a group starts there.
+        random_access: see `segments`.
         checkpoints: folder for what the next group starts from; None keeps it in memory only.
         on_progress: called after every step.
 
@@ -157,16 +161,28 @@ def train_groups(
     torch.set_num_threads(1)
     store = Checkpoint(checkpoints)
     run = _Run(capture, settings, on_progress)
+    if not first_frame:
+        store.clear()  # what an earlier run with other settings may have left
     state = store.load(first_frame) if first_frame else None  # absent after a cut, too
     if state is not None:
         run.subject = Subject.restored(state, run.views, settings)
     start = first_frame
-    while start < capture.frame_count:
-        run.estimate(capture.frame_count - start)
-        group = run.group(range(start, min(start + settings.gop, capture.frame_count)))
-        start += len(group)
-        store.save(start, run.subject)
-        yield group
+    for segment in segments(capture.frame_count, settings.gop, random_access):
+        while start < segment.stop:
+            run.estimate(capture.frame_count - start)
+            group = run.group(range(start, min(start + settings.gop, segment.stop)))
+            start += len(group)
+            if start == segment.stop:
+                run.subject = None
+            store.save(start, run.subject)
+            yield group
+
+
+def segments(frame_count: int, gop: int, random_access: int) -> list[range]:
+    """Frames that are trained without a look at others: `random_access` of them, or a group where that is longer, each;
+    all in one where it is 0."""
+    length = max(random_access, gop) if random_access else max(frame_count, 1)
+    return [range(a, min(a + length, frame_count)) for a in range(0, frame_count, length)]
 
 
 class _Run:
@@ -197,7 +213,8 @@ class _Run:
 
     def group(self, frames: range) -> Group:
         """Trains one group; it ends before `frames` does where the Gaussians no longer serve."""
-        track = _Track([], [])
+        track = _Track()
+        self.views.restart()
         if self.subject is not None:
             self._follow(frames, track)
         parents = np.arange(len(self.subject.tracker.own), dtype=np.int32) if track.models else None
@@ -221,21 +238,21 @@ class _Run:
         radius = subject_radius(model.params["means"].numpy())
         on_step = self._report(f"keyframe {frame}")
         loss = train_keyframe(model, self.views, frame, s, steps=s.keyframe_steps, radius=radius, on_step=on_step)
-        return Subject(Tracker(model, self.views, s, radius), loss)
+        return Subject(Tracker(model, self.views, s, radius, loss, Changes.since(self.views, frame)), loss)
 
     def _follow(self, frames: range, track: _Track) -> None:
         """Adds the frames to `track` until the subject is lost."""
         subject = self.subject
         for frame in frames:
             loss = subject.tracker.advance(frame, self._report(f"track {frame}"))
-            if loss > self.settings.cut_ratio * subject.loss:
+            if loss is not None and loss > self.settings.cut_ratio * subject.loss + CUT_FLOOR:
                 break
             track.add(subject.tracker)
 
     def _finetuned(self, subject: Subject, frames: range, track: _Track) -> GroupModel:
         radius = subject.tracker.radius
         steps = steps_for(self.settings.quality, radius)
-        model = GroupModel(subject.tracker.graph, subject.canonical, track.models, track.poses, steps)
+        model = GroupModel(subject.tracker.graph, subject.canonical, track.models, track.poses, steps, track.moved())
         on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
         finetune(model, self.views, frames, self.settings, radius=radius, on_step=on_step)
         return model
@@ -243,11 +260,17 @@ class _Run:
 
 @dataclass
 class _Track:
-    """Frame by frame the Gaussians and the nodes."""
+    """Frame by frame the Gaussians, the nodes, and which Gaussians tracking has touched ([N] bool)."""
 
-    models: list[Model]
-    poses: list[Pose]
+    models: list[Model] = field(default_factory=list)
+    poses: list[Pose] = field(default_factory=list)
+    moving: list[torch.Tensor] = field(default_factory=list)
 
     def add(self, tracker: Tracker) -> None:
         self.models.append(tracker.model)
         self.poses.append(tracker.pose)
+        self.moving.append(tracker.moving)
+
+    def moved(self) -> torch.Tensor:
+        """[N] bool: touched in any frame."""
+        return torch.stack(self.moving).any(0)

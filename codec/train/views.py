@@ -57,6 +57,11 @@ class Views:
         self._held.move_to_end(key)
         return self._held[key]
 
+    def restart(self) -> None:
+        """Draws anew, as a run that goes on from here will."""
+        self._order.clear()
+        self._rounds.clear()
+
     def draw(self, frame: int, scale: float = 1.0) -> Target:
         """The next view of `frame`; every camera once before any comes again, in an order that depends on the frame
         and not on what was drawn before (a resumed run draws the same)."""
@@ -105,9 +110,9 @@ def shrink(target: Target, scale: float) -> Target:
 
 
 def compare(params: dict, target: Target, settings: TrainSettings, rng, workspace: Workspace) -> RenderLoss:
-    """Loss of Gaussians (see `render_loss`) against a target; behind a mask the background is random in each step, so
-    that opacity is learned and not painted."""
-    background = rng.uniform(0, 1, 3) if target.alpha is not None else np.zeros(3)
+    """Loss of Gaussians (see `render_loss`) against a target; the background is random in each step, so that opacity is
+    learned and not painted."""
+    background = rng.uniform(0, 1, 3)
     return render_loss(
         {name: p.detach() for name, p in params.items()},
         target.camera,

@@ -1,0 +1,204 @@
+"""Small captures with exact ground truth: balls and boxes that move, traced ray by ray. Nothing here is a Gaussian.
+
+A `Scene` says what there is at a frame, in which light, and what is wrong with its cameras; `capture` makes it a
+Capture whose images are traced on demand. Metres, z upwards, the subject about 1.3 m tall around the origin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from gscodec.camera import Camera, look_at
+from gscodec.capture import Capture, View
+
+SAMPLES = 3  # rays along each side of a pixel
+FOCAL = 1.9  # widths
+DISTANCE = 3.0
+HEIGHTS = (-0.3, 0.5, 1.3)  # of the rings of cameras
+AMBIENT = 0.45
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A unit ball or a cube of side 2 under x -> A x + b, in a colour that a pattern of waves varies.
+
+    Attributes:
+        ball: else a box.
+        A: [3, 3]; b: [3]: local to world.
+        color: [3] 0..1.
+        pattern: depth of the texture, 0 for none.
+    """
+
+    ball: bool
+    A: np.ndarray
+    b: np.ndarray
+    color: Sequence[float]
+    pattern: float = 0.6
+
+
+@dataclass(frozen=True)
+class Light:
+    """Parallel light from `direction` (any length) and some from everywhere, both of `color`."""
+
+    direction: Sequence[float] = (0.5, -0.6, 0.8)
+    color: Sequence[float] = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One capture.
+
+    Attributes:
+        shapes: what is there at a frame.
+        light: at a frame.
+        exposure: of the images of each training camera, a range (lowest, highest) of gains.
+        pose_noise: degrees and metres by which the calibration of each training camera is wrong.
+        masks: the views have alpha.
+    """
+
+    shapes: Callable[[int], list[Shape]]
+    light: Callable[[int], Light] = lambda t: Light()
+    frames: int = 12
+    train: int = 12
+    test: int = 2
+    size: int = 128
+    exposure: tuple[float, float] = (1.0, 1.0)
+    pose_noise: tuple[float, float] = (0.0, 0.0)
+    masks: bool = True
+
+    def capture(self, name: str) -> Capture:
+        """The scene as its cameras see it."""
+        true = _rig(self.train, self.test, self.size)
+        rng = np.random.default_rng(0)
+        told = [_disturbed(c, *self.pose_noise, rng) if c.split == "train" else c for c in true]
+        gains = np.where([c.split == "train" for c in true], rng.uniform(*self.exposure, len(true)), 1)
+
+        @cache
+        def read(camera: int, frame: int) -> View:
+            rgba = trace(self.shapes(frame), self.light(frame), true[camera])
+            rgb, alpha = rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6), rgba[..., 3]
+            if not self.masks:
+                return View(_u8(gains[camera] * rgba[..., :3]))
+            return View(_u8(gains[camera] * rgb), _u8(alpha))
+
+        return Capture(name, 25.0, told, self.frames, self.masks, read)
+
+
+def _u8(x: np.ndarray) -> np.ndarray:
+    return np.rint(255 * x.clip(0, 1)).astype(np.uint8)
+
+
+def _rig(train: int, test: int, size: int) -> list[Camera]:
+    """Training cameras on three rings, test cameras between them."""
+    K = np.array([[FOCAL * size, 0, size / 2], [0, FOCAL * size, size / 2], [0, 0, 1]])
+
+    def camera(name: str, angle: float, z: float, split: str) -> Camera:
+        across = np.sqrt(DISTANCE**2 - z**2)
+        eye = np.array([across * np.cos(angle), across * np.sin(angle), z])
+        return Camera(name, K, look_at(eye, np.zeros(3), (0, 0, 1)), size, size, split=split)
+
+    turn = 2 * np.pi / train
+    cameras = [camera(f"cam{i:02}", i * turn, HEIGHTS[i % len(HEIGHTS)], "train") for i in range(train)]
+    for i in range(test):
+        angle = (0.5 + i * train / test) * turn
+        cameras.append(camera(f"test{i}", angle, 0.2 + 0.4 * i, "test"))
+    return cameras
+
+
+def _disturbed(camera: Camera, degrees: float, metres: float, rng: np.random.Generator) -> Camera:
+    """Its calibration with a wrong rotation and place, of these sizes, in random directions."""
+    axis, shift = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+    wrong = np.eye(4)
+    wrong[:3, :3] = rotation(axis, np.radians(degrees))
+    wrong[:3, 3] = metres * shift
+    return replace(camera, viewmat=wrong @ camera.viewmat)
+
+
+def rotation(axis: Sequence[float], angle: float) -> np.ndarray:
+    """[3, 3] about a unit `axis`, radians (Rodrigues)."""
+    x, y, z = axis
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+
+
+def trace(shapes: Sequence[Shape], light: Light, camera: Camera) -> np.ndarray:
+    """[H, W, 4] f32, premultiplied, 0..1: what the camera sees, the mean of `SAMPLES`^2 rays a pixel."""
+    w, h, R = camera.width, camera.height, camera.viewmat[:3, :3].astype(np.float32)
+    x = ((np.arange(SAMPLES * w) + 0.5) / SAMPLES - camera.K[0, 2]) / camera.K[0, 0]
+    y = ((np.arange(SAMPLES * h) + 0.5) / SAMPLES - camera.K[1, 2]) / camera.K[1, 1]
+    rays = x[:, None].astype(np.float32) * R[0] + (y[:, None].astype(np.float32) * R[1] + R[2])[:, None]
+    rays = rays.reshape(-1, 3)  # [P, 3], of depth 1
+    squares = np.einsum("ij,ij->i", rays, rays)
+    nearest = np.full(len(rays), np.inf, np.float32)
+    out = np.zeros((len(rays), 4), np.float32)
+    for shape in shapes:
+        index, depth, color = _seen(shape, light, camera.center, rays, squares)
+        closer = depth < nearest[index]
+        index = index[closer]
+        nearest[index] = depth[closer]
+        out[index, :3], out[index, 3] = color[closer], 1
+    return out.reshape(h, SAMPLES, w, SAMPLES, 4).mean(3).mean(1)
+
+
+def _seen(shape: Shape, light: Light, eye: np.ndarray, rays: np.ndarray, squares: np.ndarray) -> tuple:
+    """Which rays ([P, 3], of squared lengths [P]) meet the shape: their indices [R], how far along, and the colours."""
+    into = np.linalg.inv(shape.A)
+    radius = np.linalg.norm(shape.A, 2) * (1 if shape.ball else np.sqrt(3))
+    to = shape.b - eye
+    along = rays @ to.astype(np.float32)
+    near = along**2 >= np.float32(to @ to - radius**2) * squares  # rays that pass the bounding sphere
+    index = np.flatnonzero(near)
+    o, d = (-into @ to).astype(np.float32), rays[index] @ into.T.astype(np.float32)
+    depth, normal = (_ball if shape.ball else _box)(o, d)
+    hit = np.isfinite(depth) & (depth > 0)
+    index, depth, normal = index[hit], depth[hit], normal[hit]
+    local = o + depth[:, None] * d[hit]
+    normal = normal @ into
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    toward = np.asarray(light.direction) / np.linalg.norm(light.direction)
+    shade = AMBIENT + (1 - AMBIENT) * (normal @ toward).clip(0)
+    color = np.asarray(shape.color) * _pattern(local, shape.pattern) * shade[:, None] * light.color
+    return index, depth, color.clip(0, 1).astype(np.float32)
+
+
+def _ball(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (inf: missed) and normal where rays o + t d meet the unit ball."""
+    a, b, c = (d * d).sum(1), d @ o, o @ o - 1
+    root = b * b - a * c
+    depth = np.where(root >= 0, (-b - np.sqrt(root.clip(0))) / a, np.inf).astype(np.float32)
+    return depth, o + np.where(np.isfinite(depth), depth, 0)[:, None] * d
+
+
+def _box(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same for the cube from -1 to 1."""
+    d = np.where(np.abs(d) < 1e-9, np.float32(1e-9), d)
+    a, b = (-1 - o) / d, (1 - o) / d
+    enter, leave = np.minimum(a, b), np.maximum(a, b)
+    depth = np.where(enter.max(1) < leave.min(1), enter.max(1), np.inf)
+    normal = np.zeros_like(d)
+    face = enter.argmax(1)
+    rows = np.arange(len(d))
+    normal[rows, face] = -np.sign(d[rows, face])
+    return depth, normal
+
+
+def _pattern(x: np.ndarray, depth: float) -> np.ndarray:
+    """[R, 3] gains around 1, waves across the shape that differ by colour."""
+    if not depth:
+        return np.ones_like(x)
+    waves = [np.sin(5 * x[:, 0] + 3 * x[:, 2] + c) * np.sin(6 * x[:, 1] - 4 * x[:, 2] + 2 * c) for c in range(3)]
+    return 1 + depth * np.stack(waves, 1)
+
+
+def placed(ball: bool, half: Sequence[float], at: Sequence[float], color: Sequence[float], **options) -> Shape:
+    """An upright shape of half sizes `half` around `at`."""
+    return Shape(ball, np.diag(np.asarray(half, float)), np.asarray(at, float), color, **options)
+
+
+def moved(shapes: Sequence[Shape], turn: np.ndarray, shift: Sequence[float] = (0, 0, 0)) -> list[Shape]:
+    """All of them turned about the origin, then shifted."""
+    return [replace(s, A=turn @ s.A, b=turn @ s.b + np.asarray(shift, float)) for s in shapes]

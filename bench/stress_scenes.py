@@ -1,0 +1,100 @@
+"""The stress cases: procedural captures of what breaks 4D methods, each one thing at a time on the same subject."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gscodec.bench.procedural import Light, Scene, Shape, moved, placed, rotation
+
+UP = (0, 0, 1)
+SKIN, SHIRT, BELT = (0.8, 0.55, 0.4), (0.25, 0.4, 0.75), (0.8, 0.7, 0.2)
+
+
+def figure(swing: float = 0.0, pattern: float = 0.6) -> list[Shape]:
+    """A torso, a head and two arms that are `swing` radians forward and back."""
+    shapes = [
+        placed(True, (0.27, 0.19, 0.42), (0, 0, 0), SHIRT, pattern=pattern),
+        placed(False, (0.12, 0.12, 0.13), (0, 0, 0.52), SKIN, pattern=pattern),
+        placed(True, (0.28, 0.2, 0.08), (0, 0, -0.18), BELT, pattern=pattern),
+    ]
+    for side in (-1, 1):
+        arm = placed(True, (0.07, 0.07, 0.3), (0, 0, -0.25), SKIN, pattern=pattern)
+        shapes += moved([arm], rotation((1, 0, 0), side * swing), (0.34 * side, 0, 0.25))
+    return shapes
+
+
+def turned(shapes: list[Shape], angle: float, shift=(0, 0, 0)) -> list[Shape]:
+    """About the vertical axis, radians."""
+    return moved(shapes, rotation(UP, angle), shift)
+
+
+def walking(t: int, speed: float = 1.0) -> list[Shape]:
+    """The figure turns 4 degrees a frame, drifts 1.5 cm, its arms swing."""
+    shift = (0.015 * speed * t - 0.09 * speed, 0.01 * np.sin(0.8 * t), 0)
+    return turned(figure(0.5 * np.sin(0.5 * speed * t)), 0.07 * speed * t, shift)
+
+
+def racing(t: int) -> list[Shape]:
+    """35 degrees and up to 30 cm a frame."""
+    place = (0.4 * np.cos(0.7 * t), 0.4 * np.sin(0.7 * t), 0.15 * np.sin(1.9 * t))
+    return turned(figure(1.2 * np.sin(1.4 * t)), 0.61 * t, place)
+
+
+def visited(t: int) -> list[Shape]:
+    """A crate is there from frame 4 to 7, beside the figure and out of nowhere."""
+    crate = placed(False, (0.18, 0.18, 0.18), (-0.55, 0.35, -0.2), (0.75, 0.3, 0.25))
+    return walking(t) + ([crate] if 4 <= t < 8 else [])
+
+
+def dimmed(t: int) -> Light:
+    """From white to a third of it and red, while it swings round."""
+    s = t / 11
+    return Light((0.5 - 1.2 * s, -0.6 + s, 0.8), (1 - 0.55 * s, 1 - 0.75 * s, 1 - 0.8 * s))
+
+
+def rods(t: int) -> list[Shape]:
+    """A lattice of rods 1.6 cm across, about a pixel, that turns."""
+    shapes = [placed(True, (0.07, 0.07, 0.07), (0, 0, 0), BELT)]
+    for i in range(6):
+        angle = np.pi * i / 6
+        lying = placed(False, (0.008, 0.008, 0.55), (0, 0, 0), SKIN if i % 2 else SHIRT)
+        shapes += moved([lying], rotation((np.cos(angle), np.sin(angle), 0), 1.0))
+    return turned(shapes, 0.07 * t)
+
+
+def sometimes(t: int) -> list[Shape]:
+    """Nothing in the first two frames and in frames 6 to 8."""
+    return [] if t < 2 or 6 <= t < 9 else walking(t)
+
+
+def cut(t: int) -> list[Shape]:
+    """Another subject from frame 6 on."""
+    if t < 6:
+        return walking(t)
+    colors = ((0.3, 0.7, 0.35), (0.75, 0.35, 0.6), (0.85, 0.8, 0.7))
+    stack = [placed(i == 1, (0.3 - 0.08 * i,) * 3, (0, 0, 0.45 * i - 0.4), c) for i, c in enumerate(colors)]
+    return turned(stack, 0.07 * t)
+
+
+def on_a_floor(t: int) -> list[Shape]:
+    """The figure on a floor, without masks."""
+    return [*turned(figure(), 0.07 * t), placed(False, (1.5, 1.5, 0.02), (0, 0, -0.45), (0.5, 0.5, 0.45))]
+
+
+SCENES = {
+    "plain": Scene(walking),
+    "fast motion": Scene(racing),
+    "appears and disappears": Scene(visited),
+    "light change": Scene(lambda t: walking(t, 0.3), dimmed),
+    "exposure by camera": Scene(walking, exposure=(0.7, 1.3)),
+    "4 cameras": Scene(walking, train=4, test=2),
+    "noisy poses": Scene(walking, pose_noise=(0.5, 0.005)),
+    "thin structure": Scene(rods),
+    "no texture": Scene(lambda t: turned(figure(0.5 * np.sin(0.5 * t), pattern=0), 0.07 * t)),
+    "empty frames": Scene(sometimes),
+    "one frame": Scene(walking, frames=1),
+    "scene cut": Scene(cut),
+    "200 frames": Scene(lambda t: walking(t % 100, 0.2), frames=200, size=64),
+    "static": Scene(lambda t: figure()),
+    "no masks": Scene(on_a_floor, masks=False),
+}

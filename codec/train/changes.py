@@ -1,0 +1,80 @@
+"""What moves: pixels that have changed since the Gaussians last looked at them, and the Gaussians behind these.
+
+In: the pictures of a frame. Out: [N] bool, Gaussians that may have to move or change. The others are frozen while the
+frame is fitted, so that a still background costs its keyframe and nothing more, and does not flicker. Each camera keeps
+a picture of what was fitted last, pixel by pixel: a slow drift adds up until it is seen.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gscodec.train.carve import project
+
+WIDTH = 256  # pixels of the pictures that are compared: noise averages out
+THRESHOLD = 6.0  # grey levels, after a mean over 3 x 3; sensors and path tracers stay below
+MARGIN = 0.02  # of the width: what is near a change may move with it, also where it has no texture
+SEEN_SHARE = 0.5  # of the cameras that see a Gaussian, that must see a change there
+
+
+class Changes:
+    """Follows the pictures of the training cameras of `views`.
+
+    Args:
+        fitted: [h, w, 3] u8 of each training camera: what the Gaussians show, as of `pictures`.
+    """
+
+    def __init__(self, views, fitted: list[np.ndarray]):
+        self.views, self.fitted = views, fitted
+
+    @staticmethod
+    def since(views, frame: int) -> Changes:
+        """Everything is fitted to `frame`."""
+        changes = Changes(views, [])
+        changes.fitted = [changes._picture(i, frame) for i in views.train_cameras]
+        return changes
+
+    def _picture(self, camera: int, frame: int) -> np.ndarray:
+        """[h, w, 3] u8, small, over mid-grey."""
+        import cv2
+
+        view = self.views.capture.view(camera, frame)
+        rgb = view.rgb.astype(np.float32)
+        if view.alpha is not None:
+            rgb = 127.5 + (rgb - 127.5) * (view.alpha[..., None] / np.float32(255))
+        height, width = rgb.shape[:2]
+        scale = min(1.0, WIDTH / width)
+        size = (max(1, round(scale * width)), max(1, round(scale * height)))
+        return np.rint(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)).astype(np.uint8)
+
+    def advance(self, frame: int) -> list[np.ndarray]:
+        """[h, w] bool of each training camera: what `frame` shows otherwise than the fitted pictures, and what is near
+        it. The changes count as fitted from now on."""
+        import cv2
+
+        masks = []
+        for camera, fitted in zip(self.views.train_cameras, self.fitted, strict=True):
+            now = self._picture(camera, frame)
+            difference = cv2.blur(now.astype(np.float32) - fitted, (3, 3))
+            changed = np.abs(difference).max(2) > THRESHOLD
+            fitted[changed] = now[changed]
+            size = 2 * round(MARGIN * now.shape[1]) + 1
+            near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+            masks.append(cv2.dilate(changed.astype(np.uint8), near) > 0)
+        return masks
+
+    def behind(self, masks: list[np.ndarray], means: np.ndarray, visible: list[np.ndarray]) -> np.ndarray:
+        """[N] bool: Gaussians at `means` ([N, 3]) that enough of the cameras that see them have in changed pixels.
+
+        Args:
+            masks: of `advance`; visible: [N] bool of each training camera.
+        """
+        seen, hit = np.zeros(len(means), np.int32), np.zeros(len(means), np.int32)
+        for camera, mask, clear in zip(self.views.train_cameras, masks, visible, strict=True):
+            height, width = mask.shape
+            p, depth = project(self.views.capture.cameras[camera].resized(width, height), means)
+            x, y = np.floor(p).astype(np.int64).T
+            on = np.flatnonzero(clear & (depth > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height))
+            seen[on] += 1
+            hit[on] += mask[y[on], x[on]]
+        return (hit > 0) & (hit >= SEEN_SHARE * seen)

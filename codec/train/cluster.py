@@ -1,0 +1,87 @@
+"""Training on a Ray cluster: one job per segment of `random_access` frames, the groups of a local run in its order.
+
+A segment is an independent group with the groups that follow it, and depends on nothing else (train.py). A job opens
+the capture by its path, so the machines of the cluster share the files. Needs the extra `ray`.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Iterator
+
+from gscodec.errors import UsageError, require
+from gscodec.gaussians import Group
+from gscodec.train.settings import TrainSettings
+from gscodec.train.train import segments, train_groups
+
+CPUS = 2  # of a job, and its threads: segments side by side pay better than more threads in one
+RETRIES = 5  # of a segment whose worker died
+
+
+def cluster_groups(
+    address: str,
+    open_capture: Callable,
+    settings: TrainSettings,
+    random_access: int,
+    *,
+    first_frame: int = 0,
+    on_progress: Callable[[int], None] | None = None,
+) -> Iterator[Group]:
+    """Yields what `train_groups` does.
+
+    Args:
+        address: of the cluster, as `ray.init` takes it ("auto", "ray://host:10001"); "local" starts one here.
+        open_capture: () -> Capture, anywhere in the cluster.
+        first_frame: where an earlier run stopped; the segment that it stopped in is trained again as a whole.
+        on_progress: called with the number of frames done.
+
+    Raises:
+        UsageError: Ray is not installed, or the cluster cannot be reached or lost a segment again and again.
+    """
+    ray = require("ray", "training on a cluster", "ray")
+    try:
+        _knock(address)
+        ray.init(address, log_to_driver=False)
+    except (OSError, ValueError) as e:
+        raise UsageError(f"--ray {address}: no cluster there ({e}); start one with: ray start --head") from e
+    try:
+        left = [s for s in segments(open_capture().frame_count, settings.gop, random_access) if s.stop > first_frame]
+        cpus = int(min(CPUS, max(node["Resources"].get("CPU", 1) for node in ray.nodes())))
+        threads = {"env_vars": {"RAYON_NUM_THREADS": str(cpus)}}
+        job = ray.remote(num_cpus=cpus, max_retries=RETRIES, runtime_env=threads)(train_segment)
+        pending = [job.remote(open_capture, settings, random_access, s) for s in left]
+        for segment in left:
+            done = segment.start
+            for group in ray.get(pending.pop(0)):
+                if done >= first_frame:
+                    yield group
+                done += len(group)
+            if on_progress:
+                on_progress(done)
+    except ray.exceptions.RayTaskError as e:
+        raise e.cause from None
+    except ray.exceptions.WorkerCrashedError:
+        message = f"its worker died {RETRIES + 1} times; look into the cluster's logs (memory?), then run again"
+        raise UsageError(f"--ray {address}: frames {segment.start} to {segment.stop - 1}: {message}") from None
+    finally:
+        ray.shutdown()  # ends what is still running
+
+
+def _knock(address: str) -> None:
+    """Raises OSError where nobody listens; Ray itself would try for ten minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if port.isdigit():
+        socket.create_connection((host, int(port)), timeout=10).close()
+
+
+def train_segment(open_capture: Callable, settings: TrainSettings, random_access: int, frames: range) -> list[Group]:
+    """One job: the groups of a segment."""
+    done, groups = (
+        frames.start,
+        train_groups(open_capture(), settings, first_frame=frames.start, random_access=random_access),
+    )
+    found = []
+    while done < frames.stop:
+        found.append(next(groups))
+        done += len(found[-1])
+    return found

@@ -1,0 +1,106 @@
+"""`gscodec` in a process that stops itself at a named moment, and a capture for it to work on.
+
+Moments are (where, n): the n-th step of a stage of training ("keyframe", "track", "fine-tune"), or half-way through
+the n-th write of a file ("state", "checkpoint", "fragment", "index", "sequence").
+"""
+
+import json
+import os
+import signal
+import sys
+from multiprocessing import get_context
+
+import cv2
+import numpy as np
+import scipy.spatial  # noqa: F401
+import torch._dynamo  # noqa: F401  (what an optimizer imports; here it is imported once, not in every process)
+
+from gscodec import _native, part_file, progress
+from gscodec.bench.procedural import Scene
+from gscodec.bench.stress_scenes import walking
+from gscodec.cli import main
+from gscodec.encode import encode, importance, writer
+from gscodec.splats import sequence_writer
+from gscodec.train import settings, train
+
+TINY = {"keyframe_steps": 40, "motion_steps": 8, "finetune_steps": 4, "gaussians_max": 200, "initial_points": 150}
+GL = np.diag([1.0, -1, -1, 1])
+
+
+def write_capture(folder, frames=7):
+    """A walking figure, 6 cameras, as transforms.json and PNG files."""
+    capture = Scene(walking, frames=frames, train=5, test=1, size=48).capture("walking")
+    first, entries = capture.cameras[0], []
+    for i, camera in enumerate(capture.cameras):
+        for t in range(frames):
+            view, name = capture.view(i, t), f"{camera.name}_{t}.png"
+            cv2.imwrite(str(folder / name), np.dstack([view.rgb[..., ::-1], view.alpha]))
+            pose = (np.linalg.inv(camera.viewmat) @ GL).tolist()
+            entry = {"file_path": name, "camera": camera.name, "frame": t, "split": camera.split}
+            entries.append(entry | {"transform_matrix": pose})
+    head = {"w": 48, "h": 48, "fl_x": first.K[0, 0], "cx": first.K[0, 2], "cy": first.K[1, 2], "fps": 25}
+    (folder / "transforms.json").write_text(json.dumps(head | {"frames": entries}))
+
+
+def gscodec(*args, at=None, by=signal.SIGKILL) -> int:
+    """Runs the command line, which gets the signal `by` at the moment `at`; returns the exit code, negative for a
+    signal."""
+    context = get_context("forkserver")
+    context.set_forkserver_preload(["interrupting"])  # torch is slow to import
+    process = context.Process(target=_run, args=([str(a) for a in args], at, by))
+    process.start()
+    process.join()
+    return process.exitcode
+
+
+def _run(args: list[str], at: tuple[str, int] | None, by: int) -> None:
+    settings.PRESETS["fast"], importance.SIZE = TINY, 128
+    if at:
+        _arm(*at, lambda: os.kill(os.getpid(), by))
+    sys.argv = ["gscodec", *args]
+    main()
+
+
+def _arm(where: str, n: int, stop) -> None:
+    left = [n]
+
+    def arrived(here: str) -> bool:
+        left[0] -= here == where
+        return here == where and left[0] == 0
+
+    class Stopping(progress.Bar):
+        def update(self, stage, done, total):
+            if arrived(stage.split()[0]):
+                stop()
+
+    def half(name, write):
+        """`write(path, data)`, which stops half-way when it comes."""
+
+        def written(path, *data):
+            if arrived(name):
+                path.with_name(path.name + ".part").write_bytes(b"half of it")
+                stop()
+            return write(path, *data)
+
+        return written
+
+    class Fragments(writer.StreamWriter):
+        def append(self, payload, frames, *, sync, state):
+            if arrived("fragment"):
+                data = _native.fragment(payload, self.groups + 1, self.frames, frames, sync, self.config)
+                self._file.write(data[: len(data) // 2])
+                self._file.flush()
+                stop()
+            super().append(payload, frames, sync=sync, state=state)
+
+        def finish(self, **k):
+            if arrived("index"):
+                self.out.with_name(self.out.name + ".indexed").write_bytes(b"half of it")
+                stop()
+            super().finish(**k)
+
+    progress.Bar = Stopping
+    writer.write_arrays = half("state", part_file.write_arrays)
+    train.write_arrays = half("checkpoint", part_file.write_arrays)
+    sequence_writer.write_ply = half("sequence", sequence_writer.write_ply)
+    encode.StreamWriter = Fragments

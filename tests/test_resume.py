@@ -1,0 +1,91 @@
+"""Runs that are stopped at any moment: what is there plays, and what comes out in the end is what would have come."""
+
+import signal
+
+import numpy as np
+import pytest
+from interrupting import gscodec, write_capture
+
+from gscodec.decode import open_stream
+
+ENCODE = ("--preset", "fast", "--gop", "2")
+MOMENTS = [
+    ("keyframe", 20),
+    ("track", 5),
+    ("state", 2),
+    ("fine-tune", 5),
+    ("fragment", 1),
+    ("checkpoint", 2),
+    ("fragment", 2),
+    ("index", 1),
+]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """The capture's folder, with the stream and the .ply folder of undisturbed runs."""
+    folder = tmp_path_factory.mktemp("walking")
+    write_capture(folder)
+    assert gscodec("encode", folder, folder / "whole.gsv", *ENCODE) == 0
+    return folder
+
+
+def same(folder, stream):
+    assert stream.read_bytes() == (folder / "whole.gsv").read_bytes()
+    left = [p.name for p in stream.parent.iterdir()]
+    assert left == [stream.name], "nothing is left over"
+
+
+def test_groups_are_predicted(capture):
+    """What the other tests here are worth: there is state to be kept from group to group."""
+    assert [g["sync"] for g in open_stream(capture / "whole.gsv").groups][:3] == [True, False, False]
+
+
+def test_killed_again_and_again(capture, tmp_path):
+    out, frames = tmp_path / "a.gsv", 0
+    for at in MOMENTS:
+        assert gscodec("encode", capture, out, *ENCODE, at=at) == -signal.SIGKILL, at
+        assert not out.exists()
+        part = open_stream(tmp_path / "a.gsv.part")
+        assert part.frame_count >= frames, "nothing that was done is lost"
+        frames = part.frame_count
+        if frames:
+            assert len(part.frame(frames - 1)) > 50
+    assert frames == 7
+    assert gscodec("encode", capture, out, *ENCODE) == 0
+    same(capture, out)
+
+
+def test_ctrl_c_leaves_a_file_that_plays(capture, tmp_path):
+    out = tmp_path / "a.gsv"
+    assert gscodec("encode", capture, out, *ENCODE, at=("fragment", 2), by=signal.SIGINT) == 130
+    stream = open_stream(out)
+    assert stream.complete
+    assert 0 < stream.frame_count < 7
+    np.testing.assert_array_equal(stream.frame(0).means, open_stream(capture / "whole.gsv").frame(0).means)
+    assert gscodec("encode", capture, out, *ENCODE) == 0
+    same(capture, out)
+
+
+def test_other_settings_start_anew_beside_old_checkpoints(capture, tmp_path):
+    out = tmp_path / "a.gsv"
+    assert gscodec("encode", capture, out, *ENCODE, "--quality", "80", at=("fragment", 3)) == -signal.SIGKILL
+    assert gscodec("encode", capture, out, *ENCODE) == 0
+    same(capture, out)
+
+
+def test_train_goes_on(capture, tmp_path):
+    whole, folder = tmp_path / "whole", tmp_path / "plys"
+    assert gscodec("train", capture, whole, *ENCODE) == 0
+    for at in (("sequence", 4), ("checkpoint", 2)):
+        assert gscodec("train", capture, folder, *ENCODE, at=at) == -signal.SIGKILL, at
+    assert gscodec("train", capture, folder, *ENCODE) == 0
+    files = sorted(p.name for p in whole.iterdir())
+    assert sorted(p.name for p in folder.iterdir()) == files
+    for name in files:
+        if name.endswith(".npz"):
+            with np.load(whole / name) as a, np.load(folder / name) as b:
+                assert all(np.array_equal(a[k], b[k]) for k in a)
+        else:
+            assert (whole / name).read_bytes() == (folder / name).read_bytes(), name
+    assert "sequence.json" in files
