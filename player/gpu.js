@@ -80,7 +80,7 @@ export class Gpu {
     await xr.setSession(session);
     this.#head = new this.#spark.PerspectiveCamera();
     const { Matrix4 } = this.#spark;
-    this.#world.matrix.copy(this.#toCamera(view)).premultiply(new Matrix4().makeScale(metres, metres, metres));
+    this.#place(this.#toCamera(view).premultiply(new Matrix4().makeScale(metres, metres, metres)));
     this.#sorter.autoUpdate = true;
     this.#renderer.setAnimationLoop(() => {
       tick();
@@ -88,10 +88,15 @@ export class Gpu {
     });
     session.addEventListener("end", () => {
       this.#renderer.setAnimationLoop(null);
-      this.#world.matrix.identity();
+      this.#place(new Matrix4());
       this.#sorter.autoUpdate = xr.enabled = false;
       this.#head = null;
     });
+  }
+
+  #place(matrix) {
+    this.#world.matrix.copy(matrix);
+    this.#scene.updateMatrixWorld(true); // Spark looks before the next rendering does it
   }
 
   // Where the head is, in units of the scene; null outside of a session.
