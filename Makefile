@@ -33,7 +33,7 @@ test: venv lint browser
 ifdef CI
 	$(BIN)/python player/build.py --committed
 endif
-	$(CARGO) test --release --quiet --workspace
+	$(CARGO) test --release --quiet --workspace --features bindings/wasm
 	$(BIN)/python -m pytest
 
 lint: venv
