@@ -6,7 +6,7 @@ NATIVE := $(shell find codec/native -name '*.rs' -not -path '*/target/*') codec/
 CARGO := cd codec/native && cargo
 DEMO := demo
 
-.PHONY: venv demo test lint format bench player browser clean
+.PHONY: venv demo test lint format bench player spark browser clean
 venv: $(VENV)/.done
 
 # Once: the environment. Again: only when dependencies or the native code change.
@@ -33,7 +33,7 @@ test: venv lint browser
 ifdef CI
 	$(BIN)/python player/build.py --committed
 endif
-	$(CARGO) test --release --quiet --workspace
+	$(CARGO) test --release --quiet --workspace --features bindings/wasm
 	$(BIN)/python -m pytest
 
 lint: venv
@@ -50,6 +50,10 @@ format: venv
 # The web player's decoder: codec/native -> player/native.wasm, which is committed.
 player:
 	$(PYTHON) player/build.py
+
+# The web player's GPU renderer: three.js and Spark -> player/spark.js, which is committed. Needs npm.
+spark:
+	$(PYTHON) player/build.py --spark
 
 # A Chromium for the tests of the player, which say that they are skipped where there is none (and fail if CI is set).
 browser:

@@ -16,8 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.bench.scenes import DISTANCE, FILES, capsule, capsule_camera, file_scene
+from gscodec.bench.scenes import DISTANCE, UP, capsule, capsule_camera, file_scene
 from gscodec.camera import Camera
+from gscodec.errors import UsageError
 from gscodec.gaussians import Gaussians
 from gscodec.render.image import render_image, render_rgba
 from gscodec.render.step import render_loss
@@ -40,11 +41,17 @@ class Case:
     distance: float = DISTANCE
     every: bool = False
 
-    def load(self, data: Path | None) -> tuple[Gaussians, Camera] | None:
-        """Gaussians and camera; None where the file is missing."""
+    def load(self, data: Path | None, work: Path) -> tuple[Gaussians, Camera]:
+        """Gaussians and camera.
+
+        Raises:
+            UsageError: the scene's files are missing.
+        """
         if self.scene == "capsule":
             return capsule(self.gaussians), capsule_camera(self.width, self.height, self.distance)
-        return file_scene(self.scene, data, self.width, self.height) if data else None
+        if data is None:
+            raise UsageError("there is no data folder, set --data or GSCODEC_DATA")
+        return file_scene(self.scene, data, work, self.width, self.height)
 
 
 ANCHORS = [Case("capsule", n, w, w, every=True) for n, w in ((20_000, 512), (50_000, 512), (100_000, 1024))]
@@ -54,7 +61,7 @@ PIXELS = [Case("capsule", 100_000, w, h) for w, h in ((512, 512), (1920, 1080), 
 COVERED = [Case("capsule", 50_000, 1024, 1024, d) for d in (1.2, 2.8, 6.0)]
 SPLATS = [Case("statue", 0, 1280, 720), Case("playbot", 0, 1280, 720), Case("lumberjack", 0, 512, 512)]
 CASES = [*ANCHORS, *GROWTH, *PIXELS, *COVERED, *SPLATS]
-SCENES = ("capsule", *FILES)
+SCENES = ("capsule", *UP)
 
 
 def measure(scene: str, gaussians: Gaussians, cam: Camera, simd: str, threads: int, repeats: int) -> dict:
@@ -100,6 +107,7 @@ def run(
     threads: list[int] | None = None,
     repeats: int = 15,
     data: Path | None = None,
+    work: Path = Path("build/bench"),
     say: Callable[[str], None] = lambda text: None,
 ) -> Iterator[dict]:
     """Yields the entries of all cases of `scenes`.
@@ -107,15 +115,17 @@ def run(
     Args:
         simd: levels of every case; None: all levels for the anchors, the fastest for the others.
         threads: numbers of threads of every case; None: 1 and all cores for the anchors, all cores for the others.
-        data: folder with the files of `scenes.FILES`; without it they are left out, which `say` is told.
+        data: folder with splats and captures; what is not there is left out, which `say` is told.
+        work: where the trained lumberjack is kept, see `sequences`.
     """
     cores = os.cpu_count() or 1
     for case in CASES:
         if case.scene not in scenes:
             continue
-        loaded = case.load(data)
-        if loaded is None:
-            say(f"{case.scene}: left out, {FILES[case.scene][0]} is not in the data folder")
+        try:
+            loaded = case.load(data, work)
+        except UsageError as e:
+            say(f"{case.scene}: left out, {e}")
             continue
         for level in simd or simd_levels()[: None if case.every else 1]:
             for count in threads or ([1, cores] if case.every and cores > 1 else [cores]):

@@ -7,17 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from gscodec.camera import Camera, look_at
+from gscodec.errors import UsageError
 from gscodec.gaussians import Gaussians
 from gscodec.render.movie import orbit_camera
 
 RADIUS, HEIGHT = 0.25, 1.8  # metres
 DISTANCE, FOCAL = 2.8, 1.4  # metres; image widths
 
-FILES = {  # scene -> file in the data folder, world axis that points up
-    "statue": ("splats/statue.ply", "-y"),
-    "playbot": ("splats/playbot.ply", "-y"),
-    "lumberjack": ("lumberjack.gsv", "z"),  # trained: what `gscodec encode lumberjack` makes
-}
+UP = {"statue": "-y", "playbot": "-y", "lumberjack": "z"}  # scene from files -> world axis that points up
 
 
 def capsule(n: int, seed: int = 0) -> Gaussians:
@@ -49,14 +46,20 @@ def capsule_camera(width: int, height: int, distance: float = DISTANCE) -> Camer
     return Camera("bench", K, look_at([0, 0, distance], [0, 0, 0], [0, 1, 0]), width, height)
 
 
-def file_scene(name: str, data: Path, width: int, height: int) -> tuple[Gaussians, Camera] | None:
-    """The Gaussians of a file in `data` and a camera that sees all of them; None if the file is not there."""
-    from gscodec.decode import open_stream
+def file_scene(name: str, data: Path, work: Path, width: int, height: int) -> tuple[Gaussians, Camera]:
+    """The Gaussians of a file in `data` (lumberjack: of the one trained in `work`) and a camera that sees them all.
+
+    Raises:
+        UsageError: the files are missing.
+    """
+    from gscodec.bench.sequences import open_case
     from gscodec.splats import open_sequence
 
-    file, up = FILES[name]
-    path = Path(data) / file
-    if not path.exists():
-        return None
-    gaussians = (open_stream(path) if path.suffix == ".gsv" else open_sequence(path)).frame(0)
-    return gaussians, orbit_camera(gaussians, up, 0.25, width, height)
+    if name == "lumberjack":
+        gaussians = open_case(name, data, work).frame(0)
+    else:
+        path = Path(data) / "splats" / f"{name}.ply"
+        if not path.exists():
+            raise UsageError(f"{path} is not there; the data folder (GSCODEC_DATA) must have it")
+        gaussians = open_sequence(path).frame(0)
+    return gaussians, orbit_camera(gaussians, UP[name], 0.25, width, height)

@@ -3,8 +3,9 @@
 One entry of bench/results/train.json per (case, recipe, preset): case, recipe, preset, seconds_per_frame, psnr,
 psnr_fg, ssim, gaussians, kb_per_frame, flicker, all on the test cameras. What gscodec trains is measured twice: before
 coding ("model", no size) and decoded from the stream ("gscodec"). "alone" trains a keyframe for every frame it is asked
-for, with the keyframe budget of the preset: what tracking is to be compared with. "v3" is V3's recipe at about the time
-that our preset medium takes (baselines/v3.py). Both have no size of their own.
+for, with the keyframe budget of the preset: what tracking is to be compared with; "alone-coded" is the same from our
+stream, every frame a group. "v3" is V3's recipe at about the time that our preset medium takes (baselines/v3.py),
+"v3-coded" the same through its own packing (baselines/videogs.py).
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from gscodec.errors import UsageError
 from gscodec.gaussians import Gaussians, Group
 
 RECIPES = ("gscodec", "alone", "v3")
+V3_PACKING = {"qp": 25, "raw": True}  # its default, in the better of its two forms
 KEYS = ("psnr", "psnr_fg", "ssim", "gaussians", "kb_per_frame", "flicker")
 
 
@@ -54,7 +56,7 @@ class Case:
         if not folder.is_dir():
             raise UsageError(f"{folder} does not exist")
         capture = open_capture(folder).frames(0, self.frames).scaled(self.scale)
-        return capture if not self.test else tested_on(capture, self.test)
+        return capture if not self.test else held_out(capture, self.test)
 
 
 CASES = {
@@ -65,7 +67,7 @@ CASES = {
 }
 
 
-def tested_on(capture: Capture, names: tuple[str, ...]) -> Capture:
+def held_out(capture: Capture, names: tuple[str, ...]) -> Capture:
     """The capture with the cameras `names` to test on and its other training cameras to train on."""
     unknown = set(names) - {c.name for c in capture.cameras}
     if unknown:
@@ -97,7 +99,7 @@ def measure(case: str, recipe: str, preset: str, frames: str | None, data: Path,
             "capture": case,
             "recipe": name,
             "preset": preset,
-            "quality": quality if name == "gscodec" else None,
+            "quality": quality if name in ("gscodec", "alone-coded") else None,
             "frames": [chosen.start, chosen.stop, chosen.step],
             "seconds_per_frame": round(seconds / len(chosen), 2),
             **{k: result[k] for k in KEYS},
@@ -117,14 +119,23 @@ def _ours(capture: Capture, frames: range, settings) -> Iterator[tuple]:
 def _alone(capture: Capture, frames: range, settings) -> Iterator[tuple]:
     models, seconds = every_frame_alone(capture, frames, settings)
     yield "alone", seconds, None, models
+    size, decoded, more = coded(part(capture, frames), [Group([g]) for g in models], settings)
+    yield "alone-coded", seconds + more, size, decoded
 
 
 def _v3(capture: Capture, frames: range, settings) -> Iterator[tuple]:
+    from gscodec.bench.baselines import videogs
     from gscodec.bench.baselines.v3 import train_v3
 
     start = time.perf_counter()
     models = train_v3(part(capture, frames), range(len(frames)), settings)
     yield "v3", time.perf_counter() - start, None, models
+    size, decoded = 0, []
+    for first in range(0, len(models), settings.gop):
+        files = videogs.encode(models[first : first + settings.gop], **V3_PACKING)
+        size += sum(map(len, files.values()))
+        decoded += videogs.decode(files)
+    yield "v3-coded", time.perf_counter() - start, size, decoded
 
 
 def sequence(capture: Capture, settings) -> tuple[list[Group], float]:

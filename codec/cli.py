@@ -266,7 +266,8 @@ def bench_raster(
     simd: Annotated[str | None, typer.Option(help="Comma-separated instruction sets.")] = None,
     threads: Annotated[str | None, typer.Option(help="Comma-separated numbers of threads.")] = None,
     repeats: Annotated[int, typer.Option(help="Runs of which the median counts.")] = 15,
-    data: Annotated[Path | None, typer.Option(envvar="GSCODEC_DATA", help="Folder with the splats' files.")] = None,
+    data: Annotated[Path | None, typer.Option(envvar="GSCODEC_DATA", help="Folder with captures and splats.")] = None,
+    work: Annotated[Path, typer.Option(help="Where the trained lumberjack is made and kept.")] = Path("build/bench"),
     out: Annotated[Path | None, typer.Option(help="Also write machine, commit, settings and entries here.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -280,7 +281,7 @@ def bench_raster(
             f"step {e['step_ms']:8.2f} ms"
         )
 
-    _show_entries(measure(scenes, simd, threads, repeats=repeats, data=data, out=out), as_json, line)
+    _show_entries(measure(scenes, simd, threads, repeats=repeats, data=data, work=work, out=out), as_json, line)
 
 
 @bench.command("rd")
@@ -329,13 +330,35 @@ def bench_train(
     def line(e: dict) -> str:
         size = "-" if e["kb_per_frame"] is None else f"{e['kb_per_frame']:.2f} kB/frame"
         return (
-            f"{e['capture']:<11}{e['recipe']:<8}{e['preset']:<7}{e['seconds_per_frame']:7.2f} s/frame  "
+            f"{e['capture']:<17}{e['recipe']:<12}{e['preset']:<7}{e['seconds_per_frame']:7.2f} s/frame  "
             f"{e['psnr_fg'] or e['psnr']:6.2f} dB  {e['gaussians']:>6} Gaussians  {size}"
         )
 
     _show_entries(
         measure(capture, recipe, preset=preset, frames=frames, quality=quality, data=data, out=out), as_json, line
     )
+
+
+@bench.command("ablation")
+def bench_ablation(
+    variant: Annotated[str | None, typer.Option(help="Comma-separated variants, see bench/ablation.py.")] = None,
+    preset: Preset = "fast",
+    quality: Quality = 50.0,
+    out: Annotated[Path, typer.Option(help="The result file; its other entries stay.")] = Path(
+        "bench/results/ablation.json"
+    ),
+    as_json: Json = False,
+) -> None:
+    """Training without one of its losses and tools at a time, on the bundled capture."""
+    from gscodec.commands import bench_ablation as measure
+
+    def line(e: dict) -> str:
+        return (
+            f"{e['variant']:<30}{e['preset']:<7}{e['psnr_fg']:6.2f} dB, coded {e['psnr_fg_coded']:6.2f} dB  "
+            f"{e['kb_per_frame']:6.2f} kB/frame  {e['seconds_per_frame']:6.2f} s/frame"
+        )
+
+    _show_entries(measure(variant, preset=preset, quality=quality, out=out), as_json, line)
 
 
 @bench.command("stress")

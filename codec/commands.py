@@ -258,7 +258,14 @@ def evaluate_stream(stream_path: Path, source: Path, *, split: str, frames: str 
 
 
 def bench_raster(
-    scenes: str | None, simd: str | None, threads: str | None, *, repeats: int, data: Path | None, out: Path | None
+    scenes: str | None,
+    simd: str | None,
+    threads: str | None,
+    *,
+    repeats: int,
+    data: Path | None,
+    work: Path,
+    out: Path | None,
 ) -> Iterator[dict]:
     """Yields what bench.raster measures (the lists are comma-separated, None: the usual ones), then writes it to `out`.
 
@@ -278,7 +285,7 @@ def bench_raster(
     }
     chosen["threads"] = [int(n) for n in chosen["threads"]] if chosen["threads"] else None
     entries = []
-    for entry in run(**chosen, data=data, say=lambda text: print(text, file=sys.stderr)):
+    for entry in run(**chosen, data=data, work=work, say=lambda text: print(text, file=sys.stderr)):
         entries.append(entry)
         yield entry
     if out:
@@ -321,6 +328,18 @@ def bench_train(
     for capture in _names("--capture", captures, CASES) or CASES:
         for recipe in _names("--recipe", recipes, RECIPES) or RECIPES:
             yield from update(out, measure(capture, recipe, preset, frames, data, quality))
+
+
+def bench_ablation(variants: str | None, *, preset: str, quality: float, out: Path) -> Iterator[dict]:
+    """Yields what bench.ablation measures (comma-separated variants, None: all), and puts it into `out` as it comes.
+
+    Raises:
+        UsageError: an unknown variant.
+    """
+    require("torch", "measuring training")
+    from gscodec.bench.ablation import VARIANTS, measure
+
+    yield from measure(_names("--variant", variants, VARIANTS) or list(VARIANTS), preset, quality, out)
 
 
 def bench_stress(cases: str | None, *, out: Path) -> Iterator[dict]:

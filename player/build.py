@@ -1,8 +1,9 @@
 """`make player`: codec/native -> player/native.wasm, and the hash of what it was built from (native.sha256).
+`make spark`: three.js and Spark, of the versions and hashes in spark/package-lock.json -> spark.js, and its hashes.
 
-Both are committed, so that a checkout and the wheel play without a wasm toolchain; a test fails when the hash is stale.
-Needs the wasm32-unknown-unknown target (rustup fetches it), or the sources of the standard library: where rustup cannot
-be used, Debian's rustc-web, cargo-web and rust-web-src will do.
+All are committed, so that a checkout and the wheel play offline and without toolchains; a test fails when a hash is
+stale. The first needs the wasm32-unknown-unknown target (rustup fetches it), or the sources of the standard library:
+where rustup cannot be used, Debian's rustc-web, cargo-web and rust-web-src will do. The second needs npm.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 PLAYER = Path(__file__).resolve().parent
 NATIVE = PLAYER.parent / "codec" / "native"
 TARGET = "wasm32-unknown-unknown"
 WASM, HASH = PLAYER / "native.wasm", PLAYER / "native.sha256"
+SPARK, SPARK_HASH = PLAYER / "spark.js", PLAYER / "spark.sha256"
 
 
 def source_hash() -> str:
@@ -73,13 +76,48 @@ def _remaps() -> list[str]:
     return [f"--remap-path-prefix={f}={'crates' if f != NATIVE else 'native'}" for f in folders]
 
 
+def spark_hashes() -> str:
+    """SHA-256 over what spark.js is made of, and of spark.js."""
+    digest = hashlib.sha256()
+    for f in sorted((PLAYER / "spark").iterdir()):
+        digest.update(f.name.encode() + b"\n" + f.read_bytes())
+    return f"{digest.hexdigest()} {hashlib.sha256(SPARK.read_bytes()).hexdigest()}"
+
+
+def build_spark() -> None:
+    """Builds spark.js, with the licences of what is in it on top.
+
+    Raises:
+        SystemExit: npm is missing or fails.
+    """
+    if not shutil.which("npm"):
+        sys.exit("error: npm was not found; spark.js is bundled with it (Debian: apt-get install npm)")
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.copytree(PLAYER / "spark", folder, dirs_exist_ok=True)
+        modules = Path(folder) / "node_modules"
+        subprocess.run(["npm", "ci", "--ignore-scripts", "--no-fund", "--no-audit"], cwd=folder, check=True)
+        names = ("three", "@sparkjsdev/spark")
+        licences = [f"{name}\n\n{(modules / name / 'LICENSE').read_text()}" for name in names]
+        banner = "/*! Bundled by `make spark` from:\n\n" + "\n".join(licences) + "*/"
+        command = [modules / ".bin" / "esbuild", "entry.js", "--bundle", "--minify", "--format=esm", "--target=es2022"]
+        command += [f"--banner:js={banner}", "--legal-comments=none", f"--outfile={SPARK}", "--log-level=error"]
+        subprocess.run(command, cwd=folder, check=True)
+    SPARK_HASH.write_text(spark_hashes() + "\n")
+    print(f"{SPARK.name}: {SPARK.stat().st_size / 1000:.0f} kB")
+
+
 def check_committed() -> None:
     """Raises SystemExit if the files in the repository are not those of its sources."""
     if not HASH.exists() or HASH.read_text().strip() != source_hash():
         sys.exit("error: player/native.wasm was built from other sources; run `make player` and commit player/native.*")
+    if not SPARK_HASH.exists() or SPARK_HASH.read_text().strip() != spark_hashes():
+        sys.exit("error: player/spark.js is not that of player/spark; run `make spark` and commit player/spark.*")
 
 
 if __name__ == "__main__":
-    if "--committed" in sys.argv[1:]:  # CI: the committed files must be current, and the tests run on rebuilt ones
-        check_committed()
-    build()
+    if "--spark" in sys.argv[1:]:
+        build_spark()
+    else:
+        if "--committed" in sys.argv[1:]:  # CI: the committed files must be current, and the tests run on rebuilt ones
+            check_committed()
+        build()

@@ -91,6 +91,25 @@ export class Camera {
     this.distance = clamp(this.distance / factor, 0.02 * this.radius, 50 * this.radius);
   }
 
+  // The view from the same side without looking up or down.
+  level() {
+    this.#leave();
+    const { pitch } = this;
+    this.pitch = 0;
+    const view = this.view(1000, 1000);
+    this.pitch = pitch;
+    return view;
+  }
+
+  // What an eye that may look anywhere around has before it: the target and far to the sides of it.
+  wide(eye) {
+    const z = scale(add(this.target, eye, -1), 1 / length(add(this.target, eye, -1)));
+    let x = cross(z, this.up);
+    x = length(x) > 1e-6 ? scale(x, 1 / length(x)) : this.side;
+    const rows = [x, cross(z, x), z].flatMap((axis) => [...axis, -dot(axis, eye)]);
+    return new Float32Array([1000, 1000, 200, 200, 500, 500, ...rows]);
+  }
+
   // width, height, fx, fy, cx, cy, 12 of world-to-camera: what the rasterizer takes.
   view(width, height) {
     const c = this.reference;

@@ -8,6 +8,7 @@ const ICONS = {
   loop: "M7 7h10v3l4-4-4-4v3H5v6h2zm10 10H7v-3l-4 4 4 4v-3h12v-6h-2z",
   reset: "M12 5V1L7 6l5 5V7a5 5 0 1 1-5 5H5a7 7 0 1 0 7-7z",
   stats: "M4 20h3V10H4zm6.5 0h3V4h-3zM17 20h3v-7h-3z",
+  vr: "M3 7h18v10h-6l-2-3h-2l-2 3H3zm4.5 3a2 2 0 1 0 0 4 2 2 0 0 0 0-4zm9 0a2 2 0 1 0 0 4 2 2 0 0 0 0-4z",
   full: "M5 5h5v2H7v3H5zm9 0h5v5h-2V7h-3zM5 14h2v3h3v2H5zm12 0h2v5h-5v-2h3z",
 };
 
@@ -18,7 +19,7 @@ const options = (list) => list.map(([value, text]) => `<option value="${value}">
 export const MARKUP = `
 <div class="frame">
   <div class="stage" tabindex="0" role="application" aria-label="Volumetric video: drag to turn, two fingers or right button to move, wheel or pinch to zoom">
-    <canvas></canvas>
+    <div class="view"><canvas></canvas></div>
     <pre class="stats" hidden></pre>
     <div class="notes" role="status"></div>
     <div class="busy" hidden></div>
@@ -34,10 +35,12 @@ export const MARKUP = `
     <select data-set="view" title="Camera" aria-label="Camera" hidden></select>
     <select data-set="speed" title="Speed" aria-label="Speed">${options([0.25, 0.5, 1, 2].map((v) => [v, `${v}×`]))}</select>
     <select data-set="layers" title="Layers" aria-label="Layers" hidden></select>
-    <select data-set="quality" title="Quality" aria-label="Quality">${options([["auto", "Auto"], [1, "Full"], [0.7, "70 %"], [0.5, "50 %"], [0.35, "35 %"]])}</select>
+    <select data-set="quality" title="Quality" aria-label="Quality">${options([["auto", "Auto quality"], [1, "Full"], [0.7, "70 %"], [0.5, "50 %"], [0.35, "35 %"]])}</select>
+    <select data-set="renderer" title="Drawn by" aria-label="Drawn by">${options([["auto", "CPU or GPU"], ["cpu", "CPU"], ["gpu", "GPU"]])}</select>
     ${button("loop", "Loop (L)", 'aria-pressed="false"')}
     ${button("reset", "Reset the camera (R)")}
     ${button("stats", "Statistics (S)", 'aria-pressed="false"')}
+    ${button("vr", "Virtual reality", "hidden")}
     ${button("full", "Full screen (F)")}
   </div>
 </div>`;
@@ -66,16 +69,16 @@ export function onKeys(host, act) {
   });
 }
 
-// Drags and wheel on the canvas; calls orbit(dx, dy), pan(dx, dy) in shares of the shorter side, zoom(factor).
-export function onDrag(canvas, { orbit, pan, zoom }) {
+// Drags and wheel on the picture; calls orbit(dx, dy), pan(dx, dy) in shares of the shorter side, zoom(factor).
+export function onDrag(view, { orbit, pan, zoom }) {
   const fingers = new Map();
-  const unit = () => Math.max(Math.min(canvas.clientWidth, canvas.clientHeight), 1);
-  canvas.addEventListener("pointerdown", (e) => {
-    canvas.setPointerCapture(e.pointerId);
+  const unit = () => Math.max(Math.min(view.clientWidth, view.clientHeight), 1);
+  view.addEventListener("pointerdown", (e) => {
+    view.setPointerCapture(e.pointerId);
     fingers.set(e.pointerId, e);
-    canvas.classList.add("dragging");
+    view.classList.add("dragging");
   });
-  canvas.addEventListener("pointermove", (e) => {
+  view.addEventListener("pointermove", (e) => {
     const before = fingers.get(e.pointerId);
     if (!before) return;
     const [dx, dy] = [(e.clientX - before.clientX) / unit(), (e.clientY - before.clientY) / unit()];
@@ -89,13 +92,13 @@ export function onDrag(canvas, { orbit, pan, zoom }) {
     fingers.set(e.pointerId, e);
   });
   for (const name of ["pointerup", "pointercancel"]) {
-    canvas.addEventListener(name, (e) => {
+    view.addEventListener(name, (e) => {
       fingers.delete(e.pointerId);
-      if (!fingers.size) canvas.classList.remove("dragging");
+      if (!fingers.size) view.classList.remove("dragging");
     });
   }
-  canvas.addEventListener("contextmenu", (e) => e.preventDefault());
-  canvas.addEventListener("wheel", (e) => {
+  view.addEventListener("contextmenu", (e) => e.preventDefault());
+  view.addEventListener("wheel", (e) => {
     e.preventDefault();
     zoom(Math.exp(-e.deltaY * (e.deltaMode ? 0.05 : 0.0015)));
   }, { passive: false });

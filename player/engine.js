@@ -1,9 +1,12 @@
 // From groups to pictures: which groups are fetched, decoded and held, which worker does what, and when a picture is whole.
 //
 //   source --payload--> group worker (decode, evaluate, project) --ellipses of a band--> raster worker --pixels--> canvas
+//                                                                \--what the view shows--> GPU, on a canvas above
 
-import { ALL, Native, load } from "./native.js";
+import { Gpu, gpuName } from "./gpu.js";
+import { ALL, AUTO, Native, load } from "./native.js";
 import { Ladder } from "./ladder.js";
+import { LayerChoice } from "./layers.js";
 import { Source } from "./source.js";
 
 const IN_FLIGHT = 2; // pictures at work: one is projected while the one before is blended
@@ -19,15 +22,19 @@ function start(url) {
 }
 
 export class Engine extends EventTarget {
-  groups = new Map(); // group -> {state: fetching | decoding | ready | failed, worker, header, abort}
+  groups = new Map(); // group -> {state: fetching | decoding | ready | failed, worker, header, layers, abort}
   failed = new Map(); // group -> message
-  layers = ALL; // of each group that are fetched and drawn
+  layers = AUTO; // of each group that are fetched and drawn
+  choice = new LayerChoice();
+  #chosen = new Map(); // sync group -> layers of it and of those predicted from it
   stats = { decode: 0, project: 0, blend: 0, gaussians: 0, link: 0 };
   #workers = [];
   #rasters = [];
   #pictures = new Map(); // id -> {bands, parts, ...}
   #next = 1;
   #shown = 0;
+  #gpu = null;
+  #how = "cpu";
 
   constructor(canvas, base, src) {
     super();
@@ -75,6 +82,51 @@ export class Engine extends EventTarget {
     this.source.close();
     for (const g of this.groups.values()) g.abort?.abort();
     for (const w of [...this.#workers, ...this.#rasters]) w.terminate();
+    this.#leaveGpu();
+  }
+
+  // Who draws from now on: "cpu", "gpu", or "auto", the GPU if there is a real one. Rejects if the GPU cannot be used.
+  async use(how) {
+    this.#how = how;
+    if (how === "cpu" || (how === "auto" && gpuName() === null)) return this.#leaveGpu();
+    if (this.#gpu) return;
+    const canvas = document.createElement("canvas");
+    canvas.hidden = true;
+    const [low, high] = [this.bounds.slice(0, 3), this.bounds.slice(3)];
+    const origin = low.map((v, i) => (v + high[i]) / 2);
+    const gpu = await Gpu.create(canvas, this.base, { origin, background: this.source.config.background });
+    if (this.closed || this.#gpu || this.#how !== how) return gpu.close();
+    this.canvas.after(canvas);
+    canvas.addEventListener("webglcontextlost", () => this.#loseGpu("its context was lost"));
+    this.#gpu = Object.assign(gpu, { canvas, origin });
+  }
+
+  #leaveGpu() {
+    const gpu = this.#gpu;
+    this.#gpu = null;
+    gpu?.canvas.remove();
+    gpu?.close();
+    for (const [id, picture] of this.#pictures) if (picture.gpu) this.#pictures.delete(id);
+    this.canvas.hidden = false;
+  }
+
+  #loseGpu(why) {
+    if (!this.#gpu) return;
+    this.#leaveGpu();
+    this.dispatchEvent(new CustomEvent("nogpu", { detail: why }));
+  }
+
+  // For people.
+  get drawnBy() {
+    return this.#gpu?.name ?? `CPU, ${this.#rasters.length} workers`;
+  }
+
+  get gpu() {
+    return this.#gpu;
+  }
+
+  get onGpu() {
+    return this.#gpu !== null;
   }
 
   get fps() {
@@ -130,6 +182,20 @@ export class Engine extends EventTarget {
     }
   }
 
+  // How many layers of group i are wanted; chosen anew where nothing before is needed for more of them.
+  #layersOf(i) {
+    if (this.layers !== AUTO) return this.layers;
+    const { groups } = this.source;
+    let start = i;
+    while (start > 0 && !groups[start].sync) start--;
+    if (start === i || !this.#chosen.has(start)) {
+      const { ends, size, frames } = groups[i];
+      const rates = (ends ?? [size]).map((bytes) => (8e-6 * bytes * this.fps) / frames);
+      this.#chosen.set(start, ends ? this.choice.choose(rates, this.stats.link) : ALL);
+    }
+    return this.#chosen.get(start);
+  }
+
   // The group that plays after i; damaged ones are passed over.
   #after(i, loop) {
     const n = this.source.groups.length;
@@ -144,10 +210,10 @@ export class Engine extends EventTarget {
   async #decode(i) {
     if (this.failed.has(i)) return;
     const abort = new AbortController();
-    const entry = { state: "fetching", abort };
+    const layers = this.#layersOf(i);
+    const entry = { state: "fetching", layers, abort };
     this.groups.set(i, entry);
     try {
-      const { layers } = this;
       const payload = await this.source.payload(i, abort.signal, layers);
       const reference = await this.#reference(i, payload, abort.signal, layers);
       if (this.groups.get(i) !== entry) return;
@@ -180,7 +246,7 @@ export class Engine extends EventTarget {
     try {
       let seconds = 0;
       for (let k = this.#after(i, loop); k !== null && k > i && seconds < AHEAD; k = this.#after(k, false)) {
-        await this.source.payload(k, undefined, this.layers);
+        await this.source.payload(k, undefined, this.#layersOf(k));
         seconds += this.source.groups[k].frames / this.fps;
       }
     } catch {
@@ -215,6 +281,9 @@ export class Engine extends EventTarget {
       this.stats.project = m.ms;
       const picture = this.#pictures.get(m.id);
       if (picture) picture.bands = m.bands;
+    } else if (m.type === "packed") {
+      this.stats.project = m.ms;
+      this.#paint(m);
     } else if (m.type === "failed") {
       if (m.id !== undefined) this.#pictures.delete(m.id);
       if (m.fatal) return this.#dead(m);
@@ -231,10 +300,28 @@ export class Engine extends EventTarget {
     const group = this.groupOf(t);
     const entry = this.groups.get(group);
     const id = this.#next++;
-    this.#pictures.set(id, { t, view, parts: [], blend: 0, gaussians: entry.header.gaussians });
+    const gpu = this.#gpu;
+    this.#pictures.set(id, { t, view, gpu, parts: [], blend: 0, gaussians: entry.header.gaussians });
     const local = t - this.source.groups[group].start_frame;
-    entry.worker.postMessage({ type: "draw", id, group, t: local, view, background: this.source.config.background });
+    const how = gpu ? { type: "pack", origin: gpu.origin } : { type: "draw", background: this.source.config.background };
+    entry.worker.postMessage({ ...how, id, group, t: local, view });
     return id;
+  }
+
+  async #paint({ id, buffer }) {
+    const picture = this.#pictures.get(id);
+    if (!picture) return; // the GPU was left meanwhile
+    const start = performance.now();
+    try {
+      await picture.gpu.draw(picture.view, new Uint32Array(buffer));
+    } catch (e) {
+      if (this.#gpu === picture.gpu) this.#loseGpu(e?.message ?? "it stopped");
+      return;
+    }
+    if (!this.#pictures.delete(id)) return;
+    picture.blend = performance.now() - start;
+    [this.canvas.hidden, picture.gpu.canvas.hidden] = [true, false];
+    this.#tell(id, picture);
   }
 
   #onRaster(worker, m) {
@@ -250,13 +337,18 @@ export class Engine extends EventTarget {
     for (const { worker, pixels } of picture.parts) worker.postMessage(pixels, [pixels]);
   }
 
-  #show(id, { parts, view, t, blend, gaussians }) {
-    this.#shown = id;
+  #show(id, picture) {
+    const { parts, view } = picture;
     const [width, height] = view;
     if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
     for (const { pixels, first, rows } of parts) {
       this.context.putImageData(new ImageData(new Uint8ClampedArray(pixels), width, rows), 0, first);
     }
+    this.#tell(id, picture);
+  }
+
+  #tell(id, { t, view, blend, gaussians }) {
+    this.#shown = id;
     Object.assign(this.stats, { blend, gaussians });
     this.dispatchEvent(new CustomEvent("picture", { detail: { id, t, view } }));
   }

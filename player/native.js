@@ -7,6 +7,7 @@ const SIMD = [0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 1
 const HEADER = 1 << 14; // bytes that have the header of a group
 export const NONE = 255; // no slot
 export const ALL = 255; // layers
+export const AUTO = 0; // as many layers as link and device carry
 
 export async function load(url) {
   if (typeof WebAssembly !== "object" || !WebAssembly.validate(new Uint8Array(SIMD))) {
@@ -100,6 +101,13 @@ export class Native {
       take({ i, bands, first: this.x.band_first(i), rows: this.x.band_rows(i), splats: this.bytes(this.x.band(i), size) });
     }
     return bands;
+  }
+
+  // What the view shows, as Spark takes it (see pack.rs), relative to an origin: a view into the memory of the instance.
+  pack(view, origin) {
+    this.put(new Uint8Array(view.buffer, view.byteOffset, view.byteLength));
+    this.check(this.x.pack(...origin));
+    return this.bytes(this.x.output(), this.x.output_length());
   }
 
   // Returns [rows, width, 4], a view into the memory of the instance.

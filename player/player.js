@@ -1,27 +1,30 @@
 // <gsv-player src="URL"> plays a .gsv file: the clock, the size of the picture, and what the viewer is told.
 //
-// Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the picture fills the element); quality="auto" or 0.1 to 1;
-// layers="2": only the first so many, else "all".
+// Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the picture fills the
+// element); quality="auto" or 0.1 to 1; layers="2" or "all", else as many as link and device carry; renderer="cpu" or "gpu", else the GPU
+// if there is a real one.
 // Properties: paused, frame, frameCount, fps, camera, stats. Methods: play(), pause(), show(frame). Events: ready, picture,
 // ended, error.
 
 import { Camera } from "./camera.js";
 import { MARKUP, clock, onDrag, onKeys, setIcon } from "./controls.js";
 import { Engine } from "./engine.js";
-import { ALL } from "./native.js";
+import { ALL, AUTO } from "./native.js";
 
 const BASE = new URL(".", import.meta.url);
 const PIXELS_MAX = 4e6; // of a still picture
 const PIXELS_START = 420_000; // of a moving one, before anything has been measured
 const PIXELS_MIN = 180_000; // below that, fewer pixels save little: the Gaussians stay
 const STILL = 250; // ms without a movement after which the picture is drawn sharp
+const TALL = 2; // metres, of a scene in a headset
 const STALL = 300; // ms without a picture after which the viewer is told to wait
 
 export class GsvPlayer extends HTMLElement {
-  static observedAttributes = ["src", "loop", "speed", "quality", "size", "layers"];
+  static observedAttributes = ["src", "loop", "speed", "quality", "size", "layers", "renderer"];
   paused = true;
   speed = 1;
   quality = "auto";
+  renderer = "auto";
   #position = 0; // frames, with a fraction
   #last = 0; // time of the last tick
   #moved = 0; // of the last change of the camera
@@ -49,12 +52,13 @@ export class GsvPlayer extends HTMLElement {
       this.#moved = performance.now();
       this.$("[data-set=view]").value = this.camera.reference ? String(this.camera.references.indexOf(this.camera.reference)) : "orbit";
     };
-    onDrag(this.$("canvas"), {
+    onDrag(this.$(".view"), {
       orbit: move((x, y) => this.camera.orbit(x, y)),
       pan: move((x, y) => this.camera.pan(x, y)),
       zoom: move((f) => this.camera.zoom(f)),
     });
     this.$("[data-do=full]").hidden = !document.fullscreenEnabled;
+    navigator.xr?.isSessionSupported("immersive-vr").then((yes) => (this.$("[data-do=vr]").hidden = !yes), () => {});
     this.$("[data-set=speed]").value = "1";
   }
 
@@ -74,12 +78,16 @@ export class GsvPlayer extends HTMLElement {
     if (name === "speed" && Number(value) > 0) this.speed = Number(value);
     if (name === "quality" && value) this.quality = value === "auto" ? value : Math.min(Math.max(Number(value) || 1, 0.1), 1);
     if (name === "layers") this.engine?.show(this.#layers);
-    for (const set of ["speed", "quality"]) this.$(`[data-set=${set}]`).value = String(this[set]);
+    if (name === "renderer") {
+      this.renderer = ["cpu", "gpu"].includes(value) ? value : "auto";
+      if (this.stats.gaussians) this.#render();
+    }
+    for (const set of ["speed", "quality", "renderer"]) this.$(`[data-set=${set}]`).value = String(this[set]);
   }
 
   get #layers() {
-    const n = Number(this.getAttribute("layers"));
-    return n >= 1 ? n : ALL;
+    const value = this.getAttribute("layers");
+    return Number(value) >= 1 ? Number(value) : value === "all" ? ALL : AUTO;
   }
 
   get loop() {
@@ -142,13 +150,14 @@ export class GsvPlayer extends HTMLElement {
     this.$(".error").hidden = true;
     this.$(".notes").replaceChildren();
     this.$(".busy").hidden = false;
-    Object.assign(this, { camera: null, paused: true });
+    Object.assign(this, { camera: null, paused: true, shown: null });
     [this.#position, this.#scale, this.#drawn] = [0, null, ""];
     const engine = (this.engine = new Engine(this.$("canvas"), BASE, this.getAttribute("src")));
     engine.layers = this.#layers;
     const { source } = engine;
     const on = (target, type, f) => target.addEventListener(type, (e) => this.engine === engine && f(e.detail));
     on(engine, "damaged", (d) => this.#damaged(d));
+    on(engine, "nogpu", (why) => this.#note("gpu", `The GPU cannot be used (${why}): the CPU draws.`));
     on(engine, "fatal", (message) => this.#fail("The player has stopped", `${message}.`));
     on(engine, "decoded", ({ header }) => this.#begin(engine, header));
     on(engine, "picture", (detail) => this.#pictured(detail));
@@ -157,7 +166,7 @@ export class GsvPlayer extends HTMLElement {
     on(source, "error", (e) => this.#fail("The file cannot be read on", sentence(e.message)));
     on(source, "groups", () => this.#grown());
     try {
-      this.#request = requestAnimationFrame((now) => this.#tick(now));
+      this.#request = requestAnimationFrame(() => this.#tick());
       await engine.open();
       if (this.engine !== engine) return;
       if (source.missing) {
@@ -188,12 +197,13 @@ export class GsvPlayer extends HTMLElement {
 
   // The first group is decoded: there is something to look at.
   #begin(engine, header) {
+    this.header = header;
     if (this.camera) return;
     const layers = this.$("[data-set=layers]");
     layers.hidden = header.layers < 2;
     const choices = Array.from({ length: header.layers - 1 }, (_, k) => new Option(`${k + 1} of ${header.layers} layers`, k + 1));
-    layers.replaceChildren(new Option("All layers", "all"), ...choices);
-    layers.value = this.#layers === ALL ? "all" : String(Math.min(this.#layers, header.layers - 1));
+    layers.replaceChildren(new Option("Auto layers", "auto"), new Option("All layers", "all"), ...choices);
+    layers.value = { [ALL]: "all", [AUTO]: "auto" }[this.#layers] ?? String(Math.min(this.#layers, header.layers - 1));
     const { config } = engine.source;
     this.camera = new Camera(engine.bounds, config.up, config.cameras);
     const select = this.$("[data-set=view]");
@@ -205,9 +215,14 @@ export class GsvPlayer extends HTMLElement {
 
   // The clock
 
-  #tick(now) {
-    this.#request = requestAnimationFrame((t) => this.#tick(t));
+  #tick() {
+    this.#request = requestAnimationFrame(() => this.#tick());
+    if (!this.engine?.gpu?.head) this.#step();
+  }
+
+  #step() {
     const { engine } = this;
+    const now = performance.now();
     const passed = Math.min(now - this.#last, 250) / 1000;
     this.#last = now;
     if (!engine?.source?.groups.length || !this.$(".error").hidden) return;
@@ -246,7 +261,10 @@ export class GsvPlayer extends HTMLElement {
       this.#position = groups[i].start_frame;
       return i;
     }
-    if (engine.source.complete) this.#fail("This file is damaged", `None of its groups can be decoded (group ${group}: ${engine.failed.get(group)}).`);
+    if (!engine.source.complete) return null;
+    this.#position = this.$(".seek input").value = 0;
+    const [first, why] = engine.failed.entries().next().value;
+    this.#fail("This file is damaged", `None of its groups can be decoded (group ${first}: ${why}).`);
     return null;
   }
 
@@ -258,6 +276,8 @@ export class GsvPlayer extends HTMLElement {
 
   // View of a picture that fills the element; a moving one may be coarser.
   #view(sharp) {
+    const head = this.engine.gpu?.head;
+    if (head) return this.camera.wide(head.map((v) => this.#near(v)));
     const fixed = /^(\d+)x(\d+)$/.exec(this.getAttribute("size") ?? "");
     if (fixed) return this.camera.view(Number(fixed[1]), Number(fixed[2]));
     const stage = this.$(".stage");
@@ -269,9 +289,15 @@ export class GsvPlayer extends HTMLElement {
     return this.camera.view(Math.round(w * scale), Math.round(h * scale));
   }
 
+  // To a hundredth of the size of the scene: what the head does within that needs no other Gaussians.
+  #near(v) {
+    const step = this.camera.radius / 50;
+    return Math.round(v / step) * step;
+  }
+
   #draw(now) {
     const view = this.#view(this.paused && now - this.#moved > STILL);
-    const what = `${this.frame} ${view} ${this.engine.layers}`;
+    const what = `${this.frame} ${view} ${this.engine.layers} ${this.engine.onGpu}`;
     if (what === this.#drawn) return;
     this.#drawn = what;
     this.engine.draw(this.frame, view);
@@ -279,22 +305,53 @@ export class GsvPlayer extends HTMLElement {
 
   #pictured(detail) {
     const now = performance.now();
+    if (!this.shown) this.#render(); // not before: the first picture does not wait for it
+    this.shown = detail;
     this.#times.push(now);
     this.#busySince = 0;
     this.dispatchEvent(new CustomEvent("picture", { detail }));
     if (!this.paused) this.#adapt(now);
   }
 
+  // The GPU, or the CPU.
+  async #render() {
+    const { engine } = this;
+    this.#note("gpu", null);
+    try {
+      await engine.use(this.renderer);
+    } catch (e) {
+      if (this.engine === engine) this.#note("gpu", `The GPU cannot be used (${e.message}): the CPU draws.`);
+    }
+  }
+
+  // Into a headset: the scene becomes as large as a person, and is drawn on the GPU.
+  async #enter() {
+    const { engine, camera } = this;
+    try {
+      const session = await navigator.xr.requestSession("immersive-vr");
+      await engine.use("gpu");
+      if (!engine.gpu) return session.end();
+      await engine.gpu.enter(session, camera.level(), TALL / (2 * camera.radius), () => this.#step());
+      session.addEventListener("end", () => (this.#drawn = "", this.#render()));
+    } catch (e) {
+      this.#note("gpu", `Virtual reality cannot be used here (${e.message}).`);
+    }
+  }
+
   // Finds the size at which this device keeps up, from how long the slowest stage of a picture takes.
   #adapt(now) {
     if (now - this.#adapted < 500) return;
     this.#adapted = now;
-    const { blend, project } = this.engine.stats;
-    const share = (Math.max(blend, project) * Math.min(this.fps * this.speed, 60)) / 1000;
+    const { blend, project, decode } = this.engine.stats;
+    const each = Math.min(this.fps * this.speed, 60) / 1000;
+    const share = Math.max(blend, project) * each;
     const { clientWidth, clientHeight } = this.$(".stage");
     const least = Math.min(1, Math.sqrt(PIXELS_MIN / Math.max(clientWidth * clientHeight, 1)));
+    const coarser = this.quality === "auto" && !this.hasAttribute("size") && this.#scale > least;
     if (share > 0.95) this.#scale = Math.max(least, this.#scale * 0.85);
     else if (share < 0.5) this.#scale = Math.min(1, this.#scale * 1.08);
+    const load = Math.max(coarser ? 0 : share, (decode * this.fps * this.speed) / 1000);
+    this.engine.choice.look(load, this.header.layers, now);
   }
 
   // What the viewer is told
@@ -339,20 +396,24 @@ export class GsvPlayer extends HTMLElement {
     this.slow = this.paused || drawn > 0.8 * wanted || !this.$(".busy").hidden ? 0 : (this.slow ?? 0) + 1;
     const text = `This device draws ${drawn} of ${Math.round(wanted)} frames a second.`;
     this.#note("slow", this.slow > 20 ? text : null);
-    const { source } = this.engine;
+    const { source, layers, choice, groups } = this.engine;
+    const shown = groups.get(this.engine.groupOf(this.frame));
+    const fewer = layers === AUTO && choice.reason && shown?.layers < shown?.header?.layers;
+    this.#note("layers", fewer ? `${shown.layers} of ${shown.header.layers} layers: ${choice.reason} no more just now.` : null);
     const lower = source.quality && source.rung < source.rungs - 1;
     this.#note("rung", lower ? `Quality ${source.quality}: the link or this device carries no more just now.` : null);
   }
 
   #figures() {
     const { source } = this.engine;
-    const [s, { width, height }] = [this.stats, this.$("canvas")];
+    const [s, [width, height]] = [this.stats, this.shown?.view ?? [0, 0]];
     const group = source.groups[this.engine.groupOf(this.frame)];
     const rate = group ? (8e-6 * group.size * this.fps) / group.frames : 0;
     return [
       ["fps", `${s.fps} of ${this.fps.toFixed(1)}`],
       ["frame", `${this.frame} of ${this.frameCount}`],
       ["picture", `${width} x ${height}`],
+      ["drawn by", this.engine.drawnBy],
       ["Gaussians", s.gaussians.toLocaleString("en")],
       ["decode", `${s.decode.toFixed(1)} ms/frame`],
       ["project", `${s.project.toFixed(1)} ms`],
@@ -420,6 +481,7 @@ export class GsvPlayer extends HTMLElement {
         this.$(".stats").hidden = !hidden;
         this.$("[data-do=stats]").setAttribute("aria-pressed", hidden);
       },
+      vr: () => this.#enter(),
       full: () => (document.fullscreenElement ? document.exitFullscreen() : this.requestFullscreen()),
       retry: () => this.#open(),
     };

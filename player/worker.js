@@ -1,6 +1,7 @@
 // A worker of the player, in one of two roles.
 //
-// group:  payloads in, decoded groups held; frame t + view -> ellipses of each band of rows, straight to the band's worker.
+// group:  payloads in, decoded groups held; frame t + view -> ellipses of each band of rows, straight to the band's worker, or
+//         what the view shows packed for the GPU, to the page.
 // raster: ellipses of a band -> its pixels, to the page.
 //
 // Two group workers take turns: one shows its group while the other decodes the next, so nothing decoded ever has to travel.
@@ -56,12 +57,15 @@ function groupWorker(native, { ports }) {
     return { type: "decoded", group, header, ms: performance.now() - start };
   }
 
+  function evaluate(group, t) {
+    if (shown === `${group} ${t}`) return;
+    native.frame(slots.get(group), t);
+    shown = `${group} ${t}`;
+  }
+
   function draw({ id, group, t, view, background }) {
     const start = performance.now();
-    if (shown !== `${group} ${t}`) {
-      native.frame(slots.get(group), t);
-      shown = `${group} ${t}`;
-    }
+    evaluate(group, t);
     const bands = native.project(view, ports.length, ({ i, bands, first, rows, splats }) => {
       let buffer = spare[i].pop();
       if (!buffer || buffer.byteLength < splats.length) buffer = new ArrayBuffer(Math.ceil(splats.length * 1.2));
@@ -71,10 +75,18 @@ function groupWorker(native, { ports }) {
     return { type: "projected", id, bands, ms: performance.now() - start };
   }
 
+  function pack({ id, group, t, view, origin }) {
+    const start = performance.now();
+    evaluate(group, t);
+    const { buffer } = native.pack(view, origin).slice();
+    self.postMessage({ type: "packed", id, buffer, ms: performance.now() - start }, [buffer]);
+  }
+
   self.onmessage = ({ data }) => {
     try {
       if (data.type === "decode") self.postMessage(decode(data));
       else if (data.type === "draw") self.postMessage(draw(data));
+      else if (data.type === "pack") pack(data);
       else if (data.type === "release" && slots.has(data.group)) {
         native.x.release(slots.get(data.group));
         slots.delete(data.group);

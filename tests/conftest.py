@@ -36,16 +36,29 @@ def server(gsv):
 
 
 @pytest.fixture(scope="session")
-def browser(tmp_path_factory):
-    from browser import Browser, find_chromium
+def browsers():
+    from gscodec.bench.browser import Browsers, find_chromium
 
     if find_chromium() is None:
         if os.environ.get("CI"):
             pytest.fail("no Chromium: set CHROMIUM or install it")
         pytest.skip("no Chromium here (Debian: apt-get install chromium)")
-    b = Browser(tmp_path_factory.mktemp("profile"))
-    yield b
-    b.close()
+    with Browsers() as b:
+        yield b
+
+
+@pytest.fixture(scope="session")
+def browser(browsers):
+    """Without WebGL."""
+    return browsers.start("--disable-gpu", "--disable-3d-apis")
+
+
+@pytest.fixture(scope="session")
+def gl_browser(browsers):
+    """With WebGL2 in software, as Chromium has it where there is no GPU and it is told to."""
+    from gscodec.bench.browser import SOFTWARE_GL
+
+    return browsers.start(*SOFTWARE_GL)
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 
+import cv2
 import numpy as np
 from synthetic import blob, moved
 
@@ -140,16 +141,35 @@ def load(browser, url, **options) -> None:
     browser.wait(f"{PLAYER}.camera && {PLAYER}.stats.gaussians > 0")
 
 
-def canvas(browser) -> np.ndarray:
-    """[H, W, 3] u8: what is on the canvas."""
-    script = f"""(() => {{
-        const c = {part("canvas")};
-        const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+def pixels(browser, canvas: str) -> np.ndarray:
+    """[H, W, 3] u8: what is on the canvas that a JavaScript expression or its promise gives.
+
+    Read in the task that has drawn it, since a WebGL canvas may be empty afterwards.
+    """
+    script = f"""Promise.resolve({canvas}).then((from) => {{
+        const copy = Object.assign(document.createElement("canvas"), {{ width: from.width, height: from.height }});
+        const context = copy.getContext("2d");
+        context.drawImage(from, 0, 0);
+        const d = context.getImageData(0, 0, copy.width, copy.height).data;
         let s = ""; for (let i = 0; i < d.length; i += 8192) s += String.fromCharCode(...d.subarray(i, i + 8192));
-        return [c.width, c.height, btoa(s)];
-    }})()"""
+        return [copy.width, copy.height, btoa(s)];
+    }})"""
     w, h, data = browser.eval(script)
     return np.frombuffer(base64.b64decode(data), np.uint8).reshape(h, w, 4)[..., :3]
+
+
+def canvas(browser) -> np.ndarray:
+    """[H, W, 3] u8: what the CPU has drawn."""
+    return pixels(browser, part("canvas"))
+
+
+def screenshot(browser, element: str) -> np.ndarray:
+    """[H, W, 3] u8: what the screen shows where an element is."""
+    box = browser.eval(
+        f"(({{ x, y, width, height }}) => ({{ x, y, width, height }}))({element}.getBoundingClientRect())"
+    )
+    png = np.frombuffer(browser.screenshot(box), np.uint8)
+    return cv2.imdecode(png, cv2.IMREAD_COLOR)[..., ::-1]
 
 
 def camera_of(view: list[float]) -> Camera:

@@ -2,13 +2,16 @@
 
 import json
 
+import numpy as np
 import pytest
 
 pytest.importorskip("torch")
 
-from gscodec.bench.machine import write_result
+from gscodec.bench.machine import ROOT, write_result
 from gscodec.bench.raster import measure, run
 from gscodec.bench.scenes import capsule, capsule_camera
+from gscodec.bench.train import held_out
+from gscodec.capture import open_capture
 from gscodec.errors import UsageError
 from gscodec.metrics.charts import draw_charts
 
@@ -49,7 +52,35 @@ def test_charts_are_drawn_from_the_results_alone(tmp_path):
         draw_charts(tmp_path / "charts", tmp_path)
 
 
+def test_training_has_a_chart_of_what_is_there(tmp_path):
+    pytest.importorskip("matplotlib")
+    made = [
+        {"capture": "a", "recipe": r, "preset": p, "seconds_per_frame": s, "kb_per_frame": kb, "psnr_fg": 26.0 + s}
+        for r, p, s, kb in (("model", "fast", 2, None), ("gscodec", "fast", 2.1, 7.0), ("gscodec", "medium", 7, 8.0))
+    ]
+    write_result(tmp_path / "train.json", {"entries": made})
+    assert [p.name for p in draw_charts(tmp_path, tmp_path / "charts")] == ["train.svg", "train.png"]
+    svg = (tmp_path / "charts" / "train.svg").read_text()
+    assert "medium" in svg
+    assert "V3" not in svg
+
+
+def test_cameras_are_taken_out_of_training(tmp_path):
+    capture = open_capture(ROOT / "examples" / "lumberjack")
+    held = held_out(capture, ("cam16", "cam17"))
+    names = [c.name for c in held.cameras]
+    assert [names[i] for i in held.indices("test")] == ["cam16", "cam17"]
+    assert len(held.indices("train")) == 10, "the capture's own test cameras are gone"
+    np.testing.assert_array_equal(
+        held.view(names.index("cam17"), 3).rgb,
+        capture.view([c.name for c in capture.cameras].index("cam17"), 3).rgb,
+    )
+    with pytest.raises(UsageError, match="no camera cam99"):
+        held_out(capture, ("cam99",))
+
+
 def test_a_missing_file_is_said(tmp_path):
     said = []
     assert list(run(("statue",), data=tmp_path, say=said.append)) == []
-    assert said == ["statue: left out, splats/statue.ply is not in the data folder"]
+    missing = tmp_path / "splats" / "statue.ply"
+    assert said == [f"statue: left out, {missing} is not there; the data folder (GSCODEC_DATA) must have it"]

@@ -13,7 +13,7 @@ ROOT = Path(gscodec.__file__).parent
 FOLDERS = {"bench": Path(gscodec.bench.__file__).parent, "player": Path(gscodec.player.__file__).parent}
 BASE = {"errors", "gaussians", "camera", "frames", "sampling", "part_file", "_native"}
 ALLOWED = {
-    "bench": BASE | {"bitstream", "capture", "decode", "encode", "metrics", "render", "splats", "train"},
+    "bench": BASE | {"bitstream", "capture", "decode", "encode", "metrics", "player", "render", "splats", "train"},
     "bitstream": BASE,
     "capture": BASE,
     "splats": BASE | {"capture"},

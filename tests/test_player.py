@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from playing import FPS, GROUPS, LENGTH, PLAYER, canvas, load, part, psnr, sequence, show
+from playing import FPS, GROUPS, LENGTH, PLAYER, canvas, load, part, psnr, screenshot, sequence, show
 
 from gscodec.decode import open_stream
 from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
@@ -27,6 +27,7 @@ def test_the_picture_is_that_of_the_renderer(browser, server, gsv):
         assert want.std() > 10
         assert psnr(got, want) >= 35
         assert np.abs(got.astype(int) - want).max() <= 2
+        assert psnr(screenshot(browser, part("canvas")), want) >= 35
     assert browser.errors == []
 
 
@@ -106,6 +107,26 @@ def test_drags_turn_move_and_zoom(browser, server):
     np.testing.assert_allclose(view(), start, atol=1e-6)
 
 
+def test_fingers_turn_move_and_zoom(browser, server):
+    try:
+        browser.resize(390, 844, mobile=True)
+        load(browser, server.url, autoplay="off")
+        view = lambda: np.array(browser.eval(f"Array.from({PLAYER}.camera.view(100, 100)).slice(6)")).reshape(3, 4)  # noqa: E731
+        start = view()
+        browser.fingers([(150, 300), (200, 310), (260, 320)])
+        turned = view()
+        assert np.abs(turned[:, :3] - start[:, :3]).max() > 0.1
+        browser.fingers([(150, 300), (100, 300)], [(200, 300), (250, 300)])  # apart
+        near = view()
+        np.testing.assert_allclose(near[:, :3], turned[:, :3], atol=1e-6)
+        assert near[2, 3] < turned[2, 3] / 2
+        browser.fingers([(150, 300), (150, 360)], [(200, 300), (200, 360)])  # both down
+        assert view()[1, 3] > near[1, 3] + 0.05
+        assert browser.eval("visualViewport.scale") == 1, "the page itself does not zoom"
+    finally:
+        browser.resize(1280, 800)
+
+
 def test_scrubbing_shows_the_frame(browser, server, gsv):
     load(browser, server.url, size="160x120", autoplay="off")
     stream = open_stream(gsv)
@@ -118,7 +139,7 @@ def test_scrubbing_shows_the_frame(browser, server, gsv):
     assert browser.eval(f"{PLAYER}.frame") == 20
 
 
-def test_a_phone(browser, server, tmp_path):
+def test_a_phone(browser, server):
     try:
         browser.resize(390, 844, mobile=True, scale=2)
         load(browser, server.url)
@@ -130,7 +151,6 @@ def test_a_phone(browser, server, tmp_path):
             assert x + w <= 390
             assert y + h <= 844
             assert min(w, h) >= 36
-        browser.screenshot(tmp_path / "phone.png")
     finally:
         browser.resize(1280, 800)
 
@@ -161,6 +181,28 @@ def test_predicted_groups_and_their_layers(browser, server, other, tmp_path):
     for t in (2 * LENGTH + 3, 0, 4 * LENGTH):
         compare(stream, t)
     assert browser.errors == []
+
+
+def test_layers_follow_the_device(browser, server):
+    """Fewer when it is too slow for some looks in a row, more again after a while."""
+    browser.goto(server.url + "?src=none.gsv")
+    script = """(async () => {
+        const { LayerChoice } = await import("/layers.js");
+        const choice = new LayerChoice();
+        const rates = [1, 2, 3];
+        const after = (load, times, now) => {
+            for (let i = 0; i < times; i++) choice.look(load, 3, now);
+            return choice.choose(rates, 0);
+        };
+        return [
+            choice.choose(rates, 0), choice.choose(rates, 2.6), choice.choose(rates, 0.1), choice.reason,
+            choice.choose(rates, 100), choice.choose(rates, 100), choice.reason,
+            after(1.5, 2, 0), after(0.7, 1, 0), after(1.5, 3, 0), choice.reason, after(1.5, 9, 0),
+            after(0.3, 1, 9000), after(0.3, 1, 100000), after(0.3, 1, 110000), after(0.3, 1, 200000),
+        ];
+    })()"""
+    link, device = "the link carries", "this device draws"
+    assert browser.eval(script) == [3, 2, 1, link, 2, 3, None, 3, 3, 2, device, 1, 1, 2, 2, 3]
 
 
 # The module itself, without the page

@@ -78,6 +78,22 @@ def test_a_ladder_is_played_at_the_rate_of_the_link(browser, server, gsv, other,
     assert browser.eval(f"{PLAYER}.engine.source.quality") == f"{rung} of 2"
 
 
+def test_layers_are_left_out_where_the_link_is_slow(browser, server, other, tmp_path):
+    s = sequence(4000)
+    path = tmp_path / "layers.gsv"
+    config = stream_config(fps=15, sh_degree=0, gaussians=4000, frames=LENGTH)
+    settings = EncodeSettings(quality=90, layers=3)
+    encode_groups(lambda done, frames: iter(s.groups[done:]), path, config, settings, fingerprint={})
+    url, handler = other(path.read_bytes(), rate=path.stat().st_size // GROUPS)  # a group takes 1 s, and plays 0.4 s
+    load(browser, server.url, src=url, size="64x64", loop="off")
+    text = browser.wait(f"{part('.notes')}.innerText")
+    assert "of 3 layers: the link carries no more" in text
+    browser.wait(f"{PLAYER}.paused")
+    assert browser.eval(f"{PLAYER}.frame") == GROUPS * LENGTH - 1
+    asked = [tuple(map(int, value[6:].split("-"))) for value in handler.log]
+    assert sum(b - a + 1 for a, b in asked) < 0.8 * path.stat().st_size
+
+
 def test_a_manifest_of_nothing(browser, server, other):
     url, _ = other(b"<MPD/>", path="/a.mpd")
     browser.goto(f"{server.url}?src={url}")
@@ -203,6 +219,7 @@ def test_a_growing_file(browser, tmp_path, gsv):
 
 
 def test_an_old_browser_is_told(browser, server):
+    browser.call("Page.enable")
     script = browser.call("Page.addScriptToEvaluateOnNewDocument", source="WebAssembly.validate = () => false")
     browser.goto(server.url)
     assert "SIMD" in error_text(browser)

@@ -1,5 +1,7 @@
 """The rasterizer against its references: plain torch, its own scalar instance, finite differences, poison."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from gscodec.gaussians import Gaussians  # noqa: E402
 from gscodec.render.image import render_image, render_rgba  # noqa: E402
 from gscodec.render.rasterize import rasterize  # noqa: E402
 from gscodec.render.reference import rasterize_reference  # noqa: E402
-from gscodec.render.step import render_loss  # noqa: E402
+from gscodec.render.step import Crop, render_batch, render_loss  # noqa: E402
 from gscodec.render.workspace import PARAMETERS, STATISTICS, Workspace, simd_levels  # noqa: E402
 from gscodec.train.ssim import image_loss_reference  # noqa: E402
 
@@ -223,6 +225,28 @@ def test_region_is_a_crop():
     whole, _ = Workspace().forward(params, cam, BACKGROUND)
     part, _ = Workspace().forward(params, cam, BACKGROUND, (37, 21, 90, 70))
     np.testing.assert_allclose(part, whole[21:91, 37:127], atol=2e-5)
+
+
+def test_batch_of_crops_is_the_sum_of_its_crops():
+    cam, g = camera(), dense(300)
+    params = {k: getattr(g, k) for k in PARAMETERS}
+    rng = np.random.default_rng(1)
+    rgb = rng.integers(0, 256, (cam.height, cam.width, 3), np.uint8)
+    other = replace(cam, viewmat=cam.viewmat @ np.diag([-1.0, 1.0, -1.0, 1.0]))
+    crops = [Crop(cam, rgb, region=(5, 3, 20, 17)), Crop(cam, rgb, None, BACKGROUND, (1.1, 0.9, 1.0)), Crop(other, rgb)]
+    batch = render_batch(params, crops)
+    single = [render_batch(params, [crop], workspace=Workspace()) for crop in crops]
+    assert batch.loss == pytest.approx(sum(s.loss for s in single))
+    for name in PARAMETERS:
+        total = sum(np.asarray(s.grads[name], np.float64) for s in single)
+        assert np.abs(total).max() > 0
+        np.testing.assert_allclose(batch.grads[name], total, rtol=1e-5, atol=1e-6 * np.abs(total).max())
+    np.testing.assert_allclose(batch.sum_weight, sum(s.sum_weight for s in single), rtol=1e-5)
+    for name in ("max_weight", "radii"):
+        np.testing.assert_array_equal(getattr(batch, name), np.max([getattr(s, name) for s in single], 0))
+    np.testing.assert_array_equal(batch.grad_gain, [s.grad_gain[0] for s in single])
+    with pytest.raises(UsageError, match="at least one crop"):
+        render_batch(params, [])
 
 
 def test_8_bit_image_is_the_float_image_rounded():

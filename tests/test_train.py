@@ -18,7 +18,6 @@ from gscodec.gaussians import GaussianSequence, Group
 from gscodec.metrics.image import psnr
 from gscodec.render.image import render_image, render_rgba
 from gscodec.train.carve import carve, meeting_point, project
-from gscodec.train.changes import Changes
 from gscodec.train.cluster import train_segment
 from gscodec.train.finetune import GroupModel
 from gscodec.train.graph import NodeGraph, Pose, quat_to_matrix, rotvec_to_quat
@@ -150,7 +149,7 @@ def test_tracking_finds_the_turn(capture):
     truth = turning(300, frames=5)
     key = from_gaussians(truth.frame(0))
     views = Views(capture, 0)
-    tracker = Tracker(key, views, TINY, 1.0, 0.01, Changes.since(views, 0))
+    tracker = Tracker.start(key, views, TINY, 0.01, range(3))
     models, poses = [tracker.model], [tracker.pose]
     for frame in (1, 2):
         tracker.advance(frame)
@@ -169,7 +168,7 @@ def test_tracking_finds_the_turn(capture):
 
 def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
     x = torch.from_numpy(blob(200).means)
-    graph = NodeGraph(x, 1.0, count=32)
+    graph = NodeGraph.of(x, 1.0, torch.ones(200, dtype=torch.bool), count=32)
     turn = rotvec_to_quat(torch.tensor([[0.3, -0.2, 0.5]])).repeat(len(graph), 1)
     R = quat_to_matrix(turn)
     nodes = torch.einsum("nij,nj->ni", R, graph.nodes) + 1

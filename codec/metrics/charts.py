@@ -8,10 +8,12 @@ from pathlib import Path
 from gscodec.errors import UsageError, require
 from gscodec.metrics.rd_chart import frames_chart, size_chart, time_chart
 from gscodec.metrics.speed_chart import speed_chart
+from gscodec.metrics.train_chart import train_chart
 
 CHARTS = {  # result file without .json -> chart -> function(result) that returns a matplotlib Figure
     "raster": {"raster": speed_chart},
     "rd": {"rd_size": size_chart, "rd_time": time_chart, "rd_frames": frames_chart},
+    "train": {"train": train_chart},
 }
 STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 

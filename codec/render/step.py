@@ -6,11 +6,13 @@ size of an image goes through torch, which is what makes a step cheap on a CPU.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gscodec.camera import Camera
+from gscodec.errors import UsageError
 from gscodec.render.workspace import PARAMETERS, STATISTICS, Region, Workspace, call, rgb, view
 
 
@@ -25,7 +27,7 @@ class RenderLoss:
         grad2d: [N] f32, norm of the gradient by the projected mean in units of half the image (3DGS's densification
             measure).
         max_weight, sum_weight: [N] f32, largest and summed blending weight alpha * transmittance (for pruning).
-        pixels: of the image.
+        pixels: of the image, of all crops together.
         radii: [N] f32, pixels, 0 for what is not visible.
         grad_gain: [3] f64, gradient of `gain`.
     """
@@ -47,6 +49,32 @@ class RenderLoss:
     def visible(self) -> np.ndarray:
         """[N] bool"""
         return self.radii > 0
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A view, or a part of one, and what it should look like; see `render_loss`."""
+
+    camera: Camera
+    target_rgb: np.ndarray
+    target_alpha: np.ndarray | None = None
+    background: Sequence[float] = (0.0, 0.0, 0.0)
+    gain: Sequence[float] | None = None
+    weight: np.ndarray | None = None
+    region: Region | None = None
+
+    def part(self) -> Region:
+        """The region; all of the picture if none is given."""
+        return self.region or (0, 0, self.camera.width, self.camera.height)
+
+    def native(self) -> tuple:
+        """As the native side takes it."""
+        target = (self.target_rgb, self.target_alpha, self.weight)
+        return (
+            view(self.camera, self.part()),
+            (rgb(self.background), None if self.gain is None else rgb(self.gain)),
+            tuple(None if t is None else np.ascontiguousarray(t) for t in target),
+        )
 
 
 def render_loss(
@@ -81,31 +109,40 @@ def render_loss(
     Raises:
         UsageError: shapes disagree, or the camera has distortion.
     """
+    crop = Crop(camera, target_rgb, target_alpha, background, gain, weight, region)
+    result = render_batch(params, [crop], ssim_lambda, mask_lambda, workspace)
+    return replace(result, grad_gain=result.grad_gain[0])
+
+
+def render_batch(
+    params: dict,
+    crops: Sequence[Crop],
+    ssim_lambda: float = 0.2,
+    mask_lambda: float = 0.0,
+    workspace: Workspace | None = None,
+) -> RenderLoss:
+    """Loss of several crops, of one view or of many, and its gradients: what `render_loss` gives for each, added up.
+
+    Of the result, loss, grads, grad2d and sum_weight are sums over the crops, max_weight and radii the largest; l1,
+    mse, ssim and mask are means, and grad_gain is [crops, 3].
+
+    Raises:
+        UsageError: shapes disagree, a camera has distortion, or there are no crops.
+    """
+    if not crops:
+        raise UsageError("a batch has at least one crop, got none")
     workspace = workspace or Workspace()
     arrays = tuple(_numpy(params[name]) for name in PARAMETERS)
     grads, statistics = workspace.gradients(arrays)
     workspace.calls += 1
-    region = region or (0, 0, camera.width, camera.height)
-    values = call(
-        workspace.native.step,
-        arrays,
-        view(camera, region),
-        (rgb(background), None if gain is None else rgb(gain)),
-        tuple(None if t is None else np.ascontiguousarray(t) for t in (target_rgb, target_alpha, weight)),
-        (ssim_lambda, mask_lambda),
-        (grads, statistics),
-    )
+    native = [crop.native() for crop in crops]
+    values, radii = call(workspace.native.step, arrays, native, (ssim_lambda, mask_lambda), (grads, statistics))
+    losses, gain = np.array([v[:5] for v in values]), np.array([v[5] for v in values])
     named = {k: _like(g, params[k]) for k, g in zip(PARAMETERS, grads, strict=True)}
-    radii, _ = workspace.native.radii()
     statistics = dict(zip(STATISTICS, statistics, strict=True))
-    return RenderLoss(
-        *values[:5],
-        pixels=region[2] * region[3],
-        grads=named,
-        radii=radii,
-        grad_gain=np.array(values[5]),
-        **statistics,
-    )
+    loss, means = float(losses[:, 0].sum()), losses[:, 1:].mean(0).tolist()
+    pixels = sum(crop.part()[2] * crop.part()[3] for crop in crops)
+    return RenderLoss(loss, *means, pixels=pixels, grads=named, radii=radii, grad_gain=gain, **statistics)
 
 
 def _numpy(array) -> np.ndarray:

@@ -41,7 +41,7 @@ def cluster_groups(
     ray = require("ray", "training on a cluster", "ray")
     try:
         _knock(address)
-        ray.init(address, log_to_driver=False)
+        ray.init(address, log_to_driver=False, logging_level="ERROR")
     except (OSError, ValueError) as e:
         raise UsageError(f"--ray {address}: no cluster there ({e}); start one with: ray start --head") from e
     try:
@@ -60,9 +60,9 @@ def cluster_groups(
                 on_progress(done)
     except ray.exceptions.RayTaskError as e:
         raise e.cause from None
-    except ray.exceptions.WorkerCrashedError:
-        message = f"its worker died {RETRIES + 1} times; look into the cluster's logs (memory?), then run again"
-        raise UsageError(f"--ray {address}: frames {segment.start} to {segment.stop - 1}: {message}") from None
+    except ray.exceptions.RayError as e:  # a worker that dies again and again, no memory, a lost machine
+        why = str(e).strip().splitlines()[0]
+        raise UsageError(f"--ray {address}: the cluster failed ({why}); run the same command to go on") from e
     finally:
         ray.shutdown()  # ends what is still running
 

@@ -19,11 +19,11 @@ import torch
 from gscodec.bitstream.color import STEP_WEIGHTS
 from gscodec.bitstream.quantization import Steps, trajectory_step
 from gscodec.bitstream.transform import dct_basis
-from gscodec.gaussians import Gaussians, Nodes
+from gscodec.gaussians import Gaussians, Group, Nodes
 from gscodec.render.workspace import Workspace
 from gscodec.train import keyframe
 from gscodec.train.graph import NodeGraph, Pose, quat_conjugate, quat_multiply, quat_to_rotvec
-from gscodec.train.model import Model
+from gscodec.train.model import NAMES, Model
 from gscodec.train.rate import CanonicalRate, laplace_bits
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, compare
@@ -31,6 +31,7 @@ from gscodec.train.views import Views, compare
 # attribute -> temporal frequencies that may be used; what is not listed is constant in a group
 FREQUENCIES = {"means": 10, "quats": 4, "log_scales": 3, "logit_opacities": 3, "sh0": 6}
 STARTS = 0.5  # steps: a residual that is there from the start, of a Gaussian that has moved in an earlier group
+HIDDEN = -20.0  # logit of the opacity of what is not born yet
 ROUND_DOWN = 0.1  # a coefficient below 0.6 steps is not coded, as the encoder does it
 RESIDUAL_RATE = 0.05  # in steps of the stream a step of the optimiser
 LAPLACE_RATE = 0.02
@@ -49,10 +50,16 @@ class GroupModel:
     """Canonical model, fixed carrying motion, and the coefficients of what is left.
 
     Args:
-        key: canonical Gaussians in the keyframe's pose; None makes it the mean of the tracked frames.
-        tracked: T tracked models; poses: T poses of the nodes of `graph`.
+        graph: carries the N Gaussians of the last frame.
+        key: canonical Gaussians that the group before has left, in the keyframe's pose; they stay as they are. None:
+            all are new, and so are those that are born in this group.
+        tracked: T tracked models, later ones with those that were born at the end; poses: T poses of the nodes.
         steps: the stream's quantization.
         moved: [N] bool, Gaussians that tracking has touched; the others have no residuals, unless they start with some.
+
+    Attributes:
+        key: canonical Gaussians; the first `known` of them are given.
+        born: [N] int, frame of the group from which each is shown.
     """
 
     def __init__(
@@ -65,8 +72,11 @@ class GroupModel:
         moved: torch.Tensor,
     ):
         self.graph, self.poses = graph, poses
-        self.fixed = key is not None
-        self.key = key or _mean_of(graph, tracked, poses)
+        counts = torch.tensor([len(m) for m in tracked])
+        self.born = (counts[:, None] <= torch.arange(counts[-1])).sum(0)
+        tracked = [_padded(m, tracked[-1]) for m in tracked]
+        self.known = 0 if key is None else len(key)
+        self.key = self._canonical(key, tracked)
         self.basis = torch.from_numpy(dct_basis(len(tracked))).float()  # [T, T]
         names = ("means", "log_scales", "quats", "logit_opacities", "sh0")
         self.canonical_steps = {n: getattr(steps, n) for n in names}
@@ -82,6 +92,25 @@ class GroupModel:
         self.log_scales = {
             n: torch.full((len(c), 1, 1), -1.0, requires_grad=True) for n, c in self.coefficients.items()
         }
+
+    def _held(self, x: list[torch.Tensor]) -> torch.Tensor:
+        """[T, N, ...]: before its birth a Gaussian is what it is at birth."""
+        x = torch.stack(x)
+        frame = torch.maximum(torch.arange(len(x))[:, None], self.born)
+        return x[frame, torch.arange(x.shape[1])]
+
+    def _canonical(self, key: Model | None, tracked: list[Model]) -> Model:
+        """What is given, and for what is new the tracked Gaussians, turned back to the keyframe's pose, on average."""
+        params = {n: self._held([m.params[n] for m in tracked]).mean(0) for n in NAMES}
+        params["means"] = self.graph.means
+        turned = [self.graph.carry(self.graph.means, pose)[1] for pose in self.poses]
+        back = [quat_multiply(quat_conjugate(q), m.params["quats"]) for q, m in zip(turned, tracked, strict=True)]
+        back = self._held(back)
+        back = back * torch.where((back * back[-1]).sum(2, keepdim=True) < 0, -1.0, 1.0)
+        params["quats"] = torch.nn.functional.normalize(back.sum(0), dim=1)
+        if key is not None:
+            params = {n: torch.cat([key.params[n], p[self.known :]]) for n, p in params.items()}
+        return Model(params)
 
     def _carry(self, pose: Pose) -> tuple[torch.Tensor, torch.Tensor]:
         return self.graph.carry(self.key.params["means"], pose)
@@ -101,7 +130,7 @@ class GroupModel:
         out = {}
         for name, most in FREQUENCIES.items():
             low = self.basis[: min(most, len(tracked))]
-            c = torch.einsum("kt,tnc->knc", low, torch.stack(residual[name])) / self.unit[name]
+            c = torch.einsum("kt,tnc->knc", low, self._held(residual[name])) / self.unit[name]
             out[name] = c.contiguous().requires_grad_()
         return out
 
@@ -111,24 +140,29 @@ class GroupModel:
         return self.unit[name] * torch.einsum("k,knc->nc", self.basis[: len(c), t], c)
 
     def _relaxed(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Canonical attributes with uniform noise in place of their quantization."""
-        noise = lambda p: torch.rand(p.shape, generator=generator) - 0.5  # noqa: E731
-        p = self.key.params
-        return p | {n: p[n] + step * noise(p[n]) for n, step in self.canonical_steps.items()}
+        """Canonical attributes with uniform noise in place of their quantization, where they are new."""
+        p, out = self.key.params, dict(self.key.params)
+        for name, step in self.canonical_steps.items():
+            noise = step * (torch.rand(p[name].shape, generator=generator) - 0.5)
+            noise[: self.known] = 0
+            out[name] = p[name] + noise
+        return out
 
     def frame(self, t: int, generator: torch.Generator | None = None) -> dict[str, torch.Tensor]:
         """Attributes of frame `t`, with noise on the canonical ones if there is a generator; differentiable in the
         coefficients."""
-        p = self.key.params if generator is None or self.fixed else self._relaxed(generator)
-        means = self.means[t] if self.fixed else self.graph.carry(p["means"], self.poses[t])[0]
+        new = self.known < len(self.key)
+        p = self._relaxed(generator) if new and generator is not None else self.key.params
+        means = self.graph.carry(p["means"], self.poses[t])[0] if new else self.means[t]
         dq = self.residual("quats", t)
+        opacities = p["logit_opacities"] + self.residual("logit_opacities", t)[:, 0]
         w = (1 - dq.square().sum(1, keepdim=True)).clamp(min=1e-6).sqrt()
         return {
             **p,
             "means": means + self.residual("means", t),
             "quats": quat_multiply(torch.cat([w, dq], 1), quat_multiply(self.turned[t], p["quats"])),
             "log_scales": p["log_scales"] + self.residual("log_scales", t),
-            "logit_opacities": p["logit_opacities"] + self.residual("logit_opacities", t)[:, 0],
+            "logit_opacities": torch.where(self.born > t, HIDDEN, opacities),
             "sh0": p["sh0"] + self.residual("sh0", t),
         }
 
@@ -139,6 +173,17 @@ class GroupModel:
             noise = torch.rand(c.shape, generator=generator) - 0.5
             total = total + laplace_bits(c + noise, self.log_scales[name]).sum()
         return total
+
+    def group(self, parents: np.ndarray | None) -> Group:
+        """All frames in numpy; `parents` as in Group."""
+        frames = len(self.poses)
+        lifetimes = np.stack([self.born.numpy(), np.full(len(self.born), frames)], 1).astype(np.int32)
+        return Group(
+            [self.gaussians(t) for t in range(frames)],
+            lifetimes=lifetimes if self.born.any() else None,
+            nodes=self.nodes(),
+            parents=parents,
+        )
 
     def nodes(self) -> Nodes:
         """The carrying motion, for the encoder."""
@@ -155,17 +200,9 @@ class GroupModel:
         return Model(self.frame(t)).gaussians()
 
 
-def _mean_of(graph: NodeGraph, tracked: list[Model], poses: list[Pose]) -> Model:
-    """Canonical Gaussians: the tracked ones, turned back to the keyframe's pose, on average."""
-    first = tracked[0].params
-    mean = {n: torch.stack([m.params[n] for m in tracked]).mean(0) for n in first}
-    total = torch.zeros_like(first["quats"])
-    for model, pose in zip(tracked, poses, strict=True):
-        _, turned = graph.carry(first["means"], pose)
-        back = quat_multiply(quat_conjugate(turned), model.params["quats"])
-        total += back * torch.where((back * first["quats"]).sum(1, keepdim=True) < 0, -1.0, 1.0)
-    quats = torch.nn.functional.normalize(total, dim=1)
-    return Model({**mean, "means": first["means"], "quats": quats})
+def _padded(model: Model, last: Model) -> Model:
+    """The model with the Gaussians that it does not have yet, as they are in `last`."""
+    return Model({n: torch.cat([p, last.params[n][len(p) :]]) for n, p in model.params.items()})
 
 
 class _Finetuner:
@@ -180,7 +217,7 @@ class _Finetuner:
         rates += [(s, LAPLACE_RATE) for s in group.log_scales.values()]
         self.optimizer = torch.optim.Adam([{"params": [p], "base": r} for p, r in rates], betas=(0.9, 0.99), fused=True)
         canonical = {n: CANONICAL_SHARE * r for n, r in keyframe.RATES.items()}
-        self.canonical_rates = {} if group.fixed else {"means": MEANS_RATE * radius, **canonical}
+        self.canonical_rates = {"means": MEANS_RATE * radius, **canonical} if group.known < len(group.key) else {}
 
     def step(self, t: int, fade: float) -> float:
         """One step on frame `t`, all rates times `fade`; returns the image loss."""
@@ -206,6 +243,8 @@ class _Finetuner:
             if price:
                 rate = group.canonical_rate.gradients(group.key.params, CANONICAL_PRICE * price, self.noise)
                 grads |= {n: grads[n] + g for n, g in rate.items()}
+            for g in grads.values():
+                g[: group.known] = 0
             group.key.adam(grads, {n: r * fade for n, r in self.canonical_rates.items()})
         return result.loss
 

@@ -15,6 +15,7 @@ from gscodec import _native
 from gscodec.sampling import farthest_points
 
 NODES = 256  # 1000 track as well
+STILL_SHARE = 0.25  # of the nodes, for what does not move yet, if that is as large a share of the Gaussians
 BLENDED = 4  # nodes that carry one Gaussian
 EDGES = 8  # neighbours of a node in the rigidity term
 HELD = 0.1  # weight from which a node has a hold on a Gaussian
@@ -95,37 +96,68 @@ class NodeGraph:
     """Nodes of a keyframe and the weights by which they carry its Gaussians.
 
     Args:
-        means: [N, 3] positions in the keyframe; radius: of the subject, world units.
+        means: [N, 3] positions in the keyframe.
+        low, step: [3] and world units, origin and spacing of the lattice; chosen: [M, 3] u32, nodes on it.
 
     Attributes:
         means: as given.
         nodes: [M, 3] positions of the nodes in the keyframe.
     """
 
-    def __init__(self, means: torch.Tensor, radius: float, count: int = NODES):
-        from scipy.sparse import csr_matrix
+    def __init__(self, means: torch.Tensor, low: torch.Tensor, step: float, chosen: np.ndarray):
         from scipy.spatial import cKDTree
 
-        self.means = means
+        self.lattice = (low, step, chosen)
+        self.nodes = low + step * torch.from_numpy(chosen.astype(np.float32))
+        self.means, self._blend = means[:0], None
+        self.extend(means)
+        m, k = len(chosen), min(EDGES, len(chosen) - 1)
+        near = cKDTree(self.nodes.numpy()).query(self.nodes.numpy(), k + 1)[1].reshape(m, -1)[:, 1:]
+        self._edges = torch.from_numpy(near.astype(np.int64))
+        length = (self.nodes[self._edges] - self.nodes[:, None]).norm(dim=2, keepdim=True)
+        middle = length.median() if k else torch.ones(())
+        hold = torch.exp2(-((length / (1.5 * middle)) ** 2))  # long edges bridge gaps: they hold less
+        self._hold = hold * GRID / step
+
+    @staticmethod
+    def of(means: torch.Tensor, radius: float, moving: torch.Tensor, count: int = NODES) -> NodeGraph:
+        """Nodes for Gaussians at `means` [N, 3], most of them where `moving` ([N] bool); `radius` of these."""
         low, step = means.min(0).values, GRID * radius
         grid = torch.round((means - low) / step).numpy().astype(np.uint32)
-        chosen = np.unique(grid[farthest_points(means.numpy(), count)], axis=0)
-        chosen = chosen[_native.morton_order(chosen)]
+        if (~moving).float().mean() < STILL_SHARE:  # nodes that stay among others that move would hold them
+            moving = torch.ones_like(moving)
+        still = int(STILL_SHARE * count) if (~moving).any() else 0
+        some = [np.zeros((0, 3), np.uint32)]
+        for mask, most in ((moving, count - still), (~moving, still)):
+            if mask.any() and most:
+                some.append(grid[mask.numpy()][farthest_points(means[mask].numpy(), most)])
+        chosen = np.unique(np.concatenate(some), axis=0)
+        return NodeGraph(means, low, step, chosen[_native.morton_order(chosen)])
+
+    def extend(self, means: torch.Tensor) -> None:
+        """More Gaussians to carry, at [K, 3] in the keyframe."""
+        from scipy.sparse import csr_matrix, vstack
+
+        low, step, chosen = self.lattice
+        grid = torch.round((means - low) / step).clamp(min=0).numpy().astype(np.uint32)
         index, weight = _native.node_weights(grid, chosen, BLENDED)
         parts = (
             weight.astype(np.float32).ravel(),
             index.astype(np.int32).ravel(),
             index.shape[1] * np.arange(len(grid) + 1),
         )
-        self._blend = csr_matrix(parts, (len(grid), len(chosen)))  # [N, M]
+        rows = csr_matrix(parts, (len(grid), len(chosen)))
+        self._blend = rows if self._blend is None else vstack([self._blend, rows], format="csr")  # [N, M]
         self._gather = self._blend.T.tocsr()
-        self.nodes = low + step * torch.from_numpy(chosen.astype(np.float32))
-        m, k = len(chosen), min(EDGES, len(chosen) - 1)
-        near = cKDTree(self.nodes.numpy()).query(self.nodes.numpy(), k + 1)[1].reshape(m, -1)[:, 1:]
-        self._edges = torch.from_numpy(near.astype(np.int64))
-        length = (self.nodes[self._edges] - self.nodes[:, None]).norm(dim=2, keepdim=True)
-        middle = length.median() if k else torch.ones(())
-        self._hold = torch.exp2(-((length / (1.5 * middle)) ** 2)) / radius  # long edges bridge gaps: they hold less
+        self.means = torch.cat([self.means, means])
+
+    def carried_back(self, means: torch.Tensor, pose: Pose) -> torch.Tensor:
+        """[K, 3] positions in the keyframe of points at `means` in `pose`, by the motion of the nearest node."""
+        from scipy.spatial import cKDTree
+
+        nearest = torch.from_numpy(cKDTree(pose.nodes.numpy()).query(means.numpy())[1])
+        back = quat_to_matrix(quat_conjugate(pose.turned[nearest]))
+        return self.nodes[nearest] + torch.einsum("kij,kj->ki", back, means - pose.nodes[nearest])
 
     def __len__(self) -> int:
         return len(self.nodes)

@@ -20,6 +20,7 @@ RATES = {"quats": 2e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 5e-3
 MEANS_RATE = (1.6e-3, 1.6e-5)  # start, end, times the radius of the subject
 DENSIFY_EVERY = 100
 DENSIFY_FROM, DENSIFY_UNTIL = 0.1, 0.6  # of the steps
+KEYFRAME_SHARE = 0.8  # of the Gaussians at most; the rest is for births
 GROWTH = 0.12  # share of the Gaussians that one round may add
 THINNING = 0.25  # share of the Gaussians that one round of thinning may take
 THIN_UNTIL = 0.8  # of the steps, from DENSIFY_UNTIL on: what is left of them repairs the picture
@@ -62,6 +63,10 @@ class Statistics:
         views = max(self.views, 1)
         return self.pulse * len(opacities) / views / (1 - opacities).clamp(min=1e-3).square()
 
+    def mean_pull(self) -> torch.Tensor:
+        """[N], over the steps that saw the Gaussian."""
+        return self.pull / self.seen.clamp(min=1)
+
 
 def train_keyframe(
     model: Model,
@@ -96,7 +101,7 @@ def train_keyframe(
         model.adam(result.grads, {"means": rate, **{n: r * 0.1**fade for n, r in RATES.items()}})
         if densify and (step + 1) % DENSIFY_EVERY == 0:
             if DENSIFY_FROM * steps < step < DENSIFY_UNTIL * steps:
-                grow(model, stats, settings.gaussians_max, radius, rng)
+                grow(model, stats, int(KEYFRAME_SHARE * settings.gaussians_max), radius, rng)
             elif step >= DENSIFY_UNTIL * steps:
                 prune(model, stats, thin=step < THIN_UNTIL * steps)
             stats = Statistics(len(model))
@@ -124,7 +129,7 @@ def grow(model: Model, stats: Statistics, most: int, radius: float, rng: np.rand
     """One round of densification: the Gaussians with the strongest pull are split (large) or cloned (small)."""
     keep = torch.sigmoid(model.params["logit_opacities"]) > PRUNE_OPACITY
     keep &= (stats.weight > PRUNE_WEIGHT) | (stats.seen == 0)
-    pull = stats.pull / stats.seen.clamp(min=1)
+    pull = stats.mean_pull()
     pull[~keep] = 0
     room = max(0, min(int(GROWTH * len(model)), most - int(keep.sum())))
     chosen = torch.topk(pull, min(room, len(pull))).indices

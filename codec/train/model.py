@@ -72,7 +72,7 @@ def from_points(points: np.ndarray, colors: np.ndarray, *, opacity: float, sh_co
 
     n = len(points)
     near = cKDTree(points).query(points, min(4, n))[0].reshape(n, -1)[:, 1:] if n > 1 else np.ones((n, 1))
-    spacing = np.maximum(near.mean(1), 1e-6 + 1e-3 * near.mean())
+    spacing = np.maximum(near.mean(1), 1e-6 + 1e-3 * near.mean()) if n else np.zeros(0)
     tensor = lambda a: torch.tensor(np.ascontiguousarray(a), dtype=torch.float32)  # noqa: E731
     quats = np.zeros((n, 4))
     quats[:, 0] = 1

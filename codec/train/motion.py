@@ -19,9 +19,12 @@ from dataclasses import fields, replace
 import numpy as np
 import torch
 
+from gscodec.bitstream.quantization import subject_radius
 from gscodec.render.workspace import Workspace
+from gscodec.train.births import born, wrong_pixels
 from gscodec.train.changes import Changes
 from gscodec.train.graph import NodeGraph, Pose, quat_conjugate, quat_multiply, rotvec_to_quat
+from gscodec.train.keyframe import Statistics
 from gscodec.train.model import NAMES, Model
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, compare
@@ -35,34 +38,57 @@ MASK_LAMBDA = 3.0  # the silhouette counts more than in a keyframe: it does not 
 # The Gaussians' own: what light changes is quick, place and shape are slow, so that the nodes take the motion.
 RATES = {"quats": 6e-4, "log_scales": 6e-3, "logit_opacities": 2e-2, "sh0": 5e-2, "shN": 2.5e-3}
 MEANS_RATE = 3e-5  # radii
+CALM = 0.995  # quantile of the pull in a keyframe
 VISIBLE = 0.05  # blending weight from which a camera sees a Gaussian
 
 
 class Tracker:
-    """Follows the Gaussians of a keyframe through the frames after it.
+    """Follows the Gaussians of a keyframe through the frames after it; `start` makes one.
 
     Args:
-        key: the keyframe's Gaussians.
-        radius: of the subject, world units.
-        loss: image loss of the keyframe, without the mask's.
+        graph: nodes in the keyframe; own: see below.
+        radius: of what moves, world units.
+        loss: see below; calm: pull on a Gaussian (`Statistics.mean_pull`) that hardly any has in the keyframe.
         changes: what has been fitted so far.
 
     Attributes:
         own: the Gaussians as they would be in the keyframe's pose; `means` is what they moved besides the nodes.
         pose: the nodes in the last frame.
         moving: [N] bool, Gaussians that were free to change in the last frame.
-        loss: image loss of the last frame that had changed.
+        loss: image loss of the last frame that had changed, without the mask's.
+        masks: what has changed in the last frame's pictures, as of `Changes.advance`.
+        pull: [N], mean pull of the last frame's pictures on each Gaussian.
     """
 
-    def __init__(self, key: Model, views: Views, settings: TrainSettings, radius: float, loss: float, changes: Changes):
-        self.views, self.radius = views, radius
+    def __init__(
+        self, graph: NodeGraph, own: Model, views: Views, settings: TrainSettings, numbers: np.ndarray, changes: Changes
+    ):
+        self.graph, self.own, self.pose, self.views = graph, own, Pose.rest(graph), views
         self.settings = replace(settings, mask_lambda=MASK_LAMBDA * settings.mask_lambda)
-        self.graph = NodeGraph(key.params["means"], radius)
-        self.pose = Pose.rest(self.graph)
-        self.own = Model({**key.params, "means": torch.zeros_like(key.params["means"])})
-        self.loss, self.changes = loss, changes
-        self.moving = torch.zeros(len(key), dtype=torch.bool)
+        self.radius, self.loss, self.calm = numbers.tolist()
+        self.changes = changes
+        self.moving = torch.zeros(len(own), dtype=torch.bool)
         self.workspace = Workspace()
+
+    @staticmethod
+    def start(key: Model, views: Views, settings: TrainSettings, loss: float, frames: range) -> Tracker:
+        """Follows `key`, the keyframe of frames[0] with image loss `loss`; most nodes go where frames[1] differs."""
+        rng, workspace, stats, visible = np.random.default_rng(settings.seed), Workspace(), Statistics(len(key)), []
+        for camera in views.train_cameras:
+            result = compare(key.params, views.target(camera, frames[0]), settings, rng, workspace)
+            stats.add(result)
+            visible.append(result.max_weight > VISIBLE)
+        means = key.params["means"]
+        moving = np.ones(len(key), bool)
+        if len(frames) > 1:
+            peek = Changes.since(views, frames[0])
+            seen = peek.behind(peek.advance(frames[1]), means.numpy(), visible)
+            moving = seen if seen.any() else moving
+        radius = subject_radius(means[moving].numpy())
+        graph = NodeGraph.of(means, radius, torch.from_numpy(moving))
+        own = Model({**key.params, "means": torch.zeros_like(means)})
+        calm = float(torch.quantile(stats.mean_pull(), CALM))
+        return Tracker(graph, own, views, settings, np.array([radius, loss, calm]), Changes.since(views, frames[0]))
 
     def carried(self, own: Model, pose: Pose) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """Attributes in the frame of `pose`, and how far the nodes have turned each Gaussian, [N, 4]."""
@@ -90,14 +116,33 @@ class Tracker:
                 break
         self.own, self.pose = fit.result()
         self.loss = loss
+        self.pull = fit.pull.mean_pull()
         return loss
+
+    def bear(self, frame: int, on_step: Callable[[int, float], None] | None = None) -> None:
+        """Adds the Gaussians that `frame` needs besides, after `advance`."""
+        room = self.settings.gaussians_max - len(self.own)
+        pull = self.pull / self.calm
+        wrong = wrong_pixels(self.model, self.masks, frame, self.views)
+        young = born(self.model, pull, wrong, frame, self.views, self.settings, room, on_step)
+        if young is not None:
+            self._add(young)
+
+    def _add(self, young: Model) -> None:
+        """Takes in Gaussians that were born in the pose of the last frame."""
+        self.graph.extend(self.graph.carried_back(young.params["means"], self.pose))
+        means, turned = (x[len(self.own) :] for x in self.graph.carry(self.graph.means, self.pose))
+        quats = quat_multiply(quat_conjugate(turned), young.params["quats"])
+        self.own.append({**young.params, "means": young.params["means"] - means, "quats": quats})
+        self.moving = torch.cat([self.moving, torch.ones(len(young), dtype=torch.bool)])
 
     def _round(self, fit: _Fit, frame: int, scale: float, on_step) -> float:
         """`motion_steps` views, the first half of them at `scale` of their size; returns the image loss at the end."""
         losses, steps = [], self.settings.motion_steps
         for step in range(steps):
-            target = self.views.draw(frame, scale if 2 * step < steps else 1.0)
-            losses.append(fit.step(target, 0.1 ** (step / steps)))
+            first = 2 * step < steps
+            target = self.views.draw(frame, scale if first else 1.0)
+            losses.append(fit.step(target, 0.1 ** (step / steps), not first))
             if on_step:
                 on_step(step, losses[-1])
         return float(np.mean(losses[-LOSS_WINDOW:]))
@@ -105,6 +150,7 @@ class Tracker:
     def _moving(self, frame: int) -> np.ndarray:
         """[N] bool: Gaussians that `frame` shows otherwise."""
         masks, model = self.changes.advance(frame), self.model
+        self.masks = masks
         if not any(m.any() for m in masks):
             return np.zeros(len(model), bool)
         rng, visible = np.random.default_rng(self.settings.seed), []
@@ -119,22 +165,18 @@ class Tracker:
         own = {f"own.{n}": p.numpy() for n, p in self.own.params.items()}
         pose = {f"pose.{f.name}": getattr(self.pose, f.name).numpy() for f in fields(Pose)}
         fitted = {f"fitted.{i}": picture for i, picture in enumerate(self.changes.fitted)}
-        return {
-            "radius_loss": np.array([self.radius, self.loss]),
-            "key_means": self.graph.means.numpy(),
-            **own,
-            **pose,
-            **fitted,
-        }
+        low, step, chosen = self.graph.lattice
+        numbers = {"numbers": np.array([self.radius, self.loss, self.calm]), "key_means": self.graph.means.numpy()}
+        return {**numbers, "low": low.numpy(), "step": np.array(step), "nodes": chosen, **own, **pose, **fitted}
 
     @staticmethod
     def restored(state: dict[str, np.ndarray], views: Views, settings: TrainSettings) -> Tracker:
         """Inverse of `state`."""
         own = Model({n: torch.from_numpy(state[f"own.{n}"]) for n in NAMES})
-        key = Model({**own.params, "means": torch.from_numpy(state["key_means"])})
+        means, low = (torch.from_numpy(state[n]) for n in ("key_means", "low"))
+        graph = NodeGraph(means, low, float(state["step"]), state["nodes"])
         changes = Changes(views, [state[f"fitted.{i}"] for i in range(len(views.train_cameras))])
-        tracker = Tracker(key, views, settings, *state["radius_loss"].tolist(), changes)
-        tracker.own = own
+        tracker = Tracker(graph, own, views, settings, state["numbers"], changes)
         tracker.pose = Pose(*(torch.from_numpy(state[f"pose.{f.name}"]) for f in fields(Pose)))
         return tracker
 
@@ -155,17 +197,20 @@ class _Fit:
         rates = [(self.turn, TURN_RATE), (self.move, MOVE_RATE * tracker.radius)]
         self.optimizer = torch.optim.Adam([{"params": [p], "base": r} for p, r in rates], betas=(0.9, 0.99), fused=True)
         self.own = Model(tracker.own.params)
+        self.pull = Statistics(len(self.own))
 
     def _pose(self) -> Pose:
         pose, turn = self.t.pose, rotvec_to_quat(self.turn)
         turned = torch.nn.functional.normalize(quat_multiply(turn, pose.turned), dim=1)
         return Pose(pose.nodes + self.move, turned, self.turn, self.move)
 
-    def step(self, target, fade: float) -> float:
-        """One view; rates times `fade`."""
+    def step(self, target, fade: float, full: bool) -> float:
+        """One view; rates times `fade`; a `full` one counts for what pulls at the Gaussians."""
         t, pose = self.t, self._pose()
         params, turned = t.carried(self.own, pose)
         result = compare(params, target, t.settings, self.rng, t.workspace)
+        if full:
+            self.pull.add(result)
         grads = result.grads
         rigid = t.settings.rigidity * t.graph.rigidity(pose)
         for g in self.optimizer.param_groups:

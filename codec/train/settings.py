@@ -16,7 +16,7 @@ class TrainSettings:
         keyframe_steps: optimisation steps for a keyframe, which always starts from nothing.
         motion_steps: steps a frame for tracking.
         finetune_steps: steps a frame for the joint fine-tuning of the group.
-        gaussians_max: bound on the count while densifying.
+        gaussians_max: bound on the count; a keyframe has four fifths of it at most, births the rest.
         ssim_lambda: share of D-SSIM in the image loss (3D Gaussian Splatting: 0.2).
         mask_lambda: weight of the alpha loss where the capture has masks.
         cut_ratio: a frame whose image loss exceeds the keyframe's by this factor starts a group of its own.
@@ -30,7 +30,7 @@ class TrainSettings:
     keyframe_steps: int = 1500
     motion_steps: int = 200
     finetune_steps: int = 80
-    gaussians_max: int = 14000
+    gaussians_max: int = 17500
     initial_points: int = 8000
     ssim_lambda: float = 0.2
     mask_lambda: float = 0.1
@@ -46,9 +46,9 @@ class TrainSettings:
 
 
 PRESETS = {
-    "fast": {"keyframe_steps": 700, "motion_steps": 100, "finetune_steps": 40, "gaussians_max": 8000},
+    "fast": {"keyframe_steps": 700, "motion_steps": 100, "finetune_steps": 40, "gaussians_max": 10000},
     "medium": {},
-    "slow": {"keyframe_steps": 4000, "motion_steps": 250, "finetune_steps": 300, "gaussians_max": 25000},
+    "slow": {"keyframe_steps": 4000, "motion_steps": 250, "finetune_steps": 300, "gaussians_max": 31000},
 }
 
 

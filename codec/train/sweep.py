@@ -26,31 +26,34 @@ NEAR, FAR = 0.2, 4.0  # times the distance to where the axes meet
 SHELL = 500  # points on the whole sphere
 
 
-def sweep(views, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def sweep(views, count: int, seed: int, masks: list[np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Points on the surfaces that several views see.
 
     Args:
         views: (camera, rgb u8 [H, W, 3], alpha or None) of each training camera.
         count: at most so many points.
+        masks: [H, W] bool of each view, at any size: where to look; everywhere if None.
 
     Returns:
         points [P, 3], colours [P, 3] in 0..1. P is 0 where no two views agree anywhere.
     """
     import cv2
 
-    cameras, pictures = [], []
-    for camera, rgb, _ in views:
+    cameras, pictures, where = [], [], []
+    for i, (camera, rgb, _) in enumerate(views):
         scale = min(1.0, WIDTH / camera.width)
         size = (round(scale * camera.width), round(scale * camera.height))
         cameras.append(camera.resized(*size))
         pictures.append(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA))
+        mask = np.ones((1, 1), np.uint8) if masks is None else masks[i].astype(np.uint8)
+        where.append(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0)
     greys = [cv2.cvtColor(p, cv2.COLOR_RGB2GRAY).astype(np.float32) for p in pictures]
     centre = meeting_point(cameras)
     distance = np.median([np.linalg.norm(c.center - centre) for c in cameras])
     inverse = np.linspace(1 / (FAR * distance), 1 / (NEAR * distance), PLANES)
     near = [_neighbours(cameras, i) for i in range(len(cameras))]
-    depths = [_depth(cameras, greys, i, near[i], inverse) for i in range(len(cameras))]
-    points, colors = [], []
+    depths = [_depth(cameras, greys, where[i], i, near[i], inverse) for i in range(len(cameras))]
+    points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for i, camera in enumerate(cameras):
         y, x = np.nonzero(depths[i])
         found = _unproject(camera, x, y, depths[i][y, x])
@@ -115,18 +118,25 @@ def _windows(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return mean, np.sqrt(np.maximum(cv2.blur(grey * grey, (WINDOW, WINDOW)) - mean * mean, 1e-6))
 
 
-def _depth(cameras, greys, i: int, near: list[int], inverse: np.ndarray) -> np.ndarray:
-    """[H, W] depth of view `i`, 0 where it is not known."""
+def _depth(cameras, greys, where: np.ndarray, i: int, near: list[int], inverse: np.ndarray) -> np.ndarray:
+    """[H, W] depth of view `i`, 0 where it is not known; `where` [H, W] bool: pixels that are asked for."""
     import cv2
 
-    grey, size = greys[i], greys[i].shape[::-1]
+    whole = np.zeros(greys[i].shape, np.float32)
+    rows, cols = np.flatnonzero(where.any(1)), np.flatnonzero(where.any(0))
+    if not near or not len(rows):
+        return whole
+    top, bottom, left, right = rows[0], rows[-1] + 1, cols[0], cols[-1] + 1
+    part = (slice(top, bottom), slice(left, right))
+    camera, grey = cameras[i].cropped(left, top, right - left, bottom - top), greys[i][part]
     mean, deviation = _windows(grey)
     best, depth = np.full(grey.shape, -1, np.float32), np.zeros(grey.shape, np.float32)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    for d in inverse if near else ():
+    for d in inverse:
         scores = np.empty((len(near), *grey.shape), np.float32)
         for score, j in zip(scores, near, strict=True):
-            seen = cv2.warpPerspective(greys[j], _plane(cameras[i], cameras[j], d), size, flags=flags, borderValue=-1)
+            plane = _plane(camera, cameras[j], d)
+            seen = cv2.warpPerspective(greys[j], plane, grey.shape[::-1], flags=flags, borderValue=-1)
             mean_seen, deviation_seen = _windows(seen)
             score[:] = cv2.blur(grey * seen, (WINDOW, WINDOW)) - mean * mean_seen
             score /= deviation * np.maximum(deviation_seen, FLAT)
@@ -134,5 +144,6 @@ def _depth(cameras, greys, i: int, near: list[int], inverse: np.ndarray) -> np.n
         score = np.sort(scores, 0)[-BEST:].mean(0)
         better = score > best
         best[better], depth[better] = score[better], 1 / d
-    depth[(best < CORRELATION) | (deviation < FLAT)] = 0
-    return depth
+    depth[(best < CORRELATION) | (deviation < FLAT) | ~where[part]] = 0
+    whole[part] = depth
+    return whole

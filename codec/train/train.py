@@ -19,7 +19,6 @@ from gscodec.errors import CaptureError
 from gscodec.gaussians import Group
 from gscodec.part_file import read_arrays, write_arrays
 from gscodec.train.carve import carve, random_box
-from gscodec.train.changes import Changes
 from gscodec.train.finetune import GroupModel, finetune
 from gscodec.train.graph import Pose
 from gscodec.train.keyframe import train_keyframe
@@ -114,23 +113,25 @@ class Subject:
     Attributes:
         tracker: where they are in the last frame.
         loss: image loss of their keyframe, which tells when they no longer serve.
+        radius: of all Gaussians in the keyframe, world units.
         canonical: what all groups since the keyframe refer to; None before the first one is fine-tuned.
     """
 
     tracker: Tracker
     loss: float
+    radius: float
     canonical: Model | None = None
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays."""
         canonical = {f"canonical.{n}": p.numpy() for n, p in self.canonical.params.items()}
-        return {"loss": np.array(self.loss), **canonical, **self.tracker.state()}
+        return {"loss_radius": np.array([self.loss, self.radius]), **canonical, **self.tracker.state()}
 
     @staticmethod
     def restored(state: dict[str, np.ndarray], views: Views, settings: TrainSettings) -> Subject:
         """Inverse of `state`."""
         canonical = {n: torch.from_numpy(state[f"canonical.{n}"]) for n in NAMES}
-        return Subject(Tracker.restored(state, views, settings), float(state["loss"]), Model(canonical))
+        return Subject(Tracker.restored(state, views, settings), *state["loss_radius"].tolist(), Model(canonical))
 
 
 def train_groups(
@@ -217,28 +218,30 @@ class _Run:
         self.views.restart()
         if self.subject is not None:
             self._follow(frames, track)
-        parents = np.arange(len(self.subject.tracker.own), dtype=np.int32) if track.models else None
+        known = len(self.subject.canonical) if track.models else 0
         if not track.models:  # nothing to follow, or lost at once
-            self.subject = self._keyframe(frames[0])
+            self.subject = self._keyframe(frames)
             track.add(self.subject.tracker)
             self._follow(frames[1:], track)
         subject, done = self.subject, frames[: len(track.models)]
         if len(done) < len(frames):
             self.subject = None
-        if len(done) == 1 and parents is None:
+        if len(done) == 1 and not known:
             subject.canonical = track.models[0]
             return Group([subject.canonical.gaussians()])
         model = self._finetuned(subject, done, track)
         subject.canonical = model.key
-        return Group([model.gaussians(t) for t in range(len(done))], nodes=model.nodes(), parents=parents)
+        index = np.arange(len(model.key), dtype=np.int32)
+        return model.group(np.where(index < known, index, -1) if known else None)
 
-    def _keyframe(self, frame: int) -> Subject:
+    def _keyframe(self, frames: range) -> Subject:
+        """Of the first of `frames`."""
         s = self.settings
-        model = initial_model(self.capture, frame, s)
+        model = initial_model(self.capture, frames[0], s)
         radius = subject_radius(model.params["means"].numpy())
-        on_step = self._report(f"keyframe {frame}")
-        loss = train_keyframe(model, self.views, frame, s, steps=s.keyframe_steps, radius=radius, on_step=on_step)
-        return Subject(Tracker(model, self.views, s, radius, loss, Changes.since(self.views, frame)), loss)
+        on_step = self._report(f"keyframe {frames[0]}")
+        loss = train_keyframe(model, self.views, frames[0], s, steps=s.keyframe_steps, radius=radius, on_step=on_step)
+        return Subject(Tracker.start(model, self.views, s, loss, frames), loss, radius)
 
     def _follow(self, frames: range, track: _Track) -> None:
         """Adds the frames to `track` until the subject is lost."""
@@ -247,14 +250,15 @@ class _Run:
             loss = subject.tracker.advance(frame, self._report(f"track {frame}"))
             if loss is not None and loss > self.settings.cut_ratio * subject.loss + CUT_FLOOR:
                 break
+            if loss is not None:
+                subject.tracker.bear(frame, self._report(f"births {frame}"))
             track.add(subject.tracker)
 
     def _finetuned(self, subject: Subject, frames: range, track: _Track) -> GroupModel:
-        radius = subject.tracker.radius
-        steps = steps_for(self.settings.quality, radius)
+        steps = steps_for(self.settings.quality, subject.radius)
         model = GroupModel(subject.tracker.graph, subject.canonical, track.models, track.poses, steps, track.moved())
         on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
-        finetune(model, self.views, frames, self.settings, radius=radius, on_step=on_step)
+        finetune(model, self.views, frames, self.settings, radius=subject.tracker.radius, on_step=on_step)
         return model
 
 
@@ -273,4 +277,8 @@ class _Track:
 
     def moved(self) -> torch.Tensor:
         """[N] bool: touched in any frame."""
-        return torch.stack(self.moving).any(0)
+        moved = torch.ones(len(self.moving[-1]), dtype=torch.bool)  # what is born moves
+        moved[: len(self.moving[0])] = False
+        for moving in self.moving:
+            moved[: len(moving)] |= moving
+        return moved

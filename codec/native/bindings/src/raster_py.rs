@@ -6,7 +6,7 @@ mod kernels;
 use numpy::{PyArray1, PyReadonlyArrayDyn, PyReadwriteArrayDyn, prelude::*};
 use pyo3::exceptions::{PyOverflowError, PyValueError};
 use pyo3::prelude::*;
-use raster::{Gradients, Lambdas, Level, RasterError, Region, Shade, Splats, Step, Surface, Target, View};
+use raster::{Gradients, Lambdas, Level, Projected, RasterError, Region, Shade, Splats, Step, Surface, Target, View};
 
 type In<'py> = PyReadonlyArrayDyn<'py, f32>;
 type InOut<'py> = PyReadwriteArrayDyn<'py, f32>;
@@ -16,6 +16,12 @@ type Grads<'py> = (
     (InOut<'py>, InOut<'py>, InOut<'py>, InOut<'py>, InOut<'py>, InOut<'py>),
     (InOut<'py>, InOut<'py>, InOut<'py>),
 );
+type Crop<'py> = (
+    ViewArgs,
+    ([f32; 3], Option<[f32; 3]>),
+    (Bytes<'py>, Option<Bytes<'py>>, Option<In<'py>>),
+);
+type Value = (f64, f64, f64, f64, f64, [f64; 3]);
 /// (image, alpha), flat
 type Picture<'py> = (Bound<'py, PyArray1<f32>>, Bound<'py, PyArray1<f32>>);
 
@@ -46,6 +52,7 @@ fn splats<'a>(p: &'a Params) -> PyResult<Splats<'a>> {
 fn gradients<'a>(g: &'a mut Grads) -> PyResult<Gradients<'a>> {
     let (params, stats) = g;
     Ok(Gradients {
+        add: false,
         means: contiguous(params.0.as_slice_mut())?,
         quats: contiguous(params.1.as_slice_mut())?,
         log_scales: contiguous(params.2.as_slice_mut())?,
@@ -168,41 +175,49 @@ impl Rasterizer {
             .map_err(usage)
     }
 
-    /// (loss, l1, mse, ssim, mask, gradient of the gain). `target` is (rgb, alpha or None, weight or None).
-    #[allow(clippy::too_many_arguments, clippy::type_complexity)]
-    fn step(
+    /// One step on a batch of crops: of each (loss, l1, mse, ssim, mask, gradient of the gain), and [N] the largest radii. The
+    /// gradients are those of the sum of the losses. A crop is (view, (background, gain or None), (rgb, alpha or None, weight
+    /// or None)).
+    fn step<'py>(
         &mut self,
-        py: Python,
+        py: Python<'py>,
         params: Params,
-        view: ViewArgs,
-        shade: ([f32; 3], Option<[f32; 3]>),
-        target: (Bytes, Option<Bytes>, Option<In>),
+        crops: Vec<Crop>,
         lambdas: (f32, f32),
         grads: Grads,
-    ) -> PyResult<(f64, f64, f64, f64, f64, [f64; 3])> {
+    ) -> PyResult<(Vec<Value>, Bound<'py, PyArray1<f32>>)> {
         let mut grads = grads;
-        let (splats, view, mut out) = (splats(&params)?, view.view(), gradients(&mut grads)?);
-        let (rgb, alpha, weight) = &target;
-        let target = Target {
-            rgb: contiguous(rgb.as_slice())?,
-            alpha: alpha.as_ref().map(|a| contiguous(a.as_slice())).transpose()?,
-            weight: weight.as_ref().map(|w| contiguous(w.as_slice())).transpose()?,
+        let (splats, mut out) = (splats(&params)?, gradients(&mut grads)?);
+        let lambdas = Lambdas {
+            ssim: lambdas.0,
+            mask: lambdas.1,
         };
-        let (shade, lambdas) = (
-            Shade {
-                background: shade.0,
-                gain: shade.1,
-            },
-            Lambdas {
-                ssim: lambdas.0,
-                mask: lambdas.1,
-            },
-        );
         let (step, inner) = (&mut self.step, &mut self.inner);
-        let v = py
-            .detach(|| step.run(inner, &splats, &view, shade, target, lambdas, &mut out))
-            .map_err(usage)?;
-        Ok((v.loss, v.image.l1, v.image.mse, v.image.ssim, v.mask, v.gain))
+        let (mut values, mut radii) = (Vec::new(), vec![0.0f32; splats.len()]);
+        for (view, (background, gain), (rgb, alpha, weight)) in &crops {
+            let target = Target {
+                rgb: contiguous(rgb.as_slice())?,
+                alpha: alpha.as_ref().map(|a| contiguous(a.as_slice())).transpose()?,
+                weight: weight.as_ref().map(|w| contiguous(w.as_slice())).transpose()?,
+            };
+            let (view, shade) = (
+                view.view(),
+                Shade {
+                    background: *background,
+                    gain: *gain,
+                },
+            );
+            let v = py
+                .detach(|| step.run(inner, &splats, &view, shade, target, lambdas, &mut out))
+                .map_err(usage)?;
+            values.push((v.loss, v.image.l1, v.image.mse, v.image.ssim, v.mask, v.gain));
+            radii
+                .iter_mut()
+                .zip(inner.projected())
+                .for_each(|(r, p)| *r = r.max(p.radius()));
+            out.add = true;
+        }
+        Ok((values, PyArray1::from_vec(py, radii)))
     }
 
     /// Draws and returns the picture as 8 bits, flat.
@@ -233,9 +248,8 @@ impl Rasterizer {
     /// [N] larger half side of each ellipse's box in pixels, 0 for the invisible, and [N] depths.
     fn radii<'py>(&self, py: Python<'py>) -> Picture<'py> {
         let projected = self.inner.projected();
-        let radii = projected.iter().map(|p| if p.visible() { p.rx.max(p.ry) } else { 0.0 });
         (
-            PyArray1::from_iter(py, radii),
+            PyArray1::from_iter(py, projected.iter().map(Projected::radius)),
             PyArray1::from_iter(py, projected.iter().map(|p| p.depth)),
         )
     }

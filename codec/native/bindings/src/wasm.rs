@@ -5,6 +5,7 @@
 //! `pixels` or a band; any call may move the memory, so addresses hold until the next one. Calls that can fail return
 //! false and leave a message in `output`. Nothing here is unsafe: the host touches memory only from outside.
 
+mod pack;
 mod player;
 mod text;
 
@@ -134,6 +135,12 @@ pub extern "C" fn band_first(i: usize) -> usize {
 #[unsafe(no_mangle)]
 pub extern "C" fn band_rows(i: usize) -> usize {
     with(|p| p.band(i).map_or(0, |b| b.rows))
+}
+
+/// Input: as for `project`. Output: what it shows of the evaluated frame as Spark takes it, relative to an origin.
+#[unsafe(no_mangle)]
+pub extern "C" fn pack(x: f32, y: f32, z: f32) -> bool {
+    with(|p| p.pack([x, y, z]))
 }
 
 /// Bytes of one element of a band.

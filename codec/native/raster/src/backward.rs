@@ -7,9 +7,11 @@
 use std::sync::atomic::AtomicU32;
 
 use crate::constants::{ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_STOP};
+use crate::picture::Pixels;
 use crate::project::Projected;
+use crate::rasterizer::Shade;
 use crate::simd::{Vector, c, dispatch};
-use crate::tile::{BATCH, BLOCK, Batch, Hits, Local, PIXEL_X, PIXEL_Y, Plane, opacities};
+use crate::tile::{BATCH, BLOCK, BLOCKS, Batch, Hits, Local, PIXEL_X, PIXEL_Y, Plane, opacities};
 
 /// Sums over the pixels of a pair. With a = dL/dalpha * alpha (the gradient by ln alpha) and w the blending weight:
 /// a, a u, a v, a u^2, a u v, a v^2, w g (3), w, largest w, unused.
@@ -32,57 +34,126 @@ pub struct Adjoint {
     pub rgb: [Plane; 3],
 }
 
+/// Visits (a Gaussian on a block) that are prepared together, and the most that one Gaussian adds to them.
+const VISITS: usize = 64;
+/// Visits whose exponentials are computed together, which hides their latency.
+const TOGETHER: usize = 4;
+const ROOM: usize = VISITS + BLOCKS + TOGETHER;
+
+/// Visits of consecutive Gaussians, front to back, and u, v and alpha on their pixels (0 where the Gaussian is not drawn).
+struct Visits {
+    count: usize,
+    splat: [u8; ROOM],
+    block: [u8; ROOM],
+    u: [[f32; BLOCK]; ROOM],
+    v: [[f32; BLOCK]; ROOM],
+    alpha: [[f32; BLOCK]; ROOM],
+}
+
+/// Set bits of a byte, lowest first.
+static BITS: [[u8; 8]; 256] = {
+    let mut table = [[0; 8]; 256];
+    let mut i = 0;
+    while i < 256 {
+        let (mut n, mut bit) = (0, 0);
+        while bit < 8 {
+            if i >> bit & 1 == 1 {
+                table[i][n] = bit;
+                n += 1;
+            }
+            bit += 1;
+        }
+        i += 1;
+    }
+    table
+};
+
+impl Visits {
+    fn new() -> Visits {
+        let rows = [[0.0; BLOCK]; ROOM];
+        Visits {
+            count: 0,
+            splat: [0; ROOM],
+            block: [0; ROOM],
+            u: rows,
+            v: rows,
+            alpha: rows,
+        }
+    }
+
+    /// Appends those of a Gaussian; without branches, since the numbers of blocks cannot be foretold.
+    #[inline(always)]
+    fn push(&mut self, splat: usize, mask: u16) {
+        let [low, high] = mask.to_le_bytes();
+        let at = self.count.min(VISITS);
+        let middle = at + low.count_ones() as usize;
+        self.splat[at..at + BLOCKS].fill(splat as u8);
+        self.block[at..at + 8].copy_from_slice(&BITS[usize::from(low)]);
+        let high_blocks = u64::from_le_bytes(BITS[usize::from(high)]) + 0x0808_0808_0808_0808;
+        self.block[middle..middle + 8].copy_from_slice(&high_blocks.to_le_bytes());
+        self.count = middle + high.count_ones() as usize;
+    }
+
+    #[inline(always)]
+    fn prepare<V: Vector>(&mut self, splats: &[Local; BATCH]) {
+        let zero = c::<V>(0.0);
+        for first in (0..self.count.min(ROOM - TOGETHER)).step_by(TOGETHER) {
+            let four: [usize; TOGETHER] = std::array::from_fn(|i| first + i);
+            let s = four.map(|i| &splats[usize::from(self.splat[i]) & (BATCH - 1)]);
+            let b = four.map(|i| usize::from(self.block[i]) & (BLOCKS - 1));
+            for at in (0..BLOCK).step_by(V::LANES) {
+                let of = |plane: &Plane| b.map(|b| V::load(&plane.0[b][at..]));
+                let [u, v, e, raw] = opacities(s, of(&PIXEL_X), of(&PIXEL_Y));
+                for i in 0..TOGETHER {
+                    u[i].store(&mut self.u[first + i][at..]);
+                    v[i].store(&mut self.v[first + i][at..]);
+                    let alpha = raw[i].min(c(ALPHA_MAX)).select(e[i].ge(c(LOG2_ALPHA_MIN)), zero);
+                    alpha.store(&mut self.alpha[first + i][at..]);
+                }
+            }
+        }
+    }
+}
+
 struct Accumulator<V>([V; 12], V);
 
-/// Adds a Gaussian's sums over N vectors of pixels, each the lanes `at ..` of a block.
+/// Adds one visit to a Gaussian's sums.
 #[inline(always)]
-fn block_backward<V: Vector, const N: usize>(
-    s: &Local,
-    b: [usize; N],
-    at: usize,
-    adjoint: &mut Adjoint,
-    acc: &mut Accumulator<V>,
-) {
+fn visit<V: Vector>(visits: &Visits, k: usize, at: usize, s: &Local, adjoint: &mut Adjoint, acc: &mut Accumulator<V>) {
     let zero = c::<V>(0.0);
-    let of = |plane: &Plane| b.map(|b| V::load(&plane.0[b & 15][at..]));
-    let [u, v, e, raw] = opacities([s; N], of(&PIXEL_X), of(&PIXEL_Y));
-    let (t, remainder) = (of(&adjoint.transmittance), of(&adjoint.remainder));
-    let [red, green, blue] = [0, 1, 2].map(|ch| of(&adjoint.rgb[ch]));
-    for i in 0..N {
-        let alpha = raw[i].min(c(ALPHA_MAX));
-        let next = alpha.neg_mul_add(t[i], t[i]);
-        let hit = e[i].ge(c(LOG2_ALPHA_MIN));
-        let draw = hit & next.ge(c(TRANSMITTANCE_STOP));
-        // Not a select of the old value: that would become a masked store, whose result the next load has to wait for.
-        let drawn_alpha = alpha.select(draw, zero);
-        let sign = c::<V>(-0.0).select(hit & !draw, zero);
-        let left = drawn_alpha.neg_mul_add(t[i], t[i]).or(sign);
-        left.store(&mut adjoint.transmittance.0[b[i] & 15][at..]);
-
-        let weight = drawn_alpha * t[i];
-        let g = [red[i], green[i], blue[i]];
-        let d = g[0].mul_add(c(s.rgb[0]), g[1].mul_add(c(s.rgb[1]), g[2] * c(s.rgb[2])));
-        let wd = weight * d;
-        let rest = remainder[i] - wd;
-        rest.store(&mut adjoint.remainder.0[b[i] & 15][at..]);
-        let odds = alpha * (c::<V>(1.0) - alpha).recip_fast();
-        // the clamp at ALPHA_MAX stops the gradient
-        let free = draw & c::<V>(ALPHA_MAX).ge(raw[i]);
-        let a = odds.neg_mul_add(rest, wd).select(free, zero);
-        let (au, av) = (a * u[i], a * v[i]);
-        let sums = &mut acc.0;
-        sums[0] = sums[0] + a;
-        sums[1] = sums[1] + au;
-        sums[2] = sums[2] + av;
-        sums[3] = au.mul_add(u[i], sums[3]);
-        sums[4] = au.mul_add(v[i], sums[4]);
-        sums[5] = av.mul_add(v[i], sums[5]);
-        for ch in 0..3 {
-            sums[6 + ch] = weight.mul_add(g[ch], sums[6 + ch]);
-        }
-        sums[9] = sums[9] + weight;
-        acc.1 = acc.1.max(weight);
+    let b = usize::from(visits.block[k]) & (BLOCKS - 1);
+    let t = V::load(&adjoint.transmittance.0[b][at..]);
+    let remainder = V::load(&adjoint.remainder.0[b][at..]);
+    let g: [V; 3] = std::array::from_fn(|ch| V::load(&adjoint.rgb[ch].0[b][at..]));
+    let [u, v, alpha] = [&visits.u, &visits.v, &visits.alpha].map(|rows| V::load(&rows[k][at..]));
+    let drawn = alpha * t;
+    let next = t - drawn;
+    let draw = next.ge(c(TRANSMITTANCE_STOP));
+    let weight = drawn.select(draw, zero);
+    // where nothing is drawn, the pixel is finished or was so before
+    next.select(draw, t.negative())
+        .store(&mut adjoint.transmittance.0[b][at..]);
+    let d = g[0].mul_add(c(s.rgb[0]), g[1].mul_add(c(s.rgb[1]), g[2] * c(s.rgb[2])));
+    let wd = weight * d;
+    let rest = remainder - wd;
+    rest.store(&mut adjoint.remainder.0[b][at..]);
+    let odds = alpha * (c::<V>(1.0) - alpha).recip_fast();
+    // the clamp at ALPHA_MAX stops the gradient
+    let free = draw & alpha.lt(c(ALPHA_MAX));
+    let a = odds.neg_mul_add(rest, wd).select(free, zero);
+    let (au, av) = (a * u, a * v);
+    let sums = &mut acc.0;
+    sums[0] = sums[0] + a;
+    sums[1] = sums[1] + au;
+    sums[2] = sums[2] + av;
+    sums[3] = au.mul_add(u, sums[3]);
+    sums[4] = au.mul_add(v, sums[4]);
+    sums[5] = av.mul_add(v, sums[5]);
+    for ch in 0..3 {
+        sums[6 + ch] = weight.mul_add(g[ch], sums[6 + ch]);
     }
+    sums[9] = sums[9] + weight;
+    acc.1 = acc.1.max(weight);
 }
 
 /// On which blocks each Gaussian of the batch was drawn: bit b of entry i is Gaussian i on block b.
@@ -104,40 +175,45 @@ fn transpose(hits: &Hits) -> [u16; BATCH] {
 fn backward_kernel<V: Vector>(
     projected: &[Projected],
     pairs: &[AtomicU32],
-    origin: [f32; 2],
+    pixels: &Pixels,
+    at: [usize; 2],
+    shade: Shade,
     hits: &[Hits],
-    adjoint: &mut Adjoint,
     sums: &mut [Sums],
 ) {
+    let (adjoint, origin) = (&mut pixels.adjoint(at, shade), at.map(|v| v as f32));
     let mut batch = Batch::new();
+    let mut visits = Visits::new();
     for (i, (hits, sums)) in hits.iter().zip(sums.chunks_mut(BATCH)).enumerate() {
+        if hits.iter().all(|&h| h == 0) {
+            sums.fill(Sums::ZERO);
+            continue;
+        }
         batch.fill(projected, &pairs[i * BATCH..], sums.len(), origin);
-        for ((splat, mask), out) in batch.splats.iter().zip(transpose(hits)).zip(sums) {
-            if mask == 0 {
-                *out = Sums::ZERO;
-                continue;
+        let masks = transpose(hits);
+        let mut first = 0;
+        while first < sums.len() {
+            visits.count = 0;
+            let mut end = first;
+            while end < sums.len() && visits.count <= VISITS {
+                visits.push(end, masks[end]);
+                end += 1;
             }
-            let mut acc = Accumulator([c::<V>(0.0); 12], c::<V>(0.0));
-            let mut rest = mask;
-            while rest & (rest - 1) != 0 {
-                let first = rest.trailing_zeros() as usize;
-                rest &= rest - 1;
-                let both = [first, rest.trailing_zeros() as usize];
-                rest &= rest - 1;
-                for at in (0..BLOCK).step_by(V::LANES) {
-                    block_backward::<V, 2>(splat, both, at, adjoint, &mut acc);
+            visits.prepare::<V>(&batch.splats);
+            let mut k = 0;
+            for (j, out) in (first..end).zip(&mut sums[first..end]) {
+                let mut acc = Accumulator([c::<V>(0.0); 12], c::<V>(0.0));
+                let last = k + masks[j].count_ones() as usize;
+                for k in k..last.min(ROOM) {
+                    for at in (0..BLOCK).step_by(V::LANES) {
+                        visit(&visits, k, at, &batch.splats[j], adjoint, &mut acc);
+                    }
                 }
-                if rest == 0 {
-                    break;
-                }
+                k = last;
+                V::sum12(&acc.0, &mut out.0);
+                out.0[10] = acc.1.max_lane();
             }
-            if rest != 0 {
-                for at in (0..BLOCK).step_by(V::LANES) {
-                    block_backward::<V, 1>(splat, [rest.trailing_zeros() as usize], at, adjoint, &mut acc);
-                }
-            }
-            V::sum12(&acc.0, &mut out.0);
-            out.0[10] = acc.1.max_lane();
+            first = end;
         }
     }
 }
@@ -145,9 +221,10 @@ dispatch!(
     pub fn backward = backward_kernel(
         projected: &[Projected],
         pairs: &[AtomicU32],
-        origin: [f32; 2],
+        pixels: &Pixels,
+        at: [usize; 2],
+        shade: Shade,
         hits: &[Hits],
-        adjoint: &mut Adjoint,
         sums: &mut [Sums],
     )
 );

@@ -1,7 +1,7 @@
 //! Ellipses of a picture -> those of each of k bands of rows, for workers that share no memory: each draws its band with
 //! `Rasterizer::draw`. Bands start at multiples of TILE rows, so that the picture is the same as in one piece.
 
-use crate::project::{Projected, TILE};
+use crate::project::{MANY, Projected, TILE};
 
 /// Rows of the picture and what is to be seen in them; y and tiles are relative to the first row.
 #[derive(Default)]
@@ -68,7 +68,14 @@ impl Band {
             if p.visible() && y0 <= bottom && y1 >= top {
                 let tiles = [x0, x1, y0.max(top) - top, y1.min(bottom) - top];
                 let y = p.y - self.first as f32;
-                self.splats.push(Projected { y, tiles, ..*p });
+                // the rows above are gone, and those below
+                let met = if p.met == MANY {
+                    MANY
+                } else {
+                    p.met >> (2 * (tiles[2] + top - y0))
+                };
+                let met = if y1 > bottom && met != MANY { met & 0b11 } else { met };
+                self.splats.push(Projected { y, tiles, met, ..*p });
             }
         }
     }

@@ -9,14 +9,20 @@ use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
-use crate::constants::LOG2_ALPHA_MIN;
-use crate::project::{Projected, SLACK, TILE};
+use crate::project::{MANY, Projected, SLACK, TILE};
 use crate::scene::{RasterError, Region};
 use crate::simd::prefetch;
-use crate::tile::BATCH;
+use crate::tile::{BATCH, Ellipse, reach};
 
-/// Chunks of the sorted order; bounds the parallelism of binning.
+/// Chunks of the sorted order; bounds the parallelism of binning. Few Gaussians have fewer, but not fewer than the least:
+/// each chunk has a counter a tile.
 const CHUNKS: usize = 16;
+const CHUNKS_MIN: usize = 4;
+const CHUNK_SIZE: usize = 4096;
+/// Entry of a Gaussian whose ellipse meets no tile.
+const NOWHERE: u32 = u32::MAX;
+/// The most that `append` adds for a Gaussian whose tiles are known.
+const FEW: usize = 4;
 /// An entry of `owned` is chunk << OFFSET_BITS | offset in the chunk's list.
 const OFFSET_BITS: u32 = 28;
 const HIDDEN: u32 = u32::MAX;
@@ -82,52 +88,93 @@ pub struct Bins {
     pub pairs: Vec<AtomicU32>,
     /// [N] where a Gaussian's entry in the lists begins; HIDDEN for the invisible
     owned: Vec<AtomicU32>,
-    /// of each chunk: for each Gaussian the number of its pairs, then their positions in `pairs`
+    /// of each chunk: for each Gaussian the positions of its pairs in `pairs`, << 1, with 1 added to the last; or NOWHERE
     lists: Vec<Vec<u32>>,
-    cursors: Vec<u32>, // [CHUNKS, tiles]
-}
-
-/// log2(alpha / ALPHA_MIN) at the centre, with the slack: the squared radius in units of u, v.
-#[inline(always)]
-pub fn reach(log2_opacity: f32) -> f32 {
-    (log2_opacity - LOG2_ALPHA_MIN) * (1.0 + SLACK) + SLACK
+    cursors: Vec<u32>, // [chunks, tiles]
 }
 
 /// Calls `visit(tile)` for those of the tiles that the ellipse of `p` meets at pixel centres.
 #[inline(always)]
 fn for_tiles(p: &Projected, tiles: &Tiles, mut visit: impl FnMut(usize)) {
     let [x0, x1, y0, y1] = p.tiles.map(usize::from);
-    let small = x0 >= x1 || y0 >= y1;
     let (x0, y0) = (x0.max(tiles.columns.start), y0.max(tiles.rows.start));
     let (x1, y1) = (x1.min(tiles.columns.end - 1), y1.min(tiles.rows.end - 1));
     let start = |row: usize| (row - tiles.rows.start) * tiles.columns.len();
-    if small {
+    if p.met != MANY {
+        let first = [usize::from(p.tiles[0]), usize::from(p.tiles[2])];
         for row in y0..=y1 {
             for column in x0..=x1 {
-                visit(start(row) + column - tiles.columns.start);
+                if p.met >> (2 * (row - first[1]) + column - first[0]) & 1 == 1 {
+                    visit(start(row) + column - tiles.columns.start);
+                }
             }
         }
         return;
     }
-    let q = reach(p.log2_opacity);
-    let inv = 1.0 / p.l11;
-    // y where the ellipse is widest to the right
-    let peak = -p.l21 * p.l11 * p.rx / (p.l21 * p.l21 + p.l22 * p.l22);
+    let ellipse = Ellipse {
+        l11: p.l11,
+        l21: p.l21,
+        l22: p.l22,
+        reach: reach(p.log2_opacity),
+    };
+    let peak = ellipse.peak();
     let tile = |v: f32| v.max(0.0) as usize / TILE;
     for row in y0..=y1 {
         let top = (row * TILE) as f32 + 0.5 - p.y;
-        let bottom = top + (TILE - 1) as f32;
-        let (yr, yl) = (peak.max(top).min(bottom), (-peak).max(top).min(bottom));
-        let (hr, hl) = (q - p.l22 * yr * p.l22 * yr, q - p.l22 * yl * p.l22 * yl);
-        if hr >= 0.0 && hl >= 0.0 {
-            let right = (hr.sqrt() - p.l21 * yr) * inv + SLACK;
-            let left = (-hl.sqrt() - p.l21 * yl) * inv - SLACK;
-            let (first, last) = (tile(p.x + left + 0.5), tile(p.x + right - 0.5));
+        let (met, left, right) = ellipse.span(peak, top, top + (TILE - 1) as f32);
+        if met {
+            let first = tile(p.x + left / p.l11 - SLACK + 0.5);
+            let last = tile(p.x + right / p.l11 + SLACK - 0.5);
             for column in first.max(x0)..=last.min(x1) {
                 visit(start(row) + column - tiles.columns.start);
             }
         }
     }
+}
+
+/// Makes room for `more` entries; by a quarter, since twice as much would be felt in the memory of a picture.
+#[inline(always)]
+fn grow(list: &mut Vec<u32>, more: usize) {
+    if list.capacity() - list.len() < more {
+        list.reserve_exact(more + list.len() / 4);
+    }
+}
+
+/// A Gaussian's entries of a chunk's list, tile << 1 | last, from `used` on; counts them. Returns their end. There is room for
+/// FEW, and no branch for those that are met: which ones cannot be foretold.
+#[inline(always)]
+fn append(p: &Projected, tiles: &Tiles, count: &mut [u32], list: &mut Vec<u32>, used: usize) -> usize {
+    let [x0, x1, y0, y1] = p.tiles.map(usize::from);
+    let inside = x0 >= tiles.columns.start && x1 < tiles.columns.end && y0 >= tiles.rows.start && y1 < tiles.rows.end;
+    let mut end = used;
+    if p.met != MANY && inside {
+        let width = tiles.columns.len();
+        let first = (y0 - tiles.rows.start) * width + x0 - tiles.columns.start;
+        for (i, tile) in [first, first + 1, first + width, first + width + 1]
+            .into_iter()
+            .enumerate()
+        {
+            let met = usize::from(p.met >> i & 1);
+            list[end] = (tile as u32) << 1;
+            count[tile * met] += met as u32;
+            end += met;
+        }
+    } else {
+        list.truncate(used);
+        grow(list, (x1 + 1 - x0.min(x1)) * (y1 + 1 - y0.min(y1)) + FEW);
+        for_tiles(p, tiles, |tile| {
+            count[tile] += 1;
+            list.push((tile as u32) << 1);
+        });
+        end = list.len();
+        list.resize(end + FEW, 0);
+    }
+    if end == used {
+        list[used] = NOWHERE;
+        return used + 1;
+    }
+    list[end - 1] |= 1;
+    end
 }
 
 /// Index of the Gaussian of a key of `DepthSort`.
@@ -181,28 +228,35 @@ impl Bins {
         items.split_at_mut(length.min(items.len()))
     }
 
-    /// The list entry of a visible Gaussian and what follows it.
+    /// The list from the entries of a visible Gaussian on.
     #[inline(always)]
-    fn entry(&self, gaussian: usize) -> Option<&[u32]> {
-        let entry = self.owned.get(gaussian)?.load(Relaxed);
-        let list = self.lists.get((entry >> OFFSET_BITS) as usize)?;
-        list.get((entry & ((1 << OFFSET_BITS) - 1)) as usize..)
+    fn entries(&self, gaussian: usize) -> &[u32] {
+        let Some(owned) = self.owned.get(gaussian) else {
+            return &[];
+        };
+        let owned = owned.load(Relaxed);
+        let list = self.lists.get((owned >> OFFSET_BITS) as usize);
+        list.and_then(|list| list.get((owned & ((1 << OFFSET_BITS) - 1)) as usize..))
+            .unwrap_or(&[])
     }
 
     /// Fetches what `places` will read.
     #[inline(always)]
     pub fn prefetch_places(&self, gaussian: usize) {
-        if let Some(list) = self.entry(gaussian) {
-            prefetch(list, 0);
-        }
+        prefetch(self.entries(gaussian), 0);
     }
 
-    /// Positions in `pairs` of a Gaussian; none if it is invisible.
+    /// Calls `visit` with each position in `pairs` of a Gaussian; none if it is invisible.
     #[inline(always)]
-    pub fn places(&self, gaussian: usize) -> &[u32] {
-        match self.entry(gaussian) {
-            Some([n, rest @ ..]) => &rest[..*n as usize],
-            _ => &[],
+    pub fn places(&self, gaussian: usize, mut visit: impl FnMut(usize)) {
+        for &entry in self.entries(gaussian) {
+            if entry == NOWHERE {
+                return;
+            }
+            visit(entry as usize >> 1);
+            if entry & 1 == 1 {
+                return;
+            }
         }
     }
 
@@ -218,12 +272,13 @@ impl Bins {
         let tiles = rectangle.len();
         self.tiles = rectangle;
         let rectangle = &self.tiles;
+        let chunks = (sorted.len() / CHUNK_SIZE).clamp(CHUNKS_MIN, CHUNKS);
         self.cursors.clear();
-        self.cursors.resize(CHUNKS * tiles, 0);
-        self.lists.resize_with(CHUNKS, Vec::new);
+        self.cursors.resize(chunks * tiles, 0);
+        self.lists.resize_with(chunks, Vec::new);
         self.owned.clear();
         self.owned.resize_with(projected.len(), || AtomicU32::new(HIDDEN));
-        let share = sorted.len().div_ceil(CHUNKS).max(1);
+        let share = sorted.len().div_ceil(chunks).max(1);
         let owned = &self.owned;
         self.lists.iter_mut().for_each(Vec::clear);
         let work = self
@@ -233,24 +288,25 @@ impl Bins {
             .zip(sorted.par_chunks(share))
             .enumerate();
         work.for_each(|(chunk, ((count, list), keys))| {
+            let mut used = 0;
             for (i, key) in keys.iter().enumerate() {
+                if list.len() < used + FEW {
+                    grow(list, 8 * FEW);
+                    list.resize(list.capacity(), 0);
+                }
                 if let Some(next) = keys.get(i + AHEAD) {
                     prefetch(projected, index(next));
                 }
-                let (g, head) = (index(key), list.len());
-                owned[g].store((chunk as u32) << OFFSET_BITS | head as u32, Relaxed);
-                list.push(0);
-                for_tiles(&projected[g], rectangle, |t| {
-                    count[t] += 1;
-                    list.push(t as u32);
-                });
-                list[head] = (list.len() - head - 1) as u32;
-                if list.len() > limit / CHUNKS {
-                    return; // reported below
+                let g = index(key);
+                owned[g].store((chunk as u32) << OFFSET_BITS | used as u32, Relaxed);
+                used = append(&projected[g], rectangle, count, list, used);
+                if used > limit / chunks {
+                    break; // reported below
                 }
             }
+            list.truncate(used);
         });
-        if self.lists.iter().any(|list| list.len() > limit / CHUNKS) {
+        if self.lists.iter().any(|list| list.len() > limit / chunks) {
             return Err(RasterError::TooMany {
                 what: "Gaussian-tile pairs",
                 limit,
@@ -267,7 +323,7 @@ impl Bins {
         let mut sum = 0;
         for t in 0..tiles {
             self.starts.push(sum);
-            for chunk in 0..CHUNKS {
+            for chunk in 0..self.lists.len() {
                 sum += std::mem::replace(&mut self.cursors[chunk * tiles + t], sum);
             }
         }
@@ -284,17 +340,15 @@ impl Bins {
             .zip(&mut self.lists)
             .zip(sorted.par_chunks(share));
         work.for_each(|((cursor, list), keys)| {
-            let mut rest = &mut list[..];
-            for key in keys {
-                let Some((n, own)) = rest.split_first_mut() else { return };
-                let (own, after) = own.split_at_mut(*n as usize);
-                for tile in own {
-                    let place = &mut cursor[*tile as usize];
-                    pairs[*place as usize].store(index(key) as u32, Relaxed);
-                    *tile = *place;
+            let mut at = 0;
+            for entry in list.iter_mut() {
+                if *entry != NOWHERE {
+                    let place = &mut cursor[*entry as usize >> 1];
+                    pairs[*place as usize].store(index(&keys[at]) as u32, Relaxed);
+                    *entry = *place << 1 | (*entry & 1);
                     *place += 1;
                 }
-                rest = after;
+                at += *entry as usize & 1;
             }
         });
     }

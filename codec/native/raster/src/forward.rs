@@ -24,6 +24,11 @@ impl Canvas {
             rgb: [Plane::ZERO; 3],
             live: 0,
         };
+        if width >= TILE && height >= TILE {
+            canvas.transmittance = Plane([[1.0; BLOCK]; BLOCKS]);
+            canvas.live = u16::MAX;
+            return canvas;
+        }
         for y in 0..height.min(TILE) {
             for x in 0..width.min(TILE) {
                 let (b, k) = swizzle(x, y);
@@ -55,10 +60,11 @@ fn blend<V: Vector>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut 
         let [_, _, e, raw] = opacities(splats, [px; 2], [py; 2]);
         for ((s, e), raw) in splats.into_iter().zip(e).zip(raw) {
             let alpha = raw.min(c(ALPHA_MAX));
-            let next = alpha.neg_mul_add(t, t);
+            let drawn = alpha * t;
+            let next = t - drawn;
             let hit = e.ge(c(LOG2_ALPHA_MIN));
             let draw = hit & next.ge(c(TRANSMITTANCE_STOP));
-            let weight = (alpha * t).select(draw, c(0.0));
+            let weight = drawn.select(draw, c(0.0));
             for ch in 0..3 {
                 rgb[ch] = weight.mul_add(c(s.rgb[ch]), rgb[ch]);
             }

@@ -135,15 +135,25 @@ pub fn finish(canvas: &Canvas, shade: Shade, x: usize, width: usize, band: &mut 
     }
 }
 
-/// A tile without Gaussians.
-pub fn finish_empty(shade: Shade, x: usize, width: usize, band: &mut Surface) {
+/// Columns without Gaussians: whole stretches of rows, which memory likes better than tile after tile.
+pub fn finish_empty(shade: Shade, columns: Range<usize>, width: usize, band: &mut Surface) {
+    if columns.is_empty() {
+        return;
+    }
+    let colour = shade.background;
     for y in 0..band.pixels() / width {
-        band.put(
-            y * width + x,
-            TILE.min(width - x),
-            &[shade.background; TILE],
-            &[0.0; TILE],
-        );
+        let row = y * width + columns.start..y * width + columns.end;
+        match band {
+            Surface::Floats { image, alpha } => {
+                alpha[row.clone()].fill(0.0);
+                image.as_chunks_mut::<3>().0[row].fill(colour);
+            }
+            Surface::Rgb(p) => p[row].fill(colour.map(byte)),
+            Surface::Rgba(p) => {
+                let [r, g, b] = colour.map(byte);
+                p[row].fill([r, g, b, 255]);
+            }
+        }
     }
 }
 
@@ -159,7 +169,8 @@ pub struct Pixels<'a> {
 impl Pixels<'_> {
     /// The tile at (x, y). With image = gain sum(w rgb) + T background and alpha = 1 - T, the remainder of the whole pixel,
     /// g . sum(w rgb) + T (g . background - g_alpha), is g . image - T g_alpha.
-    pub fn adjoint(&self, x: usize, y: usize, shade: Shade) -> Adjoint {
+    #[inline(always)] // into the kernel, whose wide instructions it needs
+    pub fn adjoint(&self, [x, y]: [usize; 2], shade: Shade) -> Adjoint {
         let mut a = Adjoint {
             transmittance: Plane::ZERO,
             remainder: Plane::ZERO,

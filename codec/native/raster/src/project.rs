@@ -8,8 +8,9 @@
 use crate::constants::{FOV_MARGIN, LOG2_ALPHA_MIN, LOW_PASS, NEAR};
 use crate::scene::{Splats, View};
 use crate::sh;
-use crate::simd::{Vector, c, dispatch};
+use crate::simd::{MAGIC, Vector, c, dispatch};
 use crate::soa::{CHUNK, Row, Soa, load_rows};
+use crate::tile::{Ellipse, reach};
 
 /// Side of a tile in pixels.
 pub const TILE: usize = 16;
@@ -35,11 +36,21 @@ pub struct Projected {
     pub ry: f32,
     /// Tiles that the box meets: first and last column, first and last row.
     pub tiles: [u16; 4],
+    /// Which of them the ellipse meets if they are at most 2 x 2: bit 2 row + column, from the first ones. Else `MANY`.
+    pub met: u16,
 }
+
+/// `met` of a box of more tiles than that.
+pub const MANY: u16 = 1 << 4;
 
 impl Projected {
     pub fn visible(&self) -> bool {
         self.rx >= 0.0
+    }
+
+    /// Larger half side of the box in pixels, 0 for the invisible.
+    pub fn radius(&self) -> f32 {
+        if self.visible() { self.rx.max(self.ry) } else { 0.0 }
     }
 }
 
@@ -217,8 +228,8 @@ pub fn colour<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize) -> [V; 3] 
     rgb
 }
 
-/// The fields of `Projected` of 16 Gaussians, as rows; the last four are pixels, rounded down and clamped to the region.
-struct Out([Row; 16]);
+/// The fields of `Projected` of 16 Gaussians, as rows; MAGIC is added to the last five, so that they are in the low bits.
+struct Out([Row; 17]);
 
 #[inline(always)]
 fn project_lanes<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize, out: &mut Out) {
@@ -228,17 +239,17 @@ fn project_lanes<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize, out: &m
     let r = (c::<V>(WHITEN) / (e.cov[2] * e.det)).sqrt();
     let (l11, l21, l22) = (e.cov[2] * r, -(e.cov[1] * r), (c::<V>(WHITEN) / e.cov[2]).sqrt());
     // log2(sigmoid(logit)); the clamp keeps exp finite, an opacity of 2^-80 is culled below
-    let logit = V::load(&soa.logits[at..]);
+    let logit = V::load(&soa.logits[0][at..]);
     let log2_opacity = -(c::<V>(1.0) + exp(-logit.max(c(-55.0)))).log2();
-    let reach = log2_opacity - c(LOG2_ALPHA_MIN);
-    let rx = (reach * e.cov[0] * c(1.0 / WHITEN)).sqrt();
-    let ry = (reach * e.cov[2] * c(1.0 / WHITEN)).sqrt();
+    let range = log2_opacity - c(LOG2_ALPHA_MIN);
+    let rx = (range * e.cov[0] * c(1.0 / WHITEN)).sqrt();
+    let ry = (range * e.cov[2] * c(1.0 / WHITEN)).sqrt();
     let rgb = colour::<V>(soa, lens, k, at);
 
     let half = c::<V>(0.5);
     let in_x = (x + rx).ge(half) & (c::<V>(lens.size[0]) - half).ge(x - rx);
     let in_y = (y + ry).ge(half) & (c::<V>(lens.size[1]) - half).ge(y - ry);
-    let front = e.p[2].ge(c(NEAR)) & reach.ge(c(0.0)) & logit.finite();
+    let front = e.p[2].ge(c(NEAR)) & range.ge(c(0.0)) & logit.finite();
     let shape = x.finite() & y.finite() & l11.finite() & l21.finite() & l22.finite() & rx.finite() & ry.finite();
     let scales: [V; 3] = load_rows(&soa.log_scales, at);
     let front = front & scales[0].finite() & scales[1].finite() & scales[2].finite();
@@ -262,21 +273,59 @@ fn project_lanes<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize, out: &m
     rx.select(seen, c(-1.0)).store(&mut out.0[10][at..]);
     ry.store(&mut out.0[11][at..]);
     let (wide, high) = (rx + c(SLACK), ry + c(SLACK));
-    let edges = [(x - wide, 0), (x + wide, 0), (y - high, 1), (y + high, 1)];
-    for (i, (edge, axis)) in edges.into_iter().enumerate() {
-        // the first pixel centre at or after the edge; the last one at or before it
-        let pixel = if i % 2 == 0 { edge + c(0.5) } else { edge - c(0.5) };
-        pixel
-            .max(c(0.0))
-            .min(c(lens.size[axis] - 1.0))
-            .store(&mut out.0[12 + i][at..]);
+    // the first pixel centre at or after an edge, the last one at or before it; a tile too many is found out by `meet`
+    let tile = |edge: V, axis: usize| {
+        let pixel = edge.max(c(0.0)).min(c(lens.size[axis] - 1.0));
+        pixel.mul_add(c(1.0 / TILE as f32), c(-0.5)) + c(MAGIC)
+    };
+    let half_on = c::<V>(0.25); // so that the last pixel of a picture is not rounded down
+    let tiles = [
+        tile(x - wide + half, 0),
+        tile(x + wide - half + half_on, 0),
+        tile(y - high + half, 1),
+        tile(y + high - half + half_on, 1),
+    ];
+    for (i, tile) in tiles.into_iter().enumerate() {
+        tile.store(&mut out.0[12 + i][at..]);
     }
+    let ellipse = Ellipse {
+        l11,
+        l21,
+        l22,
+        reach: reach(log2_opacity),
+    };
+    meet(&ellipse, [x, y], tiles.map(|tile| tile - c(MAGIC))).store(&mut out.0[16][at..]);
+}
+
+/// `met` of the ellipse around the point, + MAGIC, by a test at the pixel centres of 2 x 2 tiles.
+#[inline(always)]
+fn meet<V: Vector>(ellipse: &Ellipse<V>, [x, y]: [V; 2], [x0, x1, y0, y1]: [V; 4]) -> V {
+    let side = TILE as f32;
+    let (left, top) = (x0.mul_add(c(side), -x), y0.mul_add(c(side), -y));
+    let peak = ellipse.peak();
+    let (columns, rows) = (x1 - x0, y1 - y0);
+    let mut bits = c::<V>(MAGIC);
+    for i in 0..2 {
+        let first = top + c(i as f32 * side + 0.5);
+        let (some, from, to) = ellipse.span(peak, first, first + c(side - 1.0));
+        let some = some & rows.ge(c(i as f32));
+        for j in 0..2 {
+            let west = left + c(j as f32 * side + 0.5);
+            let hit = some
+                & columns.ge(c(j as f32))
+                & to.ge(west * ellipse.l11)
+                & ((west + c(side - 1.0)) * ellipse.l11).ge(from);
+            bits = bits + c::<V>((1 << (2 * i + j)) as f32).select(hit, c(0.0));
+        }
+    }
+    let many = columns.ge(c(2.0)) | rows.ge(c(2.0));
+    c::<V>(MAGIC + f32::from(MANY)).select(many, bits)
 }
 
 #[inline(always)]
 fn project_kernel<V: Vector>(splats: &Splats, lens: &Lens, first: usize, out: &mut [Projected]) {
     let mut soa = Soa::new();
-    let mut rows = Out([[0.0; CHUNK]; 16]);
+    let mut rows = Out([[0.0; CHUNK]; 17]);
     for (i, block) in out.chunks_mut(CHUNK).enumerate() {
         soa.fill(splats, first + i * CHUNK);
         for at in (0..CHUNK).step_by(V::LANES) {
@@ -295,8 +344,8 @@ fn project_kernel<V: Vector>(splats: &Splats, lens: &Lens, first: usize, out: &m
                 depth: f[9][lane],
                 rx: f[10][lane],
                 ry: f[11][lane],
-                tiles: [f[12][lane], f[13][lane], f[14][lane], f[15][lane]]
-                    .map(|pixel| (pixel as i32 / TILE as i32) as u16),
+                tiles: [12, 13, 14, 15].map(|i| f[i][lane].to_bits() as u16),
+                met: f[16][lane].to_bits() as u16,
             };
         }
     }

@@ -38,25 +38,36 @@ impl GradientRows {
     /// To the `n` Gaussians `at ..` of `out`; 0 for those without a bit in `seen`.
     #[inline(always)]
     fn write(&self, n: usize, seen: u16, sums: &[Row; 12], at: usize, k: usize, out: &mut Gradients) {
-        let to = at + n;
-        write_columns(&self.means, seen, &mut out.means[3 * at..3 * to]);
-        write_columns(&self.quats, seen, &mut out.quats[4 * at..4 * to]);
-        write_columns(&self.log_scales, seen, &mut out.log_scales[3 * at..3 * to]);
-        write_columns(&self.logits, seen, &mut out.logit_opacities[at..to]);
-        write_columns(&self.sh0, seen, &mut out.sh0[3 * at..3 * to]);
-        write_columns(&self.grad2d, seen, &mut out.grad2d[at..to]);
-        out.sum_weight[at..to].copy_from_slice(&sums[9][..n]);
-        out.max_weight[at..to].copy_from_slice(&sums[10][..n]);
+        let (to, add) = (at + n, out.add);
+        write_columns(&self.means, seen, add, &mut out.means[3 * at..3 * to]);
+        write_columns(&self.quats, seen, add, &mut out.quats[4 * at..4 * to]);
+        write_columns(&self.log_scales, seen, add, &mut out.log_scales[3 * at..3 * to]);
+        write_columns(&self.logits, seen, add, &mut out.logit_opacities[at..to]);
+        write_columns(&self.sh0, seen, add, &mut out.sh0[3 * at..3 * to]);
+        write_columns(&self.grad2d, seen, add, &mut out.grad2d[at..to]);
+        write_columns(&[sums[9]], seen, add, &mut out.sum_weight[at..to]);
+        let largest = out.max_weight[at..to].iter_mut();
+        for (lane, (old, &new)) in largest.zip(&sums[10]).enumerate() {
+            let new = if seen >> lane & 1 == 1 { new } else { 0.0 };
+            *old = if add { old.max(new) } else { new };
+        }
         if k == 0 {
             return;
         }
         for (lane, out) in out.sh_n[3 * k * at..3 * k * to].chunks_exact_mut(3 * k).enumerate() {
             if seen >> lane & 1 == 0 {
-                out.fill(0.0);
+                if !add {
+                    out.fill(0.0);
+                }
                 continue;
             }
             for (out, rows) in out.as_chunks_mut::<3>().0.iter_mut().zip(&self.sh_n) {
-                *out = [rows[0][lane], rows[1][lane], rows[2][lane]];
+                let new = [rows[0][lane], rows[1][lane], rows[2][lane]];
+                *out = if add {
+                    std::array::from_fn(|ch| out[ch] + new[ch])
+                } else {
+                    new
+                };
             }
         }
     }
@@ -66,29 +77,27 @@ impl GradientRows {
 const AHEAD: usize = 24;
 
 /// Adds up the pairs of `n` Gaussians, in the order of their tiles. Bit i of the mask is set if Gaussian first + i has any.
-fn gather(bins: &Bins, sums: &[Sums], first: usize, n: usize) -> ([Row; 12], u16) {
-    let (mut rows, mut seen) = ([[0.0; CHUNK]; 12], 0);
+#[inline(always)] // into the kernel, whose wide instructions it needs
+fn gather(bins: &Bins, sums: &[Sums], first: usize, n: usize, rows: &mut [Row; 12]) -> u16 {
+    let mut seen = 0;
     for lane in 0..n {
         let g = first + lane;
         bins.prefetch_places(g + 2 * AHEAD);
-        bins.places(g + AHEAD)
-            .iter()
-            .for_each(|&place| prefetch(sums, place as usize));
-        let mut total = [0.0f32; 12];
-        let places = bins.places(g);
-        for &place in places {
-            let s = &sums[place as usize].0;
+        bins.places(g + AHEAD, |place| prefetch(sums, place));
+        let mut total = Sums::ZERO.0;
+        bins.places(g, |place| {
+            let s = &sums[place].0;
             for k in 0..10 {
                 total[k] += s[k];
             }
             total[10] = total[10].max(s[10]);
-        }
-        seen |= u16::from(!places.is_empty()) << lane;
+            seen |= 1 << lane;
+        });
         for (row, v) in rows.iter_mut().zip(total) {
             row[lane] = v;
         }
     }
-    (rows, seen)
+    seen
 }
 
 /// Gradient by the camera-space mean and by M = J W R S, from those by the projected mean and the covariance.
@@ -216,7 +225,7 @@ fn chunk<V: Vector>(soa: &Soa, lens: &Lens, k: usize, sums: &[Row; 12], out: &mu
         geometry(&e, lens, &s, at, out);
         colour_backward::<V>(soa, lens, k, sums, at, out);
         // d ln(sigmoid(x)) / dx = 1 - sigmoid(x)
-        let logit = V::load(&soa.logits[at..]).max(c(-55.0));
+        let logit = V::load(&soa.logits[0][at..]).max(c(-55.0));
         let up = crate::project::exp(-logit);
         (V::load(&sums[0][at..]) * up / (c::<V>(1.0) + up)).store(&mut out.logits[0][at..]);
         let gx = s.mean2d[0] * c(0.5 * lens.full[0]);
@@ -234,13 +243,13 @@ fn project_backward_kernel<V: Vector>(
     range: Range<usize>,
     out: &mut Gradients,
 ) {
-    let (mut soa, mut rows) = (Soa::new(), GradientRows::new());
+    let (mut soa, mut rows, mut totals) = (Soa::new(), GradientRows::new(), [[0.0; CHUNK]; 12]);
     for first in range.clone().step_by(CHUNK) {
         let n = CHUNK.min(range.end - first);
-        let (sums, seen) = gather(bins, sums, first, n);
+        let seen = gather(bins, sums, first, n, &mut totals);
         soa.fill(splats, first);
-        chunk::<V>(&soa, lens, splats.sh_k, &sums, &mut rows);
-        rows.write(n, seen, &sums, first - range.start, splats.sh_k, out);
+        chunk::<V>(&soa, lens, splats.sh_k, &totals, &mut rows);
+        rows.write(n, seen, &totals, first - range.start, splats.sh_k, out);
     }
 }
 dispatch!(

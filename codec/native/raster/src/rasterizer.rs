@@ -284,6 +284,7 @@ impl Rasterizer {
                 ((band, seen), (band_rest, seen_rest))
             },
             &|row, (mut band, mut seen)| {
+                let mut empty = left * TILE; // where the tiles without Gaussians begin that end here
                 for column in 0..columns {
                     let t = row.start * columns + column;
                     let range = bins.tile(t);
@@ -291,9 +292,10 @@ impl Rasterizer {
                     seen = rest;
                     let x = (left + column) * TILE;
                     if range.is_empty() {
-                        finish_empty(shade, x, width, &mut band);
                         continue;
                     }
+                    finish_empty(shade, empty..x, width, &mut band);
+                    empty = x + TILE;
                     let mut canvas = Canvas::new(width - x, band.pixels() / width);
                     let origin = [x as f32, ((top + row.start) * TILE) as f32];
                     forward(
@@ -307,6 +309,7 @@ impl Rasterizer {
                     );
                     finish(&canvas, shade, x, width, &mut band);
                 }
+                finish_empty(shade, empty..((left + columns) * TILE).min(width), width, &mut band);
             },
         );
     }
@@ -375,9 +378,8 @@ impl Rasterizer {
                     continue;
                 }
                 let (x, y) = (column * TILE, row.start * TILE);
-                let mut adjoint = pixels.adjoint(x, y, shade);
                 let (pairs, hits) = (&bins.pairs[bins.first(t)..], &seen[bins.batches(t)..]);
-                backward(level, projected, pairs, [x as f32, y as f32], hits, &mut adjoint, own);
+                backward(level, projected, pairs, &pixels, [x, y], shade, hits, own);
             }
         });
     }
@@ -401,6 +403,11 @@ mod tests {
 
     /// `n` round splats of the given scale on a line that winds through the view, and a camera of size x size pixels.
     fn draw(n: usize, log_scale: f32, size: usize, training: bool) -> Rasterizer {
+        draw_at(Level::best(), n, log_scale, size, training).0
+    }
+
+    /// The same, and the gradient of the means if `training`.
+    fn draw_at(level: Level, n: usize, log_scale: f32, size: usize, training: bool) -> (Rasterizer, Vec<f32>) {
         let t = |i: usize| i as f32 / n as f32;
         let means: Vec<f32> = (0..n)
             .flat_map(|i| [(9.0 * t(i)).sin(), t(i) - 0.5, 3.0 + t(i)])
@@ -429,10 +436,53 @@ mod tests {
             translation: [0.0; 3],
             region,
         };
-        let mut r = Rasterizer::new(Level::best(), 0);
+        let mut r = Rasterizer::new(level, 0);
         r.forward(&splats, &view, Shade::over([0.1, 0.2, 0.3]), training)
             .unwrap();
-        r
+        let mut grads = [3, 4, 3, 1, 3, 0, 1, 1, 1].map(|d| vec![0.0; d * n]);
+        if training {
+            let [
+                means,
+                quats,
+                log_scales,
+                logit_opacities,
+                sh0,
+                sh_n,
+                grad2d,
+                max_weight,
+                sum_weight,
+            ] = &mut grads;
+            let mut out = Gradients {
+                add: false,
+                means,
+                quats,
+                log_scales,
+                logit_opacities,
+                sh0,
+                sh_n,
+                grad2d,
+                max_weight,
+                sum_weight,
+            };
+            let slope: Vec<f32> = (0..3 * size * size).map(|i| (0.1 * i as f32).sin()).collect();
+            r.backward(&splats, &slope, &slope[..size * size], &mut out).unwrap();
+        }
+        let [means, ..] = grads;
+        (r, means)
+    }
+
+    #[test]
+    fn every_level_draws_and_differentiates_like_scalar() {
+        let (want, slopes) = draw_at(Level::SCALAR, 300, -3.0, 90, true);
+        let largest = slopes.iter().fold(0.0f32, |m, s| m.max(s.abs()));
+        assert!(largest > 0.0);
+        for level in Level::available() {
+            let (got, other) = draw_at(level, 300, -3.0, 90, true);
+            let image = got.image.iter().zip(&want.image);
+            assert!(image.clone().all(|(a, b)| (a - b).abs() < 1e-4), "{}", level.name());
+            let near = other.iter().zip(&slopes).all(|(a, b)| (a - b).abs() < 1e-3 * largest);
+            assert!(near, "{}", level.name());
+        }
     }
 
     #[test]

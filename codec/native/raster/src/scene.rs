@@ -49,8 +49,10 @@ impl Splats<'_> {
     }
 }
 
-/// Gradients, same shapes as `Splats`; overwritten, not added to.
+/// Gradients, same shapes as `Splats`.
 pub struct Gradients<'a> {
+    /// Add to what is there (of `max_weight` keep the larger); else overwrite it.
+    pub add: bool,
     pub means: &'a mut [f32],
     pub quats: &'a mut [f32],
     pub log_scales: &'a mut [f32],
@@ -67,6 +69,7 @@ pub struct Gradients<'a> {
 impl<'a> Gradients<'a> {
     pub fn reborrow(&mut self) -> Gradients<'_> {
         Gradients {
+            add: self.add,
             means: self.means,
             quats: self.quats,
             log_scales: self.log_scales,
@@ -92,6 +95,7 @@ impl<'a> Gradients<'a> {
         let (sum_weight, sum_weight2) = self.sum_weight.split_at_mut(n);
         (
             Gradients {
+                add: self.add,
                 means,
                 quats,
                 log_scales,
@@ -103,6 +107,7 @@ impl<'a> Gradients<'a> {
                 sum_weight,
             },
             Gradients {
+                add: self.add,
                 means: means2,
                 quats: quats2,
                 log_scales: log_scales2,

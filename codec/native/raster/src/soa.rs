@@ -12,7 +12,7 @@ pub struct Soa {
     pub means: [Row; 3],
     pub quats: [Row; 4],
     pub log_scales: [Row; 3],
-    pub logits: Row,
+    pub logits: [Row; 1],
     pub sh0: [Row; 3],
     pub sh_n: [[Row; 3]; 15],
 }
@@ -24,7 +24,7 @@ impl Soa {
             means: [z; 3],
             quats: [z; 4],
             log_scales: [z; 3],
-            logits: z,
+            logits: [z],
             sh0: [z; 3],
             sh_n: [[z; 3]; 15],
         }
@@ -39,7 +39,7 @@ impl Soa {
         columns(&mut self.quats, &s.quats[4 * first..4 * (first + n)]);
         columns(&mut self.log_scales, &s.log_scales[3 * first..3 * (first + n)]);
         columns(&mut self.sh0, &s.sh0[3 * first..3 * (first + n)]);
-        self.logits[..n].copy_from_slice(&s.logit_opacities[first..first + n]);
+        columns(&mut self.logits, &s.logit_opacities[first..first + n]);
         if s.sh_k > 0 {
             let own = s.sh_n[3 * s.sh_k * first..].chunks_exact(3 * s.sh_k);
             for (lane, item) in own.take(n).enumerate() {
@@ -72,12 +72,12 @@ fn columns<const D: usize>(rows: &mut [Row; D], flat: &[f32]) {
     }
 }
 
-/// D rows -> [n, D], the mirror of `columns`; 0 where `seen` has no bit.
+/// D rows -> [n, D], the mirror of `columns`; 0 where `seen` has no bit; `add`: to what is there.
 #[inline(always)]
-pub fn write_columns<const D: usize>(rows: &[Row; D], seen: u16, flat: &mut [f32]) {
-    let keep = |d: usize, lane: usize| if seen >> lane & 1 == 1 { rows[d][lane] } else { 0.0 };
+pub fn write_columns<const D: usize>(rows: &[Row; D], seen: u16, add: bool, flat: &mut [f32]) {
     if let ([whole], []) = flat.as_chunks_mut::<D>().0.as_chunks_mut::<CHUNK>()
         && seen == u16::MAX
+        && !add
     {
         for lane in 0..CHUNK {
             for d in 0..D {
@@ -88,7 +88,8 @@ pub fn write_columns<const D: usize>(rows: &[Row; D], seen: u16, flat: &mut [f32
     }
     for (lane, item) in flat.chunks_exact_mut(D).enumerate() {
         for d in 0..D {
-            item[d] = keep(d, lane);
+            let value = if seen >> lane & 1 == 1 { rows[d][lane] } else { 0.0 };
+            item[d] = if add { item[d] + value } else { value };
         }
     }
 }

@@ -1,8 +1,9 @@
 //! Visible Gaussians front to back: a stable least-significant-digit radix sort of (depth, index).
 //!
-//! Depths of one picture span few exponents, so the keys are taken relative to the smallest and two passes usually do.
-//! Ties keep the order of the indices, which makes the picture independent of everything but its input. A pass counts and
-//! moves fixed chunks in parallel; a prefix sum over (digit, chunk) gives each its places.
+//! Depths of one picture span few exponents, so that two digits usually tell them apart: the low one of the bits, and the
+//! others relative to those of the smallest depth. Ties keep the order of the indices, which makes the picture independent
+//! of everything but its input. A pass counts (the first one while the keys are made) and moves fixed chunks in parallel; a
+//! prefix sum over (digit, chunk) gives each its places.
 
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -43,42 +44,49 @@ impl DepthSort {
         // of each chunk: the visible ones, the smallest and the largest depth
         let mut found = [(0, u32::MAX, 0); CHUNKS];
         let chunks = projected.par_chunks(share).zip(self.keys.par_chunks_mut(share));
+        let places = self.places.par_chunks_exact_mut(BUCKETS);
         chunks
-            .zip(&mut found[..])
+            .zip(places.zip(&mut found[..]))
             .enumerate()
-            .for_each(|(chunk, ((projected, keys), found))| {
-                let (n, low, high) = found;
+            .for_each(|(chunk, ((projected, keys), (places, found)))| {
+                let (mut n, mut low, mut high) = *found;
+                places.fill(0);
                 for (i, p) in projected.iter().enumerate() {
                     if p.visible() {
                         let bits = p.depth.to_bits(); // positive floats sort like their bits
-                        *low = bits.min(*low);
-                        *high = bits.max(*high);
-                        keys[*n] = AtomicU64::new(u64::from(bits) << 32 | (chunk * share + i) as u64);
-                        *n += 1;
+                        low = bits.min(low);
+                        high = bits.max(high);
+                        places[bits as usize & (BUCKETS - 1)] += 1;
+                        keys[n] = AtomicU64::new(u64::from(bits) << 32 | (chunk * share + i) as u64);
+                        n += 1;
                     }
                 }
+                *found = (n, low, high);
             });
         let total = found.iter().map(|f| f.0).sum::<usize>();
         let low = found.iter().fold(u32::MAX, |low, f| low.min(f.1));
         let high = found.iter().fold(0, |high, f| high.max(f.2));
-        let significant = 32 - high.saturating_sub(low).leading_zeros();
+        let rest = (high >> DIGIT).saturating_sub(low >> DIGIT);
         let mut parts = std::array::from_fn(|i| {
             let first = (i * share).min(projected.len());
             first..first + found[i].0
         });
-        // one pass at least, since it also closes the gaps between the chunks
-        for pass in 0..significant.div_ceil(DIGIT).max(1) {
-            self.pass(&parts, low, 32 + pass * DIGIT);
-            let share = total.div_ceil(CHUNKS);
-            parts = std::array::from_fn(|i| (i * share).min(total)..((i + 1) * share).min(total));
+        // also closes the gaps between the chunks
+        self.move_all(&parts, |key| (key >> 32) as usize & (BUCKETS - 1));
+        let share = total.div_ceil(CHUNKS);
+        parts = std::array::from_fn(|i| (i * share).min(total)..((i + 1) * share).min(total));
+        for pass in 0..(32 - rest.leading_zeros()).div_ceil(DIGIT) {
+            let (base, shift) = (u64::from(low >> DIGIT), pass * DIGIT);
+            let digit = |key: u64| (((key >> (32 + DIGIT)) - base) >> shift) as usize & (BUCKETS - 1);
+            self.count(&parts, digit);
+            self.move_all(&parts, digit);
         }
         self.visible = total;
     }
 
-    fn pass(&mut self, parts: &[Range<usize>; CHUNKS], low: u32, shift: u32) {
-        let base = u64::from(low) << 32;
-        let digit = |key: u64| ((key - base) >> shift) as usize & (BUCKETS - 1);
-        let (keys, swap) = (&self.keys, &self.swap);
+    /// Fills `places` with how often each digit occurs in each part.
+    fn count(&mut self, parts: &[Range<usize>; CHUNKS], digit: impl Fn(u64) -> usize + Sync) {
+        let keys = &self.keys;
         let places = self.places.par_chunks_exact_mut(BUCKETS).zip(parts);
         places.for_each(|(places, part)| {
             places.fill(0);
@@ -86,12 +94,17 @@ impl DepthSort {
                 places[digit(key.load(Relaxed))] += 1;
             }
         });
+    }
+
+    /// Sorts by a digit that is counted in `places`.
+    fn move_all(&mut self, parts: &[Range<usize>; CHUNKS], digit: impl Fn(u64) -> usize + Sync) {
         let mut sum = 0;
         for bucket in 0..BUCKETS {
             for chunk in 0..CHUNKS {
                 sum += std::mem::replace(&mut self.places[chunk * BUCKETS + bucket], sum);
             }
         }
+        let (keys, swap) = (&self.keys, &self.swap);
         let places = self.places.par_chunks_exact_mut(BUCKETS).zip(parts);
         places.for_each(|(places, part)| {
             for key in &keys[part.clone()] {

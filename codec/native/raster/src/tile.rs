@@ -3,8 +3,8 @@
 
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
-use crate::bin::reach;
-use crate::project::{Projected, TILE};
+use crate::constants::LOG2_ALPHA_MIN;
+use crate::project::{Projected, SLACK, TILE};
 use crate::simd::{Vector, c, prefetch};
 
 pub const BLOCKS: usize = 16;
@@ -93,6 +93,41 @@ pub fn opacities<V: Vector, const N: usize>(s: [&Local; N], x: [V; N], y: [V; N]
     [u, v, e, V::exp2_near(e)]
 }
 
+/// log2(alpha / ALPHA_MIN) at the centre, with the slack: the squared radius in units of u, v.
+#[inline(always)]
+pub fn reach<V: Vector>(log2_opacity: V) -> V {
+    (log2_opacity - c(LOG2_ALPHA_MIN)).mul_add(c(1.0 + SLACK), c(SLACK))
+}
+
+/// u^2 + v^2 <= reach around the origin.
+pub struct Ellipse<V> {
+    pub l11: V,
+    pub l21: V,
+    pub l22: V,
+    pub reach: V,
+}
+
+impl<V: Vector> Ellipse<V> {
+    /// y where it is widest to the right: -l21 sqrt(reach) / (l22 sqrt(l21^2 + l22^2))
+    #[inline(always)]
+    pub fn peak(&self) -> V {
+        let norm = self.l21.mul_add(self.l21, self.l22 * self.l22);
+        -(self.l21 * (self.reach / norm).sqrt() / self.l22)
+    }
+
+    /// Whether it meets the rows from `top` to `bottom`, and its ends there, times l11.
+    #[inline(always)]
+    pub fn span(&self, peak: V, top: V, bottom: V) -> (V::Mask, V, V) {
+        let zero = c(0.0);
+        let (yr, yl) = (peak.max(top).min(bottom), (-peak).max(top).min(bottom));
+        let (vr, vl) = (self.l22 * yr, self.l22 * yl);
+        let (hr, hl) = (vr.neg_mul_add(vr, self.reach), vl.neg_mul_add(vl, self.reach));
+        let right = self.l21.neg_mul_add(yr, hr.max(zero).sqrt());
+        let left = self.l21.neg_mul_add(yl, -hl.max(zero).sqrt());
+        (hr.ge(zero) & hl.ge(zero), left, right)
+    }
+}
+
 /// Up to 64 Gaussians of the tile, copied together.
 pub struct Batch {
     pub splats: [Local; BATCH],
@@ -164,21 +199,17 @@ impl Batch {
     fn hit_lanes<V: Vector>(&self, at: usize, hits: &mut Hits) {
         let r = &self.rows;
         let (x, y) = (V::load(&r[0][at..]), V::load(&r[1][at..]));
-        let (l11, l21, l22) = (V::load(&r[2][at..]), V::load(&r[3][at..]), V::load(&r[4][at..]));
-        let q = V::load(&r[5][at..]);
-        // y where the ellipse is widest to the right: -l21 sqrt(q) / (l22 sqrt(l21^2 + l22^2))
-        let norm = l21.mul_add(l21, l22 * l22);
-        let peak = -(l21 * (q / norm).sqrt() / l22);
+        let l11 = V::load(&r[2][at..]);
+        let ellipse = Ellipse {
+            l11,
+            l21: V::load(&r[3][at..]),
+            l22: V::load(&r[4][at..]),
+            reach: V::load(&r[5][at..]),
+        };
+        let peak = ellipse.peak();
         for row in 0..4 {
             let top = c::<V>(4.0 * row as f32 + 0.5) - y;
-            let bottom = top + c(3.0);
-            let (yr, yl) = (peak.max(top).min(bottom), (-peak).max(top).min(bottom));
-            let (vr, vl) = (l22 * yr, l22 * yl);
-            let (hr, hl) = (vr.neg_mul_add(vr, q), vl.neg_mul_add(vl, q));
-            let met = hr.ge(c(0.0)) & hl.ge(c(0.0));
-            // ends of the ellipse within the row of blocks, times l11
-            let right = l21.neg_mul_add(yr, hr.max(c(0.0)).sqrt());
-            let left = l21.neg_mul_add(yl, -hl.max(c(0.0)).sqrt());
+            let (met, left, right) = ellipse.span(peak, top, top + c(3.0));
             for column in 0..4 {
                 let first = (c::<V>(4.0 * column as f32 + 0.5) - x) * l11;
                 let last = (c::<V>(4.0 * column as f32 + 3.5) - x) * l11;

@@ -1,6 +1,6 @@
 //! What an instance holds, and what its exports do.
 
-use super::text;
+use super::{pack, text};
 use gsv::attributes::sh_coefficients;
 use gsv::container::demux::Demuxer;
 use gsv::decode::{Decoding, decode_group, reference_of};
@@ -154,24 +154,20 @@ impl Player {
     }
 
     pub fn project(&mut self, bands: usize) -> usize {
-        let f = &self.frame;
-        let splats = Splats {
-            means: f.means.as_flattened(),
-            quats: f.quats.as_flattened(),
-            log_scales: &f.log_scales,
-            logit_opacities: &f.logit_opacities,
-            sh0: &f.sh0,
-            sh_n: &f.sh_n,
-            sh_k: self.sh_k,
-        };
-        let view = view(&self.input);
-        let drawn = match self.raster.project(&splats, &view) {
-            Ok(projected) => Ok(self.bands.split(projected, [view.width, view.height], bands).len()),
-            Err(e) => Err(e),
-        };
+        let (f, view) = (&self.frame, view(&self.input));
+        let drawn = self.raster.project(&splats(f, self.sh_k), &view);
+        let drawn = drawn.map(|projected| self.bands.split(projected, [view.width, view.height], bands).len());
         let count = *drawn.as_ref().unwrap_or(&0);
         self.done(drawn);
         count
+    }
+
+    pub fn pack(&mut self, origin: [f32; 3]) -> bool {
+        let f = &self.frame;
+        self.output.clear();
+        let drawn = self.raster.project(&splats(f, self.sh_k), &view(&self.input));
+        let packed = drawn.map(|projected| pack::pack(f, projected, origin, &mut self.output));
+        self.done(packed)
     }
 
     pub fn band(&self, i: usize) -> Option<&Band> {
@@ -198,6 +194,18 @@ impl Player {
             self.raster = Rasterizer::new(level, 0);
         }
         level.is_some()
+    }
+}
+
+fn splats(f: &Frame, sh_k: usize) -> Splats<'_> {
+    Splats {
+        means: f.means.as_flattened(),
+        quats: f.quats.as_flattened(),
+        log_scales: &f.log_scales,
+        logit_opacities: &f.logit_opacities,
+        sh0: &f.sh0,
+        sh_n: &f.sh_n,
+        sh_k,
     }
 }
 

@@ -103,10 +103,6 @@ impl Vector for F32x8 {
         unsafe { F32x8(_mm256_andnot_ps(_mm256_set1_ps(-0.0), self.0)) }
     }
     #[inline(always)]
-    fn or(self, b: Self) -> Self {
-        unsafe { F32x8(_mm256_or_ps(self.0, b.0)) }
-    }
-    #[inline(always)]
     fn negative(self) -> Self {
         unsafe { F32x8(_mm256_or_ps(self.0, _mm256_set1_ps(-0.0))) }
     }

@@ -93,10 +93,6 @@ impl Vector for F32x16 {
         unsafe { F32x16(_mm512_abs_ps(self.0)) }
     }
     #[inline(always)]
-    fn or(self, b: Self) -> Self {
-        unsafe { F32x16(_mm512_or_ps(self.0, b.0)) }
-    }
-    #[inline(always)]
     fn negative(self) -> Self {
         unsafe { F32x16(_mm512_or_ps(self.0, _mm512_set1_ps(-0.0))) }
     }

@@ -1,12 +1,14 @@
 //! One vector interface for all kernels. A kernel is written once, generic over `Vector`; the instances are `f32` (the plain
-//! reference), AVX2 + FMA and AVX-512, chosen at run time by `Level`, WebAssembly simd128, chosen by the build, and a portable
-//! one for all other machines, ARM above all. `dispatch!` makes the entry point of a kernel: it compiles the instance inside a
+//! reference), AVX2 + FMA and AVX-512, chosen at run time by `Level`, NEON and WebAssembly simd128, chosen by the build, and a
+//! portable one for all other machines. `dispatch!` makes the entry point of a kernel: it compiles the instance inside a
 //! function that has the target features, which is what lets the intrinsics inline.
 
 #[cfg(target_arch = "x86_64")]
 pub mod avx2;
 #[cfg(target_arch = "x86_64")]
 pub mod avx512;
+#[cfg(target_arch = "aarch64")]
+pub mod neon;
 #[cfg(not(target_family = "wasm"))]
 pub mod portable;
 mod scalar;
@@ -51,8 +53,6 @@ pub trait Vector:
     fn recip_fast(self) -> Self {
         self.recip()
     }
-    /// Bitwise; with -0.0 it sets the sign.
-    fn or(self, b: Self) -> Self;
     /// -|x|
     fn negative(self) -> Self;
     /// 2^x, relative error below 5e-6 for -126 <= x <= 126; 0 or infinity far outside.
@@ -159,6 +159,8 @@ pub(crate) enum Isa {
     Avx2,
     #[cfg(target_arch = "x86_64")]
     Avx512,
+    #[cfg(target_arch = "aarch64")]
+    Neon,
     #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
     Wasm128,
 }
@@ -171,7 +173,10 @@ impl Level {
         let mut found = Vec::new();
         #[cfg(target_arch = "x86_64")]
         {
-            let fma = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+            let bits = is_x86_feature_detected!("bmi1")
+                && is_x86_feature_detected!("bmi2")
+                && is_x86_feature_detected!("popcnt");
+            let fma = bits && is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
             let f = is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq");
             if fma && f && is_x86_feature_detected!("avx512vl") && is_x86_feature_detected!("avx512bw") {
                 found.push(Level(Isa::Avx512));
@@ -182,6 +187,8 @@ impl Level {
         }
         #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
         found.push(Level(Isa::Wasm128));
+        #[cfg(target_arch = "aarch64")]
+        found.push(Level(Isa::Neon));
         #[cfg(not(target_family = "wasm"))]
         found.push(Level(Isa::Portable));
         found.push(Level::SCALAR);
@@ -201,6 +208,8 @@ impl Level {
             Isa::Avx2 => "avx2",
             #[cfg(target_arch = "x86_64")]
             Isa::Avx512 => "avx512",
+            #[cfg(target_arch = "aarch64")]
+            Isa::Neon => "neon",
             #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
             Isa::Wasm128 => "wasm128",
         }
@@ -220,11 +229,11 @@ macro_rules! dispatch {
         $vis fn $name(level: $crate::simd::Level, $($arg: $ty),*) $(-> $ret)? {
             #[cfg(target_arch = "x86_64")]
             {
-                #[target_feature(enable = "avx2,fma,avx512f,avx512dq,avx512vl,avx512bw")]
+                #[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt,avx512f,avx512dq,avx512vl,avx512bw")]
                 fn avx512($($arg: $ty),*) $(-> $ret)? {
                     $kernel::<$crate::simd::avx512::F32x16>($($arg),*)
                 }
-                #[target_feature(enable = "avx2,fma")]
+                #[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt")]
                 fn avx2($($arg: $ty),*) $(-> $ret)? {
                     $kernel::<$crate::simd::avx2::F32x8>($($arg),*)
                 }
@@ -239,6 +248,10 @@ macro_rules! dispatch {
             #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
             if level.isa() == $crate::simd::Isa::Wasm128 {
                 return $kernel::<$crate::simd::wasm128::F32x4>($($arg),*);
+            }
+            #[cfg(target_arch = "aarch64")]
+            if level.isa() == $crate::simd::Isa::Neon {
+                return $kernel::<$crate::simd::neon::F32x4>($($arg),*);
             }
             #[cfg(not(target_family = "wasm"))]
             if level.isa() == $crate::simd::Isa::Portable {

@@ -39,10 +39,6 @@ impl Vector for f32 {
         f32::abs(self)
     }
     #[inline(always)]
-    fn or(self, b: f32) -> f32 {
-        f32::from_bits(self.to_bits() | b.to_bits())
-    }
-    #[inline(always)]
     fn negative(self) -> f32 {
         -f32::abs(self)
     }

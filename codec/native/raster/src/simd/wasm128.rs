@@ -97,10 +97,6 @@ impl Vector for F32x4 {
         F32x4(f32x4_abs(self.0))
     }
     #[inline(always)]
-    fn or(self, b: Self) -> Self {
-        F32x4(v128_or(self.0, b.0))
-    }
-    #[inline(always)]
     fn negative(self) -> Self {
         F32x4(v128_or(self.0, f32x4_splat(-0.0)))
     }

@@ -1,0 +1,238 @@
+"""Speed of the web player in headless Chromium without a GPU: its CPU path, frames a second, milliseconds, memory.
+
+usage: python bench/player.py FOLDER [statue] [demo] ...
+
+FOLDER keeps the streams; what is missing is encoded first, apart from the measuring: the bundled capture (demo), and of
+the folder that GSCODEC_DATA names the moving statue, 40 frames (statue: without what no view shows, statue_all: all
+101,275 Gaussians) and 300 frames (long, for the memory).
+
+Of each stream:
+  first_picture_ms   from the start of the navigation, page and stream from this machine, nothing cached
+  fps_clock          pictures a second when 60 are wanted, median of 3 times 2 s; the display allows no more
+  fps_free           pictures a second of all frames in order, asked for as fast as they come
+  project_ms, blend_ms   medians of a picture: evaluating and projecting it, the slower one of the raster workers
+  decode, evaluate   ms a frame: a group decoded, its frames evaluated; wasm in a page and native, on one core each
+  memory_mb          largest proportional set size of the page's process while the stream plays once
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+from gscodec.bench.browser import Browser, Browsers
+from gscodec.bench.machine import RESULTS, ROOT, write_result
+from gscodec.bench.run import animated, gscodec
+from gscodec.player.server import Server
+
+SIZE = "512x512"
+LOADS = 5
+PLAYER = "document.querySelector('gsv-player')"
+STATUES = {"statue": (40, ()), "statue_all": (40, ("--keep-all",)), "long": (300, ())}
+
+# the time of the first picture, kept by every page
+KEEP = "addEventListener('picture', () => (window.firstPicture ??= performance.now()), true)"
+FIRST = "window.firstPicture"
+
+# every picture's times while all frames are drawn in order
+FREE = """async ([count]) => {
+    const player = document.querySelector("gsv-player");
+    player.pause();
+    await player.show(0);
+    const { engine } = player;
+    const view = player.camera.view(512, 512);
+    const times = { project: [], blend: [] };
+    let [t, drawn] = [0, 0];
+    const next = () => new Promise((done) => engine.addEventListener("picture", done, { once: true }));
+    const ask = () => {
+        engine.want(engine.groupOf(t), true);
+        while (engine.free && engine.ready(engine.groupOf(t))) {
+            engine.draw(t, view);
+            t = (t + 1) % player.frameCount;
+        }
+    };
+    const start = performance.now();
+    while (drawn < count) {
+        ask();
+        await Promise.race([next().then(() => {
+            drawn++;
+            for (const k of ["project", "blend"]) times[k].push(engine.stats[k]);
+        }), new Promise((done) => setTimeout(done, 100))]);
+    }
+    return { seconds: (performance.now() - start) / 1000, ...times };
+}"""
+
+# one module alone: groups decoded and all of their frames evaluated
+DECODE = """async ([limit]) => {
+    const { Native, load } = await import("/native.js");
+    const native = await Native.create(await load(new URL("/native.wasm", location.href)));
+    const file = new Uint8Array(await (await fetch("/stream.gsv")).arrayBuffer());
+    native.push(file);
+    const { config, groups } = native.describe();
+    const runs = [];
+    for (let run = 0; run < 3; run++) {
+        let [decode, evaluate, frames] = [0, 0, 0];
+        for (const [i, g] of groups.slice(0, limit).entries()) {
+            const payload = file.slice(g.offset, g.offset + g.size);
+            const start = performance.now();
+            const back = native.reference(payload);
+            native.decode(i, payload, config.level, back ? i - back : undefined);
+            const decoded = performance.now();
+            for (let t = 0; t < g.frames; t++) native.frame(i, t);
+            decode += decoded - start;
+            evaluate += performance.now() - decoded;
+            frames += g.frames;
+        }
+        runs.push([decode / frames, evaluate / frames]);
+    }
+    return runs;
+}"""
+
+NATIVE = """
+import sys, time, json
+from gscodec.decode import open_stream
+runs = []
+for _ in range(3):
+    stream = open_stream(sys.argv[1])
+    decode = evaluate = frames = 0
+    for i, g in enumerate(stream.groups[: int(sys.argv[2])]):
+        start = time.perf_counter()
+        group = stream.group(i)
+        decoded = time.perf_counter()
+        for t in range(g["frames"]):
+            group.frame(t)
+        decode += decoded - start
+        evaluate += time.perf_counter() - decoded
+        frames += g["frames"]
+    runs.append([1e3 * decode / frames, 1e3 * evaluate / frames])
+print(json.dumps(runs))
+"""
+
+
+def streams(folder: Path, names: list[str]) -> dict[str, Path]:
+    """The streams that can be had; missing ones are encoded."""
+    data = Path(os.environ["GSCODEC_DATA"]) if "GSCODEC_DATA" in os.environ else None
+    folder.mkdir(parents=True, exist_ok=True)
+    found = {}
+    for name in names:
+        path = folder / f"{name}.gsv"
+        if not path.exists() and name == "demo":
+            gscodec("encode", ROOT / "examples" / "lumberjack", path)
+        elif not path.exists() and data:
+            frames, options = STATUES[name]
+            gscodec("encode", animated(data, folder, frames), path, *options)
+        if path.exists():
+            found[name] = path
+        else:
+            print(f"{name}: left out, GSCODEC_DATA is not set", file=sys.stderr)
+    return found
+
+
+def first_pictures(browsers: Browsers, url: str) -> list[float]:
+    """Milliseconds to the first picture, each time in a browser that has seen nothing."""
+    times = []
+    for _ in range(LOADS):
+        browser = browsers.start("--disable-gpu")
+        browser.page.add_init_script(KEEP)
+        browser.goto(f"{url}?size={SIZE}")
+        times.append(browser.wait(FIRST))
+        browser.page.context.browser.close()
+    return times
+
+
+def clocked(browser: Browser, url: str, seconds: int = 2) -> float:
+    """Pictures a second while 60 are wanted."""
+    browser.page.add_init_script(KEEP)
+    browser.goto(f"{url}?size={SIZE}")
+    browser.wait(FIRST)
+    browser.eval(f"{PLAYER}.speed = 60 / {PLAYER}.fps")
+    time.sleep(2)
+    count = f"new Promise((done) => {{ let n = 0; {PLAYER}.addEventListener('picture', () => n++);"
+    count += f"setTimeout(() => done(n), {1000 * seconds}); }})"
+    return statistics.median(browser.eval(count) / seconds for _ in range(3))
+
+
+def renderer_memory(stop: threading.Event, found: list[float]) -> None:
+    """Adds the largest proportional set size of the page's process, MB, until `stop`."""
+    while not stop.wait(0.1):
+        for entry in Path("/proc").glob("[0-9]*"):
+            try:
+                if b"--type=renderer" not in (entry / "cmdline").read_bytes():
+                    continue
+                line = next(x for x in (entry / "smaps_rollup").read_text().splitlines() if x.startswith("Pss:"))
+                found.append(int(line.split()[1]) / 1024)
+            except (OSError, StopIteration):
+                continue
+
+
+def memory(browser: Browser, url: str) -> float:
+    """MB while the whole stream plays once at twice its speed."""
+    stop, found = threading.Event(), []
+    thread = threading.Thread(target=renderer_memory, args=(stop, found))
+    thread.start()
+    browser.goto(f"{url}?size={SIZE}&speed=2&loop=off")
+    browser.wait(f"{PLAYER}.paused && {PLAYER}.frame === {PLAYER}.frameCount - 1")
+    stop.set()
+    thread.join()
+    return max(found)
+
+
+def decode_times(browser: Browser, url: str, path: Path, groups: int = 2) -> dict:
+    """Milliseconds a frame and their ratio, medians of three runs."""
+    browser.goto(url + "?src=none.gsv")
+    wasm = browser.page.evaluate(DECODE, [groups])
+    env = dict(os.environ, RAYON_NUM_THREADS="1")
+    command = [sys.executable, "-c", NATIVE, str(path), str(groups)]
+    native = json.loads(subprocess.run(command, env=env, check=True, capture_output=True, text=True).stdout)
+    result = {}
+    for i, what in enumerate(("decode", "evaluate")):
+        page, here = (statistics.median(run[i] for run in runs) for runs in (wasm, native))
+        result[what] = {"wasm_ms": round(page, 2), "native_ms": round(here, 2), "ratio": round(page / here, 2)}
+    return result
+
+
+def measure(browsers: Browsers, name: str, path: Path) -> dict:
+    """The figures of one stream."""
+    info = json.loads(gscodec("info", path, "--json")[0])
+    server = Server(path)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    result = {"frames": info["frames"], "gaussians": info["gaussians"], "bytes": path.stat().st_size}
+    if name == "long":
+        return result | {"memory_mb": round(memory(browsers.start("--disable-gpu"), server.url))}
+    firsts = first_pictures(browsers, server.url)
+    browser = browsers.start("--disable-gpu")
+    result |= {
+        "first_picture_ms": round(statistics.median(firsts)),
+        "fps_clock": round(clocked(browser, server.url), 1),
+    }
+    free = browser.page.evaluate(FREE, [100])
+    result["fps_free"] = round(len(free["blend"]) / free["seconds"], 1)
+    for key in ("project", "blend"):
+        result[f"{key}_ms"] = round(statistics.median(free[key]), 2)
+    result |= decode_times(browser, server.url, path)
+    server.shutdown()
+    return result
+
+
+def main() -> None:
+    """Measures the streams named on the command line, all by default."""
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
+    found = streams(Path(sys.argv[1]), sys.argv[2:] or ["demo", *STATUES])
+    results = {}
+    with Browsers() as browsers:
+        version = browsers.start().page.context.browser.version
+        for name, path in found.items():
+            results[name] = measure(browsers, name, path)
+            print(name, json.dumps(results[name]), flush=True)
+    write_result(RESULTS / "player.json", {"size": SIZE, "browser": f"Chromium {version}", "streams": results})
+
+
+if __name__ == "__main__":
+    main()

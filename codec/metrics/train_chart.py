@@ -1,0 +1,54 @@
+"""bench/results/train.json -> quality of training against its time and its size, by recipe and preset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+LOOK = {  # recipe -> name, colour
+    "model": ("gscodec, before coding", "#8fb4e3"),
+    "gscodec": ("gscodec", "#1f5fb4"),
+    "alone": ("every frame alone", "#e0a96d"),
+    "alone-coded": ("every frame alone, coded", "#c76f14"),
+    "v3": ("V3's recipe", "#9a9a9a"),
+    "v3-coded": ("V3's recipe and packing", "#555555"),
+}
+PANELS = {"seconds_per_frame": "training, seconds a frame", "kb_per_frame": "kB a frame"}
+
+
+def train_chart(result: dict):
+    """A row for each capture, a panel for time and one for size (matplotlib)."""
+    from matplotlib.figure import Figure
+
+    captures = list(dict.fromkeys(e["capture"] for e in result["entries"]))
+    figure = Figure(figsize=(10, 3.4 * len(captures)), layout="constrained")
+    for row, capture in zip(figure.subplots(len(captures), 2, squeeze=False), captures, strict=True):
+        entries = [e for e in result["entries"] if e["capture"] == capture]
+        for axes, (key, label) in zip(row, PANELS.items(), strict=True):
+            axes.set(xlabel=label, ylabel="PSNR of the subject, dB", xscale="log")
+            _panel(axes, [e for e in entries if e[key]], key)
+        row[0].set_title(capture, loc="left", weight="bold")
+    machine = result["machine"]
+    text = f"test cameras; {machine['cpu']}, {machine['cores']} cores; commit {result['commit']}"
+    figure.text(0.995, 0.995, text, ha="right", va="top", fontsize=7, color="#888888")
+    return figure
+
+
+def _panel(axes, entries: Sequence[dict], key: str) -> None:
+    from matplotlib.ticker import LogLocator
+
+    for recipe, (name, color) in LOOK.items():
+        points = sorted((e[key], e["psnr_fg"], e["preset"]) for e in entries if e["recipe"] == recipe)
+        if not points:
+            continue
+        x, y, presets = zip(*points, strict=True)
+        ours = recipe == "gscodec"
+        axes.plot(x, y, marker="o", color=color, label=name, linewidth=2.4 if ours else 1.2, zorder=3 if ours else 2)
+        for at, preset in zip(zip(x, y, strict=True), presets, strict=True):
+            axes.annotate(preset, at, (4, -9), textcoords="offset points", fontsize=7, color=color)
+    axes.grid(alpha=0.25)
+    axes.margins(0.14)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("")
+    if axes.has_data():
+        axes.legend(frameon=False, fontsize=7)

@@ -1,0 +1,100 @@
+"""Births: Gaussians that a frame needs and its keyframe did not have, for what turns into sight or comes in.
+
+In: the Gaussians of a tracked frame, and how strongly its pictures pull at each. Out: new ones in the pose of the
+frame, trained alone for some steps among the others, which stay; they live from this frame on. Some are children of
+Gaussians at which the pictures pull far more than in the keyframe. Where the picture is altogether wrong in what has
+changed, there may be nothing near that could move there (a ball drops in): points come from a plane sweep.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gscodec.render.image import render_image
+from gscodec.render.workspace import Workspace
+from gscodec.train.keyframe import MEANS_RATE, PRUNE_OPACITY, PRUNE_WEIGHT, RATES, SPLIT_SHRINK, Statistics, rotate
+from gscodec.train.model import NAMES, Model, from_points
+from gscodec.train.sweep import sweep
+from gscodec.train.views import compare
+
+LOUD = 2.0  # times the calm pull
+LEAST = 8  # fewer are not worth a unit in the stream
+MOST = 0.05  # of the Gaussians, in one frame
+STEPS = 100
+CHILD_OPACITY = 0.3
+WRONG = 40.0  # grey levels, mean over 5 x 5 pixels: altogether wrong
+WRONG_SHARE = 0.002  # of the pictures, for a sweep to be worth its time
+
+
+def born(model: Model, pull: torch.Tensor, wrong: list[np.ndarray], frame: int, views, settings, room: int, on_step):
+    """New Gaussians for `frame` (a Model), or None.
+
+    Args:
+        model: the Gaussians of the frame; pull: [N], in units of what is calm.
+        wrong: as of `wrong_pixels`.
+        room: at most so many.
+        on_step: called with (step, loss), or None.
+    """
+    room = min(room, int(MOST * len(model)))
+    rng, workspace = np.random.default_rng([settings.seed, frame, 3]), Workspace()
+    young = _points(wrong, frame, views, room, settings.seed)
+    chosen = torch.topk(pull, max(0, min(room - len(young), len(pull)))).indices
+    young.append(_children(model, chosen[pull[chosen] > LOUD], rng))
+    if len(young) < LEAST:
+        return None
+    radius, stats = float(model.params["means"].std(0).norm()), Statistics(len(young))
+    for step in range(STEPS):
+        together = {n: torch.cat([model.params[n], young.params[n]]) for n in NAMES}
+        result = compare(together, views.draw(frame), settings, rng, workspace)
+        fade = 0.1 ** (step / STEPS)
+        rates = {"means": radius * MEANS_RATE[0] * fade, **{n: r * fade for n, r in RATES.items()}}
+        young.adam({n: g[len(model) :] for n, g in result.grads.items()}, rates)
+        if 2 * step >= STEPS:
+            weight = torch.as_tensor(result.max_weight)[len(model) :]
+            torch.maximum(stats.weight, weight, out=stats.weight)
+        if on_step:
+            on_step(step, result.loss)
+    keep = (torch.sigmoid(young.params["logit_opacities"]) > PRUNE_OPACITY) & (stats.weight > PRUNE_WEIGHT)
+    if keep.sum() < LEAST:
+        return None
+    young.select(keep)
+    young.params["quats"] = torch.nn.functional.normalize(young.params["quats"], dim=1)
+    return young
+
+
+def wrong_pixels(model: Model, masks: list[np.ndarray], frame: int, views) -> list[np.ndarray]:
+    """[h, w] bool of each training camera, of the size of its mask: changed pixels (`masks`) that the Gaussians do not
+    show at all."""
+    import cv2
+
+    g, out = model.gaussians(), []
+    for camera, mask in zip(views.train_cameras, masks, strict=True):
+        view, pinhole = views.capture.view(camera, frame), views.capture.cameras[camera]
+        truth = view.rgb.astype(np.float32)
+        if view.alpha is not None:
+            truth = 127.5 + (truth - 127.5) * (view.alpha[..., None] / np.float32(255))
+        error = np.abs(render_image(g, pinhole, (0.5, 0.5, 0.5)) - truth).max(2)
+        small = cv2.resize(error, mask.shape[::-1], interpolation=cv2.INTER_AREA)
+        out.append(mask & (cv2.blur(small, (5, 5)) > WRONG))
+    return out
+
+
+def _points(wrong: list[np.ndarray], frame: int, views, room: int, seed: int) -> Model:
+    """Gaussians on surfaces in the pixels that are wrong."""
+    empty = np.zeros((0, 3))
+    if np.mean([m.mean() for m in wrong]) < WRONG_SHARE:
+        return from_points(empty, empty, opacity=0.5)
+    taken = [views.capture.view(i, frame) for i in views.train_cameras]
+    pictures = [(views.capture.cameras[i], v.rgb, v.alpha) for i, v in zip(views.train_cameras, taken, strict=True)]
+    return from_points(*sweep(pictures, room // 2, seed, wrong), opacity=0.5)
+
+
+def _children(model: Model, chosen: torch.Tensor, rng: np.random.Generator) -> dict[str, torch.Tensor]:
+    """One smaller Gaussian beside each of the `chosen` ones."""
+    params = {n: p[chosen].clone() for n, p in model.params.items()}
+    noise = torch.from_numpy(rng.standard_normal((len(chosen), 3)).astype(np.float32))
+    params["means"] += rotate(params["quats"], noise * torch.exp(params["log_scales"]))
+    params["log_scales"] -= SPLIT_SHRINK
+    params["logit_opacities"][:] = float(np.log(CHILD_OPACITY / (1 - CHILD_OPACITY)))
+    return params

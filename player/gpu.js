@@ -1,0 +1,152 @@
+// Draws pictures on the GPU with Spark (three.js), whose constants are set to those of the picture (spec, clause 14). spark.js
+// is larger than all of the rest, so it is loaded only where it is used; without it or without a GPU the CPU draws.
+
+const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i; // slower than the wasm rasterizer
+const ALPHA_MIN = 1 / 255;
+const LOW_PASS = 0.3;
+const NEAR = 0.01;
+const FAR = 1e6; // of the depth buffer, which nothing else uses
+
+// The name of the GPU behind WebGL2; null where there is none, or one that is software.
+export function gpuName() {
+  const gl = new OffscreenCanvas(1, 1).getContext("webgl2", { failIfMajorPerformanceCaveat: true });
+  if (!gl) return null;
+  const name = nameOf(gl);
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return SOFTWARE.test(name) ? null : name;
+}
+
+function nameOf(gl) {
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+  return /^ANGLE \([^,]*, (.*?)(?: \(0x|,|$)/.exec(name)?.[1] ?? name; // of "ANGLE (maker, name (0x..) .., driver)"
+}
+
+export class Gpu {
+  #busy = Promise.resolve();
+  #spark;
+  #renderer;
+  #scene;
+  #camera;
+  #sorter;
+  #splats;
+  #mesh;
+  #world;
+  #head = null; // the camera of a session
+
+  // origin: middle of the scene, which packed Gaussians are relative to; background: 3 numbers
+  static async create(canvas, base, { origin, background }) {
+    const spark = await import(new URL("spark.js", base));
+    if (!canvas.getContext("webgl2", { antialias: false, alpha: false })) throw new Error("this browser has no WebGL2 here");
+    return new Gpu(spark, canvas, origin, background);
+  }
+
+  constructor(spark, canvas, origin, background) {
+    this.#spark = spark;
+    spark.ColorManagement.enabled = false; // colours are blended as they are
+    this.#renderer = new spark.WebGLRenderer({ canvas, antialias: false, alpha: false });
+    this.#renderer.setPixelRatio(1);
+    this.#renderer.setClearColor(new spark.Color(...background), 1);
+    this.name = nameOf(this.#renderer.getContext());
+    this.#camera = new spark.PerspectiveCamera();
+    Object.assign(this.#camera, { matrixAutoUpdate: false, near: NEAR, far: FAR });
+    this.#sorter = new spark.SparkRenderer({
+      renderer: this.#renderer,
+      autoUpdate: false,
+      preBlurAmount: LOW_PASS, // opacity is not made up for it
+      blurAmount: 0,
+      minAlpha: ALPHA_MIN,
+      maxStdDev: Math.sqrt(-2 * Math.log(ALPHA_MIN)),
+      maxPixelRadius: 1e4,
+      sortRadial: false,
+      enableLod: false,
+    });
+    this.#splats = new spark.PackedSplats();
+    this.#mesh = new spark.SplatMesh({ packedSplats: this.#splats });
+    this.#mesh.position.set(...origin);
+    this.#world = new spark.Group(); // a session places it before the viewer
+    this.#world.matrixAutoUpdate = false;
+    this.#world.add(this.#mesh);
+    this.#scene = new spark.Scene();
+    this.#scene.add(this.#sorter, this.#world);
+  }
+
+  // Shows the scene in a headset until the session ends: from where the view (18 numbers) looks, `metres` for a unit of it.
+  // Calls tick() for each picture of the session: meanwhile the window's own clock may stand still.
+  async enter(session, view, metres, tick) {
+    const { xr } = this.#renderer;
+    xr.enabled = true;
+    xr.setReferenceSpaceType("local"); // its origin is the head at the start
+    await xr.setSession(session);
+    this.#head = new this.#spark.PerspectiveCamera();
+    const { Matrix4 } = this.#spark;
+    this.#place(this.#toCamera(view).premultiply(new Matrix4().makeScale(metres, metres, metres)));
+    this.#sorter.autoUpdate = true;
+    this.#renderer.setAnimationLoop(() => {
+      tick();
+      this.#renderer.render(this.#scene, this.#head);
+    });
+    session.addEventListener("end", () => {
+      this.#renderer.setAnimationLoop(null);
+      this.#place(new Matrix4());
+      this.#sorter.autoUpdate = xr.enabled = false;
+      this.#head = null;
+    });
+  }
+
+  #place(matrix) {
+    this.#world.matrix.copy(matrix);
+    this.#scene.updateMatrixWorld(true); // Spark looks before the next rendering does it
+  }
+
+  // Where the head is, in units of the scene; null outside of a session.
+  get head() {
+    if (!this.#head) return null;
+    const { position } = this.#head;
+    return position.clone().applyMatrix4(this.#world.matrix.clone().invert()).toArray();
+  }
+
+  // Shows Gaussians that `Native.pack` made for the view (18 numbers); resolves when they are on the canvas, one after another.
+  draw(view, packed) {
+    this.#busy = this.#busy.then(() => this.#draw(view, packed));
+    return this.#busy;
+  }
+
+  async #draw(view, packed) {
+    const n = packed.length / 4;
+    this.#splats.ensureSplats(Math.max(n, 1)).set(packed);
+    this.#splats.numSplats = n;
+    this.#splats.needsUpdate = true;
+    this.#mesh.updateVersion();
+    if (this.#head) return; // the session draws, and sorts meanwhile
+    this.#look(view);
+    await this.#sorter.update({ scene: this.#scene, camera: this.#camera });
+    if (this.#head) return;
+    const [width, height] = view;
+    this.#renderer.setSize(width, height, false);
+    this.#renderer.render(this.#scene, this.#camera);
+  }
+
+  // A pinhole camera with OpenCV axes -> OpenGL.
+  #look(view) {
+    const [w, h, fx, fy, cx, cy] = view;
+    const { projectionMatrix, projectionMatrixInverse, matrix } = this.#camera;
+    const depth = [-(FAR + NEAR) / (FAR - NEAR), (-2 * FAR * NEAR) / (FAR - NEAR)];
+    projectionMatrix.set((2 * fx) / w, 0, 1 - (2 * cx) / w, 0, 0, (2 * fy) / h, (2 * cy) / h - 1, 0, 0, 0, ...depth, 0, 0, -1, 0);
+    projectionMatrixInverse.copy(projectionMatrix).invert();
+    matrix.copy(this.#toCamera(view)).invert();
+    this.#camera.updateMatrixWorld(true);
+  }
+
+  #toCamera([, , , , , , ...m]) {
+    const { Matrix4 } = this.#spark;
+    return new Matrix4().set(...m, 0, 0, 0, 1).premultiply(new Matrix4().makeScale(1, -1, -1));
+  }
+
+  close() {
+    this.#splats.dispose();
+    this.#sorter.dispose();
+    this.#renderer.dispose();
+    this.#renderer.forceContextLoss();
+  }
+}
