@@ -35,7 +35,7 @@ def server(gsv):
     s.server_close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browsers():
     from gscodec.bench.browser import Browsers, find_chromium
 
@@ -47,13 +47,13 @@ def browsers():
         yield b
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser(browsers):
     """Without WebGL."""
     return browsers.start("--disable-gpu", "--disable-3d-apis")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def gl_browser(browsers):
     """With WebGL2 in software, as Chromium has it where there is no GPU and it is told to."""
     from gscodec.bench.browser import SOFTWARE_GL

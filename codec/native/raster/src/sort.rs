@@ -41,6 +41,8 @@ impl DepthSort {
         self.keys.resize_with(projected.len(), AtomicU64::default);
         self.swap.resize_with(projected.len(), AtomicU64::default);
         self.places.resize(CHUNKS * BUCKETS, 0);
+        let used = projected.len().div_ceil(share);
+        self.places[used * BUCKETS..].fill(0); // small scenes fill fewer chunks than the one before
         // of each chunk: the visible ones, the smallest and the largest depth
         let mut found = [(0, u32::MAX, 0); CHUNKS];
         let chunks = projected.par_chunks(share).zip(self.keys.par_chunks_mut(share));
@@ -125,18 +127,20 @@ mod tests {
     #[test]
     fn sorts_by_depth_then_index_and_drops_the_invisible() {
         let depth = |i: usize| [2.5, 1e-2, 7e20, 2.5, 1.0, 2.500_001][i % 6];
-        let p: Vec<Projected> = (0..600)
-            .map(|i| Projected {
-                depth: depth(i),
-                rx: if i % 5 == 0 { -1.0 } else { 1.0 },
-                ..Default::default()
-            })
-            .collect();
-        let mut want: Vec<usize> = (0..600).filter(|i| i % 5 != 0).collect();
-        want.sort_by(|&a, &b| depth(a).total_cmp(&depth(b)));
         let mut sort = DepthSort::default();
-        sort.sort(&p);
-        let got: Vec<usize> = sort.keys().iter().map(|k| k.load(Relaxed) as u32 as usize).collect();
-        assert_eq!(got, want);
+        for n in [600, 9, 5, 2, 1, 0, 600] {
+            let p: Vec<Projected> = (0..n)
+                .map(|i| Projected {
+                    depth: depth(i),
+                    rx: if i % 5 == 0 { -1.0 } else { 1.0 },
+                    ..Default::default()
+                })
+                .collect();
+            let mut want: Vec<usize> = (0..n).filter(|i| i % 5 != 0).collect();
+            want.sort_by(|&a, &b| depth(a).total_cmp(&depth(b)));
+            sort.sort(&p);
+            let got: Vec<usize> = sort.keys().iter().map(|k| k.load(Relaxed) as u32 as usize).collect();
+            assert_eq!(got, want, "{n} Gaussians");
+        }
     }
 }
