@@ -80,10 +80,14 @@ class Capture:
         return replace(self, cameras=[c.resized(w, h) for c, (w, h) in zip(self.cameras, size, strict=True)])
 
 
-def composite(view: View, background: Sequence[float]) -> np.ndarray:
-    """[H, W, 3] u8: the view over `background` (r, g, b in 0..1), blended in sRGB as every splat renderer does."""
+def blend(view: View, background: Sequence[float]) -> np.ndarray:
+    """[H, W, 3] f32, 0 to 255: the view over `background` (r, g, b in 0..1), in sRGB as splat renderers do."""
     if view.alpha is None:
-        return view.rgb
+        return view.rgb.astype(np.float32)
     a = view.alpha[..., None].astype(np.float32) / 255
-    out = view.rgb * a + np.asarray(background, np.float32) * (255 * (1 - a))
-    return (out + 0.5).astype(np.uint8)
+    return view.rgb * a + np.asarray(background, np.float32) * (255 * (1 - a))
+
+
+def composite(view: View, background: Sequence[float]) -> np.ndarray:
+    """[H, W, 3] u8: `blend`, rounded."""
+    return view.rgb if view.alpha is None else (blend(view, background) + 0.5).astype(np.uint8)

@@ -12,9 +12,18 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from gscodec.capture import blend
 from gscodec.render.image import render_image
 from gscodec.render.workspace import Workspace
-from gscodec.train.keyframe import MEANS_RATE, PRUNE_OPACITY, PRUNE_WEIGHT, RATES, SPLIT_SHRINK, Statistics, rotate
+from gscodec.train.keyframe import (
+    MEANS_RATE,
+    PRUNE_OPACITY,
+    PRUNE_WEIGHT,
+    RATES,
+    SPLIT_SHRINK,
+    Statistics,
+    random_offset,
+)
 from gscodec.train.model import NAMES, Model, from_points
 from gscodec.train.sweep import sweep
 from gscodec.train.views import compare
@@ -24,6 +33,7 @@ LEAST = 8  # fewer are not worth a unit in the stream
 MOST = 0.05  # of the Gaussians, in one frame
 STEPS = 100
 CHILD_OPACITY = 0.3
+GREY = (0.5, 0.5, 0.5)
 WRONG = 40.0  # grey levels: altogether wrong
 BLOB = 7  # pixels of 256 a picture: wrong edges and highlights are thinner than what is missing
 WRONG_SHARE = 0.002  # of the picture in half of the views; what only some have wrong is a highlight
@@ -75,11 +85,8 @@ def wrong_pixels(model: Model, masks: list[np.ndarray], frame: int, views) -> li
     g, out = model.gaussians(), []
     blob = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (BLOB, BLOB))
     for camera, mask in zip(views.train_cameras, masks, strict=True):
-        view, pinhole = views.capture.view(camera, frame), views.capture.cameras[camera]
-        truth = view.rgb.astype(np.float32)
-        if view.alpha is not None:
-            truth = 127.5 + (truth - 127.5) * (view.alpha[..., None] / np.float32(255))
-        error = np.abs(render_image(g, pinhole, (0.5, 0.5, 0.5)) - truth).max(2)
+        truth = blend(views.view(camera, frame), GREY)
+        error = np.abs(render_image(g, views.capture.cameras[camera], GREY) - truth).max(2)
         small = cv2.resize(error, mask.shape[::-1], interpolation=cv2.INTER_AREA)
         wrong = (mask & (small > WRONG)).astype(np.uint8)
         out.append(cv2.morphologyEx(wrong, cv2.MORPH_OPEN, blob) > 0)
@@ -88,7 +95,7 @@ def wrong_pixels(model: Model, masks: list[np.ndarray], frame: int, views) -> li
 
 def _points(wrong: list[np.ndarray], frame: int, views, most: int, seed: int) -> Model:
     """At most `most` Gaussians on surfaces in the pixels that are wrong."""
-    taken = [views.capture.view(i, frame) for i in views.train_cameras]
+    taken = [views.view(i, frame) for i in views.train_cameras]
     pictures = [(views.capture.cameras[i], v.rgb, v.alpha) for i, v in zip(views.train_cameras, taken, strict=True)]
     return from_points(*sweep(pictures, most, seed, wrong), opacity=0.5)
 
@@ -96,8 +103,7 @@ def _points(wrong: list[np.ndarray], frame: int, views, most: int, seed: int) ->
 def _children(model: Model, chosen: torch.Tensor, rng: np.random.Generator) -> dict[str, torch.Tensor]:
     """One smaller Gaussian beside each of the `chosen` ones."""
     params = {n: p[chosen].clone() for n, p in model.params.items()}
-    noise = torch.from_numpy(rng.standard_normal((len(chosen), 3)).astype(np.float32))
-    params["means"] += rotate(params["quats"], noise * torch.exp(params["log_scales"]))
+    params["means"] += random_offset(params, rng)
     params["log_scales"] -= SPLIT_SHRINK
     params["logit_opacities"][:] = float(np.log(CHILD_OPACITY / (1 - CHILD_OPACITY)))
     return params

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gscodec.capture import blend
 from gscodec.train.carve import project
 
 WIDTH = 256  # pixels of the pictures that are compared: noise averages out
@@ -21,7 +22,7 @@ class Changes:
     """Follows the pictures of the training cameras of `views`.
 
     Args:
-        fitted: [h, w, 3] u8 of each training camera: what the Gaussians show, as of `pictures`.
+        fitted: [h, w, 3] u8 of each training camera: what the Gaussians show.
     """
 
     def __init__(self, views, fitted: list[np.ndarray]):
@@ -38,10 +39,7 @@ class Changes:
         """[h, w, 3] u8, small, over mid-grey."""
         import cv2
 
-        view = self.views.capture.view(camera, frame)
-        rgb = view.rgb.astype(np.float32)
-        if view.alpha is not None:
-            rgb = 127.5 + (rgb - 127.5) * (view.alpha[..., None] / np.float32(255))
+        rgb = blend(self.views.view(camera, frame), (0.5, 0.5, 0.5))
         height, width = rgb.shape[:2]
         scale = min(1.0, WIDTH / width)
         size = (max(1, round(scale * width)), max(1, round(scale * height)))

@@ -110,15 +110,19 @@ def train_keyframe(
     return float(np.mean(losses[-len(views.train_cameras) :]))
 
 
+def _shows(model: Model, stats: Statistics) -> torch.Tensor:
+    """[N] bool: neither nearly transparent nor hidden in every view it was tried in."""
+    opaque = torch.sigmoid(model.params["logit_opacities"]) > PRUNE_OPACITY
+    return opaque & ((stats.weight > PRUNE_WEIGHT) | (stats.seen == 0))
+
+
 @torch.no_grad()
 def prune(model: Model, stats: Statistics, *, thin: bool = False) -> None:
     """Drops Gaussians that are nearly transparent or hidden in every view they were tried in; with `thin`, also those
     that are not worth their bits."""
-    opacities = torch.sigmoid(model.params["logit_opacities"])
-    keep = opacities > PRUNE_OPACITY
-    keep &= (stats.weight > PRUNE_WEIGHT) | (stats.seen == 0)
+    keep = _shows(model, stats)
     if thin:
-        worth = stats.worth(opacities)
+        worth = stats.worth(torch.sigmoid(model.params["logit_opacities"]))
         keep &= worth >= min(IDLE, torch.quantile(worth, THINNING).item())
     if keep.any():
         model.select(keep)
@@ -127,8 +131,7 @@ def prune(model: Model, stats: Statistics, *, thin: bool = False) -> None:
 @torch.no_grad()
 def grow(model: Model, stats: Statistics, most: int, radius: float, rng: np.random.Generator) -> None:
     """One round of densification: the Gaussians with the strongest pull are split (large) or cloned (small)."""
-    keep = torch.sigmoid(model.params["logit_opacities"]) > PRUNE_OPACITY
-    keep &= (stats.weight > PRUNE_WEIGHT) | (stats.seen == 0)
+    keep = _shows(model, stats)
     pull = stats.mean_pull()
     pull[~keep] = 0
     room = max(0, min(int(GROWTH * len(model)), most - int(keep.sum())))
@@ -137,8 +140,7 @@ def grow(model: Model, stats: Statistics, most: int, radius: float, rng: np.rand
     children = {n: p[chosen].clone() for n, p in model.params.items()}
     spread = torch.exp(children["log_scales"])
     large = spread.max(1).values > torch.exp(model.params["log_scales"]).max(1).values.median()
-    noise = torch.from_numpy(rng.standard_normal((len(chosen), 3)).astype(np.float32))
-    offset = rotate(children["quats"], noise * spread)
+    offset = random_offset(children, rng)
     children["means"] = children["means"] + offset * torch.where(large, 0.7, 0.3)[:, None]
     parents = chosen[large]
     model.params["means"][parents] -= 0.7 * offset[large]
@@ -147,6 +149,12 @@ def grow(model: Model, stats: Statistics, most: int, radius: float, rng: np.rand
     if keep.any():
         model.select(keep)
     model.append(children)
+
+
+def random_offset(params: dict[str, torch.Tensor], rng: np.random.Generator) -> torch.Tensor:
+    """[N, 3] from each mean to a point drawn from its Gaussian."""
+    noise = torch.from_numpy(rng.standard_normal((len(params["means"]), 3)).astype(np.float32))
+    return rotate(params["quats"], noise * torch.exp(params["log_scales"]))
 
 
 def rotate(quats: torch.Tensor, v: torch.Tensor) -> torch.Tensor:

@@ -27,7 +27,7 @@ from gscodec.train.graph import NodeGraph, Pose, quat_conjugate, quat_multiply, 
 from gscodec.train.keyframe import Statistics
 from gscodec.train.model import NAMES, Model
 from gscodec.train.settings import TrainSettings
-from gscodec.train.views import Views, compare
+from gscodec.train.views import Views, compare, look
 
 ROUNDS = 4  # at most, of `motion_steps` each: as many as a frame needs to come near the loss of the one before
 PAYS, LOSS_FLOOR = 1.2, 0.001  # what is near
@@ -73,22 +73,21 @@ class Tracker:
     @staticmethod
     def start(key: Model, views: Views, settings: TrainSettings, loss: float, frames: range) -> Tracker:
         """Follows `key`, the keyframe of frames[0] with image loss `loss`; most nodes go where frames[1] differs."""
-        rng, workspace, stats, visible = np.random.default_rng(settings.seed), Workspace(), Statistics(len(key)), []
-        for camera in views.train_cameras:
-            result = compare(key.params, views.target(camera, frames[0]), settings, rng, workspace)
+        stats, visible, changes = Statistics(len(key)), [], Changes.since(views, frames[0])
+        for result in look(key.params, views, frames[0], settings, Workspace()):
             stats.add(result)
             visible.append(result.max_weight > VISIBLE)
         means = key.params["means"]
         moving = np.ones(len(key), bool)
         if len(frames) > 1:
-            peek = Changes.since(views, frames[0])
+            peek = Changes(views, [picture.copy() for picture in changes.fitted])
             seen = peek.behind(peek.advance(frames[1]), means.numpy(), visible)
             moving = seen if seen.any() else moving
         radius = subject_radius(means[moving].numpy())
         graph = NodeGraph.of(means, radius, torch.from_numpy(moving))
         own = Model({**key.params, "means": torch.zeros_like(means)})
         calm = float(torch.quantile(stats.mean_pull(), CALM))
-        return Tracker(graph, own, views, settings, np.array([radius, loss, calm]), Changes.since(views, frames[0]))
+        return Tracker(graph, own, views, settings, np.array([radius, loss, calm]), changes)
 
     def carried(self, own: Model, pose: Pose) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """Attributes in the frame of `pose`, and how far the nodes have turned each Gaussian, [N, 4]."""
@@ -153,11 +152,8 @@ class Tracker:
         self.masks = masks
         if not any(m.any() for m in masks):
             return np.zeros(len(model), bool)
-        rng, visible = np.random.default_rng(self.settings.seed), []
-        for camera in self.views.train_cameras:
-            target = self.views.target(camera, frame, SMALL)
-            result = compare(model.params, target, self.settings, rng, self.workspace)
-            visible.append(result.max_weight > VISIBLE)
+        looks = look(model.params, self.views, frame, self.settings, self.workspace, SMALL)
+        visible = [result.max_weight > VISIBLE for result in looks]
         return self.changes.behind(masks, model.params["means"].numpy(), visible)
 
     def state(self) -> dict[str, np.ndarray]:

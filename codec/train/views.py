@@ -7,10 +7,12 @@ and the mask term needs only a margin of it.
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
+from gscodec.capture import View
 from gscodec.render.step import RenderLoss, Workspace, render_loss
 from gscodec.train.settings import TrainSettings
 
@@ -40,16 +42,25 @@ class Views:
         self.capture = capture
         self.train_cameras = [i for i, c in enumerate(capture.cameras) if c.split == "train"]
         self._seed = seed
-        self._held: OrderedDict[tuple[int, int, float], Target] = OrderedDict()
+        self._held: OrderedDict[tuple, View | Target] = OrderedDict()
         self._bytes = 0
         self._order: dict[int, list[int]] = {}
         self._rounds: dict[int, int] = {}
 
+    def view(self, camera: int, frame: int) -> View:
+        """Image of camera index `camera` at `frame`, as the capture has it."""
+        return self._hold((camera, frame), lambda: self.capture.view(camera, frame))
+
     def target(self, camera: int, frame: int, scale: float = 1.0) -> Target:
         """View of camera index `camera` at `frame`, cropped to the subject, `scale` times its size (at most 1)."""
-        key = (camera, frame, scale)
+        if scale == 1:
+            return self._hold((camera, frame, scale), lambda: self._cropped(camera, frame))
+        return self._hold((camera, frame, scale), lambda: shrink(self.target(camera, frame), scale))
+
+    def _hold(self, key: tuple, load: Callable[[], View | Target]):
+        """What `load` gives, which is kept as long as there is room."""
         if key not in self._held:
-            self._held[key] = self._load(camera, frame) if scale == 1 else shrink(self.target(camera, frame), scale)
+            self._held[key] = load()
             self._bytes += self._size(self._held[key])
             while self._bytes > CACHE_BYTES and len(self._held) > 1:
                 _, old = self._held.popitem(last=False)
@@ -73,11 +84,11 @@ class Views:
         return self.target(order.pop(), frame, scale)
 
     @staticmethod
-    def _size(t: Target) -> int:
+    def _size(t: View | Target) -> int:
         return t.rgb.nbytes + (0 if t.alpha is None else t.alpha.nbytes)
 
-    def _load(self, camera: int, frame: int) -> Target:
-        view, cam = self.capture.view(camera, frame), self.capture.cameras[camera]
+    def _cropped(self, camera: int, frame: int) -> Target:
+        view, cam = self.view(camera, frame), self.capture.cameras[camera]
         h, w = view.rgb.shape[:2]
         if view.alpha is None or not view.alpha.any():
             return Target(cam, np.ascontiguousarray(view.rgb), view.alpha)
@@ -123,3 +134,12 @@ def compare(params: dict, target: Target, settings: TrainSettings, rng, workspac
         mask_lambda=settings.mask_lambda,
         workspace=workspace,
     )
+
+
+def look(
+    params: dict, views: Views, frame: int, settings: TrainSettings, workspace: Workspace, scale: float = 1.0
+) -> Iterator[RenderLoss]:
+    """`compare` with every training view of `frame`, in the order of the cameras."""
+    rng = np.random.default_rng(settings.seed)
+    for camera in views.train_cameras:
+        yield compare(params, views.target(camera, frame, scale), settings, rng, workspace)
