@@ -9,6 +9,8 @@ import subprocess
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+from gscodec.part_file import part_file
+
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "bench" / "results"
 
@@ -32,14 +34,19 @@ def write_result(path: Path, result: dict) -> None:
     """Writes machine, commit and `result` to `path`, complete or not at all."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps({"machine": machine(), "commit": commit(), **result}, indent=1) + "\n")
-    os.replace(part, path)
+    with part_file(path) as part:
+        part.write_text(json.dumps({"machine": machine(), "commit": commit(), **result}, indent=1) + "\n")
 
 
-def update_entries(path: Path, entries: Iterable[dict], key: Callable[[dict], object]) -> Iterator[dict]:
-    """Yields `entries` and puts each into the list of that name in `path`, in place of an older one of the same key."""
+def update_entries(
+    path: Path,
+    entries: Iterable[dict],
+    key: Callable[[dict], object],
+    whole: Callable[[list[dict]], dict] = lambda entries: {"entries": entries},
+) -> Iterator[dict]:
+    """Yields `entries` and puts each into the list of that name in `path`, in place of an older one of the same key;
+    `whole` makes the file's content of the list."""
     for entry in entries:
         old = json.loads(path.read_text())["entries"] if path.exists() else []
-        write_result(path, {"entries": [e for e in old if key(e) != key(entry)] + [entry]})
+        write_result(path, whole([*(e for e in old if key(e) != key(entry)), entry]))
         yield entry

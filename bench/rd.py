@@ -7,7 +7,6 @@ float attributes (median of 3). The order of Gaussians that a peer makes once fo
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from gscodec.bench.baselines import BASELINES, Baseline
-from gscodec.bench.machine import commit, write_result
+from gscodec.bench.machine import commit, update_entries
 from gscodec.bench.sequences import SINGLE, open_case
 from gscodec.decode import open_stream
 from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
@@ -121,13 +120,13 @@ def update(path: Path, entries: Iterable[dict]) -> Iterator[dict]:
 
     Yields the entries; BD-rates and shares are those of the whole file.
     """
-    stored: list[dict] = json.loads(path.read_text())["entries"] if path.exists() else []
-    for entry in entries:
-        key = lambda e: (e["sequence"], e["codec"], e["setting"])  # noqa: E731
-        stored = sorted([*(e for e in stored if key(e) != key(entry)), entry], key=_place)
-        derived = {"bd_rate": bd_rates(stored), "shares": shares(stored)}
-        write_result(path, {"settings": {"psnr_every": EVERY}, "entries": stored, **derived})
-        yield entry
+    return update_entries(path, entries, lambda e: (e["sequence"], e["codec"], e["setting"]), _whole)
+
+
+def _whole(entries: list[dict]) -> dict:
+    entries = sorted(entries, key=_place)
+    derived = {"bd_rate": bd_rates(entries), "shares": shares(entries)}
+    return {"settings": {"psnr_every": EVERY}, "entries": entries, **derived}
 
 
 def _place(e: dict) -> tuple:
