@@ -125,12 +125,15 @@ class Subject:
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays."""
         canonical = {f"canonical.{n}": p.numpy() for n, p in self.canonical.params.items()}
-        return {"loss_radius": np.array([self.loss, self.radius]), **canonical, **self.tracker.state()}
+        log_gains = self.tracker.views.exposure.log_gains
+        numbers = {"loss_radius": np.array([self.loss, self.radius]), "log_gains": log_gains}
+        return {**numbers, **canonical, **self.tracker.state()}
 
     @staticmethod
     def restored(state: dict[str, np.ndarray], views: Views, settings: TrainSettings) -> Subject:
         """Inverse of `state`."""
         canonical = {n: torch.from_numpy(state[f"canonical.{n}"]) for n in NAMES}
+        views.exposure.log_gains = state["log_gains"]
         return Subject(Tracker.restored(state, views, settings), *state["loss_radius"].tolist(), Model(canonical))
 
 
