@@ -168,7 +168,7 @@ def test_tracking_finds_the_turn(capture):
 
 def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
     x = torch.from_numpy(blob(200).means)
-    graph = NodeGraph.of(x, 1.0, torch.ones(200, dtype=torch.bool), count=32)
+    graph = NodeGraph.of(x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), count=32)
     turn = rotvec_to_quat(torch.tensor([[0.3, -0.2, 0.5]])).repeat(len(graph), 1)
     R = quat_to_matrix(turn)
     nodes = torch.einsum("nij,nj->ni", R, graph.nodes) + 1
