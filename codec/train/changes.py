@@ -60,8 +60,8 @@ class Changes:
         return masks
 
     def outside(self, frame: int, means: np.ndarray) -> np.ndarray:
-        """[N] bool: Gaussians at `means` ([N, 3]) that half of the cameras have outside of the masks of `frame`, where
-        there are masks: whatever may hide them, there is nothing."""
+        """[N] bool: Gaussians at `means` ([N, 3]) that most cameras that have them in the picture have outside of the
+        masks of `frame`, where there are masks: whatever may hide them, there is nothing. No picture: outside, too."""
         import cv2
 
         masks = []
@@ -69,8 +69,8 @@ class Changes:
             alpha = self.views.view(camera, frame).alpha
             if alpha is None:
                 return np.zeros(len(means), bool)
-            masks.append(~_grown(cv2.resize(alpha, fitted.shape[1::-1], interpolation=cv2.INTER_AREA) > 0))
-        return self.behind(masks, means, [np.ones(len(means), bool)] * len(masks))
+            masks.append(_grown(cv2.resize(alpha, fitted.shape[1::-1], interpolation=cv2.INTER_AREA) > 0))
+        return ~self.behind(masks, means, [np.ones(len(means), bool)] * len(masks))
 
     def behind(self, masks: list[np.ndarray], means: np.ndarray, visible: list[np.ndarray]) -> np.ndarray:
         """[N] bool: Gaussians at `means` ([N, 3]) that enough of the cameras that see them have in changed pixels.

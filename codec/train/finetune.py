@@ -87,7 +87,7 @@ class GroupModel:
         self.canonical_rate = CanonicalRate(self.key.params["means"], steps)
         self.unit = {name: trajectory_step(getattr(steps, name), len(tracked)) for name in FREQUENCIES}
         self.unit["sh0"] *= float(STEP_WEIGHTS[0])  # Y, Co, Cg share one step; RGB errors add up over them
-        self.means, self.turned = zip(*(self._carry(p) for p in poses), strict=True)
+        self.means, self.turned = zip(*(self._carry(p) for p in self.poses), strict=True)
         self.coefficients = self._project(tracked)  # in units of the quantization step
         self.free = torch.stack([(c.detach().abs() > STARTS).any(2).any(0) for c in self.coefficients.values()]).any(0)
         self.free |= moved

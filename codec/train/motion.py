@@ -87,7 +87,9 @@ class Tracker:
             seen = peek.behind(peek.advance(frames[1]), means.numpy(), visible)
             moving = seen if seen.any() else moving
         radius = subject_radius(means[moving].numpy())
-        sizes = key.params["log_scales"].sort(1).values[:, 1:].mean(1).exp()  # without the thin axis
+        sizes = torch.ones(len(key))
+        if not views.capture.has_alpha:  # there is a background
+            sizes = key.params["log_scales"].sort(1).values[:, 1:].mean(1).exp()  # without the thin axis
         graph = NodeGraph.of(means, sizes, radius, torch.from_numpy(moving))
         own = Model({**key.params, "means": torch.zeros_like(means)})
         calm = float(torch.quantile(stats.mean_pull(), CALM))

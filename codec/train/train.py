@@ -242,10 +242,13 @@ class _Run:
             subject.parents = np.arange(len(subject.canonical))
             return Group([subject.canonical.gaussians()])
         model = self._finetuned(subject, done, track)
+        known = len(model.key) if parents is None else len(parents)
+        born = np.full(len(model.key) - known, -1)
+        group = model.group(None if parents is None else np.append(parents, born).astype(np.int32))
         subject.bury(model.key)
-        self.subject = self.subject and (subject if len(subject.parents) else None)
-        born = len(model.key) - len(parents if parents is not None else model.key)
-        return model.group(None if parents is None else np.append(parents, np.full(born, -1)).astype(np.int32))
+        if not len(subject.parents):
+            self.subject = None
+        return group
 
     def _keyframe(self, frames: range) -> Subject:
         """Of the first of `frames`."""
