@@ -156,6 +156,26 @@ def test_keyframe_learns_a_view_it_has_not_seen(masks):
         assert psnr_of(model, capture, 0) > 22
 
 
+@pytest.mark.parametrize("darkest", [0.75, 1.0])
+def test_exposure_of_each_camera_is_found(darkest):
+    """Up to what all cameras share; equal ones stay equal."""
+    capture = capture_of(turning(300, frames=1))
+    gains = np.random.default_rng(2).uniform(darkest, 1, len(capture.cameras))
+
+    def dimmed(camera, frame):
+        view = capture.read(camera, frame)
+        return dataclasses.replace(view, rgb=np.rint(gains[camera] * view.rgb).astype(np.uint8))
+
+    views, model = Views(dataclasses.replace(capture, read=dimmed), 0), initial_model(capture, 0, TINY)
+    train_keyframe(model, views, 0, TINY, steps=400, radius=1.0)
+    true = np.log(gains[:-1]) - np.log(gains[:-1]).mean()
+    np.testing.assert_allclose(views.exposure.log_gains[:-1], true[:, None] + np.zeros(3), atol=0.04)
+    assert darkest < 1 or not views.exposure.log_gains.any()
+    shown = render_image(views.exposure.seen(model.gaussians(), 0), capture.cameras[0], (0, 0, 0))
+    plain = render_image(model.gaussians(), capture.cameras[0], (0, 0, 0))
+    np.testing.assert_allclose(shown, plain * views.exposure.gain(0), atol=2)
+
+
 def test_tracking_finds_the_turn(capture):
     truth = turning(300, frames=5)
     key = from_gaussians(truth.frame(0))

@@ -47,10 +47,11 @@ def whereabouts(model: Model, some: torch.Tensor, frame: int, views, changes, ma
 
 def error(model: Model, changes) -> float:
     """Mean absolute difference to the small pictures of `changes`, over all training cameras."""
-    g, differences = model.gaussians(), []
-    for i, picture in zip(changes.views.train_cameras, changes.fitted, strict=True):
-        camera = changes.views.capture.cameras[i].resized(*picture.shape[1::-1])
-        differences.append(np.abs(render_image(g, camera, GREY).astype(np.float32) - picture).mean())
+    g, views, differences = model.gaussians(), changes.views, []
+    for i, picture in zip(views.train_cameras, changes.fitted, strict=True):
+        camera = views.capture.cameras[i].resized(*picture.shape[1::-1])
+        shown = render_image(views.exposure.seen(g, i), camera, GREY)
+        differences.append(np.abs(shown.astype(np.float32) - picture).mean())
     return float(np.mean(differences))
 
 
