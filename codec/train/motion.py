@@ -6,6 +6,8 @@ with fixed colours the motion follows the shading instead of the surface (lumber
 colours 26.1). The first half of the steps looks at small pictures, where large motion is near and a step is cheap.
 
 What does not change in the pictures (changes.py) does not move: its Gaussians and nodes stay as they are, to the bit.
+What comes in (births.py) has nodes of its own, unless it is beside what is there, and is looked for where it moves too
+fast to be followed (lost.py). What has faded away, or lies outside of the masks, is dead.
 
 A hash grid and MLP (V3) on top of the nodes gave nothing here, so that there is none: the nodes are what the stream can
 carry. V3's recipe, with the grid, is a baseline in bench/baselines/v3.py.
@@ -137,10 +139,8 @@ class Tracker:
     def _find(self, frame: int) -> None:
         """Newcomers that are lost go to where `frame` shows them, with that speed, or die."""
         family, next_pose = self.graph.family_of(), self.pose.ahead()
-        for k in np.unique(family[(self.moving & self.alive).numpy()]):
+        for k in np.setdiff1d(family[(self.moving & self.alive).numpy()], [0]):
             some = torch.from_numpy(family == k) & self.alive
-            if k == 0:
-                continue
             model = Model(self.carried(self.own, next_pose)[0])
             shift = whereabouts(model, some, frame, self.views, self.changes, self.masks)
             if shift is None:
