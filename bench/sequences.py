@@ -60,5 +60,5 @@ def _lumberjack(data: Path, folder: Path) -> None:
 
     capture = open_capture(_there(data / "lumberjack")).frames(0, FRAMES)
     writer = SequenceWriter(folder, capture.fps, capture.cameras)
-    for group in train_groups(capture, train_settings("fast")):
+    for group in train_groups(capture, train_settings("fast", sh_degree=0)):  # most video packings have no more
         writer.add(group)

@@ -156,7 +156,8 @@ def coded(capture: Capture, groups: list[Group], settings) -> tuple[int, list[Ga
     from gscodec.decode import open_stream
     from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
 
-    config = stream_config(fps=capture.fps, sh_degree=0, gaussians=settings.gaussians_max, frames=settings.gop)
+    degree, most = settings.sh_degree, settings.gaussians_max
+    config = stream_config(fps=capture.fps, sh_degree=degree, gaussians=most, frames=settings.gop)
     cameras = [c for c in capture.cameras if c.split == "train"]
     with tempfile.TemporaryDirectory() as folder:
         out, start = Path(folder) / "out.gsv", time.perf_counter()

@@ -65,9 +65,10 @@ def _encode_splats(source, out, settings, frames, gop, bar) -> EncodeReport:
     cameras = sequence.cameras
     first = sequence.frame(0)
     longest = max(len(g) for g in sequence.groups)
+    degree = max(g.frames[0].sh_degree for g in sequence.groups)
     config = stream_config(
         fps=sequence.fps,
-        sh_degree=first.sh_degree,
+        sh_degree=degree,
         gaussians=len(first),
         frames=longest,
         cameras=cameras,
@@ -144,7 +145,7 @@ def _encode_capture(source, out, settings, preset, frames, gop, cluster, bar) ->
 
     config = stream_config(
         fps=capture.fps,
-        sh_degree=0,
+        sh_degree=recipe.sh_degree,
         gaussians=recipe.gaussians_max,
         frames=gop,
         cameras=capture.cameras,

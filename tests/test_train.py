@@ -8,6 +8,7 @@ import torch
 from synthetic import blob, turning
 
 from gscodec import _native
+from gscodec.bench.train import coded
 from gscodec.bitstream.quantization import steps_for, subject_radius
 from gscodec.camera import Camera, look_at
 from gscodec.capture.capture import Capture
@@ -188,6 +189,28 @@ def test_pose_of_each_camera_is_found(wrong):
     train_keyframe(model, views, 0, TINY, steps=400, radius=1.0)
     left = views.extrinsics.values[trained] + told.values[trained] - told.values[trained].mean(0)
     assert np.sqrt(np.mean(left**2)) <= 0.5 * np.sqrt(np.mean(told.values[trained] ** 2))
+
+
+def glossy(gloss: float) -> GaussianSequence:
+    """Two frames of the turning blob, whose colours change by `gloss` with the direction."""
+    group = turning(300, frames=2).groups[0]
+    frames = [dataclasses.replace(g, shN=np.full((300, 3, 3), gloss, np.float32)) for g in group.frames]
+    return GaussianSequence(25.0, [Group(frames)])
+
+
+@pytest.mark.parametrize(("gloss", "kept"), [(0.0, 0), (0.3, 3)])
+def test_harmonics_stay_where_colours_depend_on_the_view(gloss, kept):
+    """From keyframe to stream; a whole run, since every stage has to carry them."""
+    capture = capture_of(glossy(gloss))
+    settings = dataclasses.replace(TINY, gop=2, keyframe_steps=500)
+    (group,) = train_groups(capture, settings)
+    assert [g.shN.shape[1] for g in group.frames] == [kept] * 2
+    if kept:
+        plain = dataclasses.replace(group.frames[1], shN=group.frames[1].shN[:, :0])
+        assert psnr_of(group.frames[1], capture, 1) > psnr_of(plain, capture, 1) + 0.5
+    _, decoded, _ = coded(capture, [group], settings)
+    assert decoded[1].shN.shape[1] == kept
+    assert psnr_of(decoded[1], capture, 1) > psnr_of(group.frames[1], capture, 1) - 1
 
 
 def test_tracking_finds_the_turn(capture):

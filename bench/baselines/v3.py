@@ -12,6 +12,8 @@ before, which the public description leaves open and which is worth 0.7 dB after
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -52,6 +54,7 @@ class MotionField(torch.nn.Module):
 
 def train_v3(capture, frames: range, settings: TrainSettings) -> list:
     """Gaussians of each frame: a keyframe for the first, then one frame from the other."""
+    settings = replace(settings, sh_degree=0)  # its packing has no more
     views = Views(capture, settings.seed)
     model = initial_model(capture, frames[0], settings)
     radius = subject_radius(model.params["means"].numpy())

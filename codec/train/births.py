@@ -53,6 +53,7 @@ def born(model: Model, pull: torch.Tensor, wrong: list[np.ndarray], frame: int, 
     room = min(room, int(MOST * len(model)))
     rng, workspace = np.random.default_rng([settings.seed, frame, 3]), Workspace()
     young = from_points(*sweep_wrong(wrong, frame, views, room // 2, settings.seed), opacity=0.5)
+    young.set_degree(model.degree)
     chosen = torch.topk(pull, max(0, min(room - len(young), len(pull)))).indices
     young.append(_children(model, chosen[pull[chosen] > LOUD], rng))
     if len(young) < LEAST:

@@ -83,8 +83,7 @@ class GroupModel:
         self.known = 0 if key is None else len(key)
         self.key = self._canonical(key, tracked)
         self.basis = torch.from_numpy(dct_basis(len(tracked))).float()  # [T, T]
-        names = ("means", "log_scales", "quats", "logit_opacities", "sh0")
-        self.canonical_steps = {n: getattr(steps, n) for n in names}
+        self.canonical_steps = {n: getattr(steps, n) for n in NAMES}
         self.canonical_rate = CanonicalRate(self.key.params["means"], steps)
         self.unit = {name: trajectory_step(getattr(steps, name), len(tracked)) for name in FREQUENCIES}
         self.unit["sh0"] *= float(STEP_WEIGHTS[0])  # Y, Co, Cg share one step; RGB errors add up over them

@@ -1,7 +1,8 @@
 """Keyframe: one frame's Gaussians from its views. In: views, a starting model. Out: the model, densified and pruned.
 
 3D Gaussian Splatting's recipe (Kerbl et al. 2023) shortened: Gaussians that the image pulls at are cloned when small
-and split when large, those that hardly contribute to any view go.
+and split when large, those that hardly contribute to any view go. Spherical harmonics come in on the way, and go again
+where they are not worth their bits.
 """
 
 from __future__ import annotations
@@ -14,13 +15,14 @@ import torch
 from gscodec.render.workspace import Workspace
 from gscodec.train.model import Model
 from gscodec.train.settings import TrainSettings
-from gscodec.train.views import Views, compare
+from gscodec.train.views import Views, compare, look
 
-RATES = {"quats": 2e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 5e-3, "shN": 2.5e-4}
+RATES = {"quats": 2e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 5e-3, "shN": 1.5e-3}
 MEANS_RATE = (1.6e-3, 1.6e-5)  # start, end, times the radius of the subject
 DENSIFY_EVERY = 100
 DENSIFY_FROM, DENSIFY_UNTIL = 0.1, 0.6  # of the steps
-EXPOSE_FROM = 0.3  # of the steps
+APPEARANCE_FROM = 0.3  # of the steps: exposure and harmonics wait for colours that are about right
+HARMONICS_PAY = 0.1  # share by which pictures must err more without harmonics; what these cost in quality buys 0.04
 KEYFRAME_SHARE = 0.8  # of the Gaussians at most; the rest is for births
 GROWTH = 0.12  # share of the Gaussians that one round may add
 THINNING = 0.25  # share of the Gaussians that one round of thinning may take
@@ -103,14 +105,18 @@ def train_keyframe(
         losses.append(result.loss - settings.mask_lambda * result.mask)
         fade = step / max(steps - 1, 1)
         rate = radius * MEANS_RATE[0] * (MEANS_RATE[1] / MEANS_RATE[0]) ** fade
-        if step >= EXPOSE_FROM * steps:
+        if step >= APPEARANCE_FROM * steps:
             views.exposure.learn(target.index, result.grad_gain, 0.1**fade)
             arrays = [x[n].numpy() for x in (model.params, result.grads) for n in ("means", "quats")]
             views.extrinsics.learn(target.index, views.extrinsics.gradient(*arrays), 0.1**fade)
         model.adam(result.grads, {"means": rate, **{n: r * 0.1**fade for n, r in RATES.items()}})
+        if step == int(APPEARANCE_FROM * steps):
+            model.set_degree(settings.sh_degree)
         if step == int(DENSIFY_UNTIL * steps):
             views.exposure.settle()
             views.extrinsics.settle()
+        if step == int(THIN_UNTIL * steps) and not harmonics_pay(model, views, frame, settings, workspace):
+            model.set_degree(0)
         if densify and (step + 1) % DENSIFY_EVERY == 0:
             if DENSIFY_FROM * steps < step < DENSIFY_UNTIL * steps:
                 grow(model, stats, int(KEYFRAME_SHARE * settings.gaussians_max), radius, rng)
@@ -120,6 +126,13 @@ def train_keyframe(
         if on_step:
             on_step(step, result.loss)
     return float(np.mean(losses[-len(views.train_cameras) :]))
+
+
+def harmonics_pay(model: Model, views: Views, frame: int, settings: TrainSettings, workspace: Workspace) -> bool:
+    """Whether the training views of `frame` are so much worse without them that they are worth their bits."""
+    plain = {**model.params, "shN": model.params["shN"][:, :0].contiguous()}
+    whole, less = (np.mean([r.mse for r in look(p, views, frame, settings, workspace)]) for p in (model.params, plain))
+    return less > (1 + HARMONICS_PAY) * max(whole, LEAST_ERROR)
 
 
 def _shows(model: Model, stats: Statistics) -> torch.Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 
@@ -25,6 +27,11 @@ class Model:
 
     def __len__(self) -> int:
         return len(self.params["means"])
+
+    @property
+    def degree(self) -> int:
+        """Of the spherical harmonics."""
+        return math.isqrt(self.params["shN"].shape[1] + 1) - 1
 
     @torch.no_grad()
     def adam(self, grads: dict[str, torch.Tensor], rates: dict[str, float]) -> None:
@@ -54,6 +61,12 @@ class Model:
             self.params[n] = torch.cat([self.params[n], new])
             for store in (self._first, self._second):
                 store[n] = torch.cat([store[n], torch.zeros_like(new)])
+
+    def set_degree(self, degree: int) -> None:
+        """Gives the Gaussians spherical harmonics of this degree: higher ones go, lower ones that are missing are 0."""
+        more = (degree + 1) ** 2 - 1 - self.params["shN"].shape[1]
+        for store in (self.params, self._first, self._second):
+            store["shN"] = torch.nn.functional.pad(store["shN"], (0, 0, 0, more)).contiguous()
 
     def gaussians(self) -> Gaussians:
         """A copy in numpy, quaternions normalised."""

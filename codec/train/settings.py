@@ -17,6 +17,7 @@ class TrainSettings:
         motion_steps: steps a frame for tracking.
         finetune_steps: steps a frame for the joint fine-tuning of the group.
         gaussians_max: bound on the count; a keyframe has four fifths of it at most, births the rest.
+        sh_degree: most that a keyframe may have of spherical harmonics; it keeps what pays.
         ssim_lambda: share of D-SSIM in the image loss (3D Gaussian Splatting: 0.2).
         mask_lambda: weight of the alpha loss where the capture has masks.
         cut_ratio: a frame whose image loss exceeds the keyframe's by this factor starts a group of its own.
@@ -32,6 +33,7 @@ class TrainSettings:
     finetune_steps: int = 80
     gaussians_max: int = 17500
     initial_points: int = 8000
+    sh_degree: int = 1
     ssim_lambda: float = 0.2
     mask_lambda: float = 0.1
     cut_ratio: float = 2.0
