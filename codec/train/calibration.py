@@ -64,7 +64,7 @@ class Exposure(_Learned):
     PULL = 0.02  # towards 0: this times half the square of a log gain is added to the loss
 
     def __init__(self, count: int, trained: list[int]):
-        super().__init__(count, 3, trained, rate=0.02, least=0.06)
+        super().__init__(count, 3, trained, rate=0.02, least=0.05)
 
     def gain(self, camera: int) -> np.ndarray:
         """[3] f32."""
