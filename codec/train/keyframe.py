@@ -96,6 +96,8 @@ def train_keyframe(
     stats, losses = Statistics(len(model)), []
     model.restart()
     views.exposure.restart()
+    views.extrinsics.restart()
+    views.extrinsics.about(model.params["means"].numpy().mean(0, dtype=np.float64), radius)
     for step in range(steps):
         target = views.draw(frame)
         result = compare(model.params, target, settings, rng, workspace)
@@ -103,13 +105,16 @@ def train_keyframe(
         losses.append(result.loss - settings.mask_lambda * result.mask)
         fade = step / max(steps - 1, 1)
         rate = radius * MEANS_RATE[0] * (MEANS_RATE[1] / MEANS_RATE[0]) ** fade
+        if step >= APPEARANCE_FROM * steps:
+            views.exposure.learn(target.index, result.grad_gain, 0.1**fade)
+            arrays = [x[n].numpy() for x in (model.params, result.grads) for n in ("means", "quats")]
+            views.extrinsics.learn(target.index, views.extrinsics.gradient(*arrays), 0.1**fade)
         model.adam(result.grads, {"means": rate, **{n: r * 0.1**fade for n, r in RATES.items()}})
         if step == int(APPEARANCE_FROM * steps):
             model.set_degree(settings.sh_degree)
-        if step >= APPEARANCE_FROM * steps:
-            views.exposure.learn(target.index, result.grad_gain, 0.1**fade)
         if step == int(DENSIFY_UNTIL * steps):
             views.exposure.settle()
+            views.extrinsics.settle()
         if step == int(THIN_UNTIL * steps) and not harmonics_pay(model, views, frame, settings, workspace):
             model.set_degree(0)
         if densify and (step + 1) % DENSIFY_EVERY == 0:
