@@ -103,7 +103,7 @@ def _entry(capture: Capture, name: str, preset: str, quality: float) -> dict:
         for where, attribute, value in variant.patches:
             stack.enter_context(patch.object(where, attribute, value))
         groups, seconds = train.sequence(capture, settings)
-    models = [g for group in groups for g in group.frames]
+    models = train.shown(groups)
     size, decoded, _ = train.coded(capture, groups, settings)
     model, stream = (train.evaluate(capture, frames) for frames in (models, decoded))
     return {

@@ -77,7 +77,7 @@ def compare(name: str, scene: Scene, **budget) -> dict:
         for t in range(capture.frame_count):
             capture.view(camera, t)
     groups, seconds = train.sequence(capture, settings)
-    models = [g for group in groups for g in group.frames]
+    models = train.shown(groups)
     ours = train.evaluate(capture, models)
     size, decoded, _ = train.coded(capture, groups, settings)
     chosen = range(0, capture.frame_count, -(-capture.frame_count // ALONE_MOST))

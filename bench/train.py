@@ -111,7 +111,7 @@ def _ours(capture: Capture, frames: range, settings) -> Iterator[tuple]:
     if frames.step != 1:
         raise UsageError("gscodec follows what moves: it needs every frame, expected a range without a step")
     groups, trained = sequence(part(capture, frames), settings)
-    yield "model", trained, None, [g for group in groups for g in group.frames]
+    yield "model", trained, None, shown(groups)
     size, decoded, seconds = coded(part(capture, frames), groups, settings)
     yield "gscodec", trained + seconds, size, decoded
 
@@ -144,6 +144,11 @@ def sequence(capture: Capture, settings) -> tuple[list[Group], float]:
 
     start = time.perf_counter()
     return list(train_groups(capture, settings)), time.perf_counter() - start
+
+
+def shown(groups: list[Group]) -> list[Gaussians]:
+    """Frame by frame the Gaussians that live."""
+    return [group.visible(t) for group in groups for t in range(len(group))]
 
 
 def coded(capture: Capture, groups: list[Group], settings) -> tuple[int, list[Gaussians], float]:

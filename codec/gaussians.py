@@ -94,15 +94,19 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
 class Nodes:
     """Coarse motion of a group: M control points, each a rigid motion per frame (HiFi4G's ED graph, DualGS's joints).
 
+    They carry Gaussians from a pose of rest: that of the keyframe, and for what has come in since a place beside it.
+
     Attributes:
-        positions: [M, 3] f32, canonical (keyframe) position of each node, world units.
-        rotations: [T, M, 3] f32, rotation vector in radians from the keyframe to frame t, about the node.
-        translations: [T, M, 3] f32, displacement of the node, world units.
+        positions: [M, 3] f32, position of each node at rest, world units.
+        rotations: [T, M, 3] f32, rotation vector in radians from rest to frame t, about the node.
+        translations: [T, M, 3] f32, displacement of the node from rest, world units.
+        rest: [N, 3] f32, position of each Gaussian at rest.
     """
 
     positions: np.ndarray
     rotations: np.ndarray
     translations: np.ndarray
+    rest: np.ndarray
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from gscodec.encode.group import group_integers, stack_group
 from gscodec.encode.motion import carry, choose_nodes
 from gscodec.encode.writer import StreamWriter
 from gscodec.errors import BitstreamError, CaptureError, UsageError
-from gscodec.gaussians import Gaussians, Group
+from gscodec.gaussians import Gaussians, Group, Nodes
 
 
 def write(sequence, out, quality=50.0, **settings):
@@ -136,6 +136,26 @@ def test_lifetimes_survive(tmp_path):
     stream = open_stream(tmp_path / "a.gsv")
     for t in range(6):
         assert len(stream.frame(t)) == len(sequence.frame(t))
+
+
+def test_a_trainers_nodes_carry_newcomers_from_where_these_rest():
+    """A blob that turns; half of it is born late, rests beside the rest of it and has nodes of its own: no residual."""
+    n, frames = 400, 6
+    group = turning(n, frames).groups[0]
+    x, young = group.frames[0].means, np.arange(n) >= n // 2
+    rest = x + 4 * young[:, None].astype(np.float32) * [1, 0, 0]
+    seeds = np.concatenate([np.arange(12), n // 2 + np.arange(12)])
+    turn = np.stack([np.tile([0, 0.1 * t, 0.02 * t], (24, 1)) for t in range(frames)])
+    moves = np.stack([group.frames[t].means[seeds] for t in range(frames)]) - rest[seeds]
+    moves[:, 12:] = np.where(np.arange(frames)[:, None, None] < 3, moves[3:4, 12:], moves[:, 12:])  # wait at birth
+    turn[:3, 12:] = turn[3, 12:]
+    lifetimes = np.stack([np.where(young, 3, 0), np.full(n, frames)], 1).astype(np.int32)
+    nodes = Nodes(*(a.astype(np.float32) for a in (rest[seeds], turn, moves, rest)))
+    with_nodes = group_integers(Group(group.frames, lifetimes, nodes), 50, keep_all=True)
+    assert (with_nodes["positions"][:, 0].max() * with_nodes["grid_step"]) > 4, "at their place of rest"
+    left = {n: t["coefficients"] for n, t in with_nodes["trajectories"].items()}
+    assert all(len(c) == 1 for c in left.values()), "only what rounding has left of the canonical, nothing over time"
+    assert (left.get("means", np.zeros(1)) != 0).mean() < 0.01
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

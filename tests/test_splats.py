@@ -393,7 +393,8 @@ def stored_sequence():
     g = gaussians(50, 3)
     lifetimes = np.stack([np.zeros(50), np.full(50, 4)], 1).astype(np.int32)
     lifetimes[:5] = (1, 3)
-    nodes = Nodes(*(np.random.default_rng(0).normal(size=s).astype(np.float32) for s in ((6, 3), (4, 6, 3), (4, 6, 3))))
+    shapes = ((6, 3), (4, 6, 3), (4, 6, 3), (50, 3))
+    nodes = Nodes(*(np.random.default_rng(0).normal(size=s).astype(np.float32) for s in shapes))
     camera = Camera("a", np.diag([9.0, 9, 1]), np.eye(4), 32, 24, split="test")
     groups = [Group([moved(g, t) for t in range(4)], lifetimes, nodes), Group([gaussians(40, 3, 9)])]
     return GaussianSequence(25, groups, [camera])

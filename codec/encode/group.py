@@ -18,7 +18,7 @@ from gscodec.camera import Camera
 from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
 from gscodec.encode.importance import Importance, measure, steps_for_error
-from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes, rebase
+from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes
 from gscodec.gaussians import Gaussians, Group
 from gscodec.gaussians import Nodes as GivenNodes
 
@@ -37,6 +37,15 @@ class Stack:
     sh0: np.ndarray  # [T, N, 3]
     shN: np.ndarray  # [T, N, K, 3]
     lifetimes: np.ndarray | None  # [N, 2]
+
+    def held(self, a: np.ndarray) -> np.ndarray:
+        """[T, N, ...] of these Gaussians; outside a lifetime it repeats the nearest frame inside."""
+        return a[self.near(np.arange(len(a))[:, None]), np.arange(a.shape[1])] if self.lifetimes is not None else a
+
+    def near(self, t: np.ndarray) -> np.ndarray:
+        """[..., N] the frame nearest to `t` ([...] or [..., 1]) in which each Gaussian is shown."""
+        life = np.array([[0, len(self.means)]]) if self.lifetimes is None else self.lifetimes
+        return np.clip(t, life[:, 0], life[:, 1] - 1)
 
     def take(self, index: np.ndarray) -> Stack:
         """The Gaussians at `index`, in that order."""
@@ -59,11 +68,8 @@ def stack_group(group: Group) -> Stack:
     frames = [group.frames[t] for t in range(len(group))]
     names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
     arrays = [np.stack([getattr(f, n) for f in frames]) for n in names]
-    life = group.lifetimes
-    if life is not None:
-        held = np.clip(np.arange(len(frames))[:, None], life[:, 0], life[:, 1] - 1)  # [T, N]
-        arrays = [a[held, np.arange(len(life))] for a in arrays]
-    return Stack(*arrays, life)
+    raw = Stack(*arrays, group.lifetimes)
+    return Stack(*(raw.held(a) for a in arrays), group.lifetimes)
 
 
 def align_axes(s: Stack, middle: int, turn: np.ndarray, order: np.ndarray) -> Stack:
@@ -103,12 +109,13 @@ class Grid:
     bits: int
 
     @staticmethod
-    def around(means: np.ndarray, step: float) -> Grid:
-        """The lattice that holds `means` [N, 3]."""
+    def around(means: np.ndarray, step: float, room: int = 0) -> Grid:
+        """The lattice that holds `means` [N, 3], and 2^room of it along each axis."""
         low = means.min(0) if len(means) else np.zeros(3)
         extent = float((means.max(0) - low).max()) if len(means) else 0.0
-        step = float(np.float32(max(step, extent / (2**GRID_BITS_MAX - 2))))  # far floaters: coarser, not an error
-        return Grid(low.astype(np.float32), step, max(1, int(np.ceil(extent / step + 1)).bit_length()))
+        finest = extent / (2 ** (GRID_BITS_MAX - room) - 2)
+        step = float(np.float32(max(step, finest)))  # far floaters: coarser, not an error
+        return Grid(low.astype(np.float32), step, room + max(1, int(np.ceil(extent / step + 1)).bit_length()))
 
     def header(self) -> dict:
         """Its entries in the input of `encode_group`."""
@@ -138,7 +145,8 @@ def _appearance(s: Stack) -> dict[str, np.ndarray]:
 
 
 def _residual(s: Stack, channels: dict, x: np.ndarray, motion: NodeMotion | None) -> dict[str, np.ndarray]:
-    """[T, N, C] f32 of each attribute: what canonical values and nodes leave over."""
+    """[T, N, C] f32 of each attribute: what canonical values and nodes leave over; held outside a lifetime, in which
+    the nodes go on."""
     v = dequantize_channels(channels["quats"])
     canonical = np.concatenate([np.sqrt(np.maximum(0, 1 - (v**2).sum(1, keepdims=True))), v], 1)
     dq = quat_multiply(s.quats, quat_conjugate(canonical[None].astype(np.float32)))
@@ -150,7 +158,7 @@ def _residual(s: Stack, channels: dict, x: np.ndarray, motion: NodeMotion | None
     }
     for name, values in _appearance(s).items():
         residual[name] = values - dequantize_channels(channels[name])[None].astype(np.float32)
-    return residual
+    return {n: s.held(r) for n, r in residual.items()}
 
 
 @dataclass(frozen=True)
@@ -218,10 +226,11 @@ def code_group(
     source = np.arange(len(turn)) if keep_all else np.flatnonzero(measured.removal >= PRUNE * error / max(len(turn), 1))
     nominal = steps_for(quality, subject_radius(s.means[middle]))
     steps = _steps(s.take(source), measured.take(source), error, nominal)
-    rest = middle if group.nodes is None else 0
-    grid = Grid.around(s.means[rest, source], float(steps["means"][0]))
-    source = source[_native.morton_order(grid.to_integers(s.means[rest, source]))]
-    nodes, x, quats = _rest_pose(s.take(source), rest, grid, nominal.node_translation, group.nodes)
+    given = group.nodes if frames > 1 else None
+    rest = s.means[middle] if given is None else given.rest
+    grid = Grid.around(rest[source], float(steps["means"][0]), room=0 if given is None else 1)
+    source = source[_native.morton_order(grid.to_integers(rest[source]))]
+    nodes, x, quats = _rest_pose(s.take(source), rest[source], grid, nominal.node_translation, given)
     positions = grid.to_integers(x)
     order = _native.morton_order(positions)
     layer = layer_of(prominence(s.take(source[order])), layers)
@@ -292,25 +301,25 @@ def _steps(s: Stack, measured: Importance, error: float, nominal: Steps) -> dict
 
 
 def _rest_pose(
-    s: Stack, rest: int, grid: Grid, node_step: float, given: GivenNodes | None
+    s: Stack, rest: np.ndarray, grid: Grid, node_step: float, given: GivenNodes | None
 ) -> tuple[Nodes | None, np.ndarray, np.ndarray]:
-    """Nodes, and the means [N, 3] and quaternions [N, 4] that they carry nearest to all frames: what jitters in frame
-    `rest`, which is in Morton order, is not the canonical of all. Nodes that are `given` rest in the first frame."""
-    positions = grid.to_integers(s.means[rest])
+    """Nodes, and the means [N, 3] and quaternions [N, 4] that they carry nearest to all frames: what jitters in `rest`
+    ([N, 3], in Morton order) is not the canonical of all."""
+    positions = grid.to_integers(rest)
     x, frames = grid.to_world(positions), len(s.means)
     if frames == 1 or not len(x):
-        return None, s.means[rest], s.quats[rest]
+        return None, s.means[0], s.quats[0]
     if given is None:
         nodes = choose_nodes(positions, x, s.means, grid.step, node_step, grid.to_world)
     else:
-        nodes = given_nodes(rebase(given), x, node_step, grid)
+        nodes = given_nodes(given, x, node_step, grid)
     if nodes is None:
         means, quats = s.means.mean(0, dtype=np.float64), s.quats.mean(0)
     else:
         motion = carry(nodes, positions, x, frames)
         back = quat_conjugate(motion.turned)
-        means = x + rotate(back, s.means - motion.carried).mean(0)
-        quats = quat_multiply(back, s.quats).mean(0)
+        means = x + s.held(rotate(back, s.means - motion.carried)).mean(0)
+        quats = s.held(quat_multiply(back, s.quats)).mean(0)
     return nodes, means, quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
 
 

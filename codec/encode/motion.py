@@ -210,18 +210,6 @@ def _rotation_step(step: float, distance: np.ndarray) -> float:
     return float(np.float32(min(step / max(lever, 1e-12), 0.1)))
 
 
-def rebase(given: GivenNodes) -> GivenNodes:
-    """The same motions with nodes that rest in the first frame."""
-    from scipy.spatial.transform import Rotation
-
-    back = Rotation.from_rotvec(given.rotations[0]).inv()
-    rotations, near = np.zeros_like(given.rotations), np.zeros_like(given.rotations[0])
-    for t, r in enumerate(given.rotations):
-        near = rotations[t] = matrix_to_rotvec((Rotation.from_rotvec(r) * back).as_matrix(), near)
-    first = given.translations[:1]
-    return GivenNodes(given.positions + first[0], rotations, given.translations - first)
-
-
 def carry(nodes: Nodes, grid_positions: np.ndarray, x: np.ndarray, frames: int) -> NodeMotion:
     """What `nodes` do to all Gaussians: grid positions [N, 3] u32, world positions x [N, 3]."""
     blend = Blend(grid_positions, nodes.positions, np.float32)

@@ -74,7 +74,8 @@ def predict_group(
     x = grid.to_world(positions)
     nodes = _nodes(group, positions, x, old.means, reference) if len(known) else None
     motion = nodes and carry(nodes, positions, x, len(s.means))
-    places = _carry_back(new.means[middle], x, nodes, motion, middle, grid)
+    rest = None if group.nodes is None else group.nodes.rest[births]
+    places = _carry_back(new, middle, rest, x, nodes, motion, grid)
     order = _native.morton_order(places)
     places, births, new = places[order], births[order], new.take(order)
     new_motion = nodes and carry(nodes, places, grid.to_world(places), len(s.means))
@@ -123,33 +124,37 @@ def _coded_parents(parents: np.ndarray, source: np.ndarray) -> np.ndarray:
 
 
 def _carry_back(
-    means: np.ndarray, x: np.ndarray, nodes: Nodes | None, motion: NodeMotion | None, middle: int, grid: Grid
+    s: Stack, middle: int, rest: np.ndarray | None, x: np.ndarray, nodes: Nodes | None, motion, grid: Grid
 ) -> np.ndarray:
-    """[B, 3] u32, grid points from which the nodes carry births to `means` [B, 3] in frame `middle`.
+    """[B, 3] u32, grid points from which the nodes carry the births `s` to where they are in frame `middle`, or the
+    nearest to it in which they are shown.
 
-    The nearest survivor's motion is undone (x [N, 3] are the survivors' canonical positions), then the error is.
+    From `rest` ([B, 3]), or where the trainer does not know it, from where the motion of the nearest survivor comes
+    from (x [N, 3] are the survivors' canonical positions): then the error is undone.
     """
+    at, each = s.near(middle), np.arange(s.means.shape[1])
+    means = s.means[at, each]
     if nodes is None or not len(means):
         return grid.to_integers(means)
-    from scipy.spatial import cKDTree
+    if rest is None:
+        from scipy.spatial import cKDTree
 
-    near = cKDTree(motion.carried[middle]).query(means)[1]
-    turned, carried = motion.turned[middle, near], motion.carried[middle, near]
-    places = x[near]
+        near = cKDTree(motion.carried[middle]).query(means)[1]
+        rest = x[near] + rotate(quat_conjugate(motion.turned[middle, near]), means - motion.carried[middle, near])
     for _ in range(ROUNDS):
-        places = places + rotate(quat_conjugate(turned), means - carried)
-        on_grid = grid.to_integers(places)
-        moved = carry(nodes, on_grid, grid.to_world(on_grid), len(motion.carried))
-        turned, carried = moved.turned[middle], moved.carried[middle]
-    return grid.to_integers(places)
+        on_grid = grid.to_integers(rest)
+        moved = carry(nodes, on_grid, grid.to_world(on_grid), len(s.means))
+        rest = rest + rotate(quat_conjugate(moved.turned[at, each]), means - moved.carried[at, each])
+    return grid.to_integers(rest)
 
 
 def _canonical_births(s: Stack, middle: int, motion: NodeMotion | None) -> tuple[Stack, np.ndarray]:
     """Births with their axes in canonical form, and the vector part of their canonical quaternions, [B, 3]."""
-    quats = s.quats[middle]
+    at, each = s.near(middle), np.arange(s.means.shape[1])
+    quats = s.quats[at, each]
     if motion is not None:
-        quats = quat_multiply(quat_conjugate(motion.turned[middle]), quats)
-    turn, order = canonical_axes(quats, s.log_scales[middle])
+        quats = quat_multiply(quat_conjugate(motion.turned[at, each]), quats)
+    turn, order = canonical_axes(quats, s.log_scales[at, each])
     quats = quat_multiply(quats.astype(np.float64), turn)
     quats *= np.where(quats[:, :1] < 0, -1, 1)
     return align_axes(s, middle, turn, order), quats[:, 1:]

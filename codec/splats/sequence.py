@@ -222,8 +222,8 @@ def _stored_group(path: Path, paths: list[Path], start: int, count: int, extra: 
     except (OSError, ValueError) as e:
         raise CaptureError(f"{path / extra}: missing or damaged ({e}), sequence.json refers to it") from e
     lifetimes, nodes, hidden = arrays.get("lifetimes"), None, {}
-    if "node_positions" in arrays:
-        nodes = Nodes(arrays["node_positions"], arrays["node_rotations"], arrays["node_translations"])
+    if "node_rest" in arrays:
+        nodes = Nodes(*(arrays[f"node_{n}"] for n in ("positions", "rotations", "translations", "rest")))
     if lifetimes is not None:
         for t in range(count):
             away = (lifetimes[:, 0] > t) | (t >= lifetimes[:, 1])

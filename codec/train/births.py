@@ -52,7 +52,7 @@ def born(model: Model, pull: torch.Tensor, wrong: list[np.ndarray], frame: int, 
         return None
     room = min(room, int(MOST * len(model)))
     rng, workspace = np.random.default_rng([settings.seed, frame, 3]), Workspace()
-    young = _points(wrong, frame, views, room // 2, settings.seed)
+    young = from_points(*sweep_wrong(wrong, frame, views, room // 2, settings.seed), opacity=0.5)
     young.set_degree(model.degree)
     chosen = torch.topk(pull, max(0, min(room - len(young), len(pull)))).indices
     young.append(_children(model, chosen[pull[chosen] > LOUD], rng))
@@ -95,11 +95,11 @@ def wrong_pixels(model: Model, masks: list[np.ndarray], frame: int, views) -> li
     return out
 
 
-def _points(wrong: list[np.ndarray], frame: int, views, most: int, seed: int) -> Model:
-    """At most `most` Gaussians on surfaces in the pixels that are wrong."""
+def sweep_wrong(wrong: list[np.ndarray], frame: int, views, most: int, seed: int = 0):
+    """At most `most` points on surfaces in the pixels that are wrong, and their colours, as of `sweep`."""
     taken = [views.view(i, frame) for i in views.train_cameras]
     pictures = [(views.camera(i), v.rgb, v.alpha) for i, v in zip(views.train_cameras, taken, strict=True)]
-    return from_points(*sweep(pictures, most, seed, wrong), opacity=0.5)
+    return sweep(pictures, most, seed, wrong)
 
 
 def _children(model: Model, chosen: torch.Tensor, rng: np.random.Generator) -> dict[str, torch.Tensor]:

@@ -56,10 +56,21 @@ class Changes:
             difference = cv2.blur(now.astype(np.float32) - fitted, (3, 3))
             changed = np.abs(difference).max(2) > THRESHOLD
             fitted[changed] = now[changed]
-            size = 2 * round(MARGIN * now.shape[1]) + 1
-            near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-            masks.append(cv2.dilate(changed.astype(np.uint8), near) > 0)
+            masks.append(_grown(changed))
         return masks
+
+    def outside(self, frame: int, means: np.ndarray) -> np.ndarray:
+        """[N] bool: Gaussians at `means` ([N, 3]) that most cameras that have them in the picture have outside of the
+        masks of `frame`, where there are masks: whatever may hide them, there is nothing. No picture: outside, too."""
+        import cv2
+
+        masks = []
+        for camera, fitted in zip(self.views.train_cameras, self.fitted, strict=True):
+            alpha = self.views.view(camera, frame).alpha
+            if alpha is None:
+                return np.zeros(len(means), bool)
+            masks.append(_grown(cv2.resize(alpha, fitted.shape[1::-1], interpolation=cv2.INTER_AREA) > 0))
+        return ~self.behind(masks, means, [np.ones(len(means), bool)] * len(masks))
 
     def behind(self, masks: list[np.ndarray], means: np.ndarray, visible: list[np.ndarray]) -> np.ndarray:
         """[N] bool: Gaussians at `means` ([N, 3]) that enough of the cameras that see them have in changed pixels.
@@ -70,9 +81,18 @@ class Changes:
         seen, hit = np.zeros(len(means), np.int32), np.zeros(len(means), np.int32)
         for camera, mask, clear in zip(self.views.train_cameras, masks, visible, strict=True):
             height, width = mask.shape
-            p, depth = project(self.views.capture.cameras[camera].resized(width, height), means)
+            p, depth = project(self.views.camera(camera).resized(width, height), means)
             x, y = np.floor(p).astype(np.int64).T
             on = np.flatnonzero(clear & (depth > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height))
             seen[on] += 1
             hit[on] += mask[y[on], x[on]]
         return (hit > 0) & (hit >= SEEN_SHARE * seen)
+
+
+def _grown(mask: np.ndarray) -> np.ndarray:
+    """[h, w] bool and what is near it."""
+    import cv2
+
+    size = 2 * round(MARGIN * mask.shape[1]) + 1
+    near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    return cv2.dilate(mask.astype(np.uint8), near) > 0

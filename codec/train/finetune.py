@@ -12,6 +12,7 @@ place of their quantization, and a rate term of their own (rate.py).
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from gscodec.gaussians import Gaussians, Group, Nodes
 from gscodec.render.workspace import Workspace
 from gscodec.train import keyframe
 from gscodec.train.graph import NodeGraph, Pose, quat_conjugate, quat_multiply, quat_to_rotvec
-from gscodec.train.model import NAMES, Model
+from gscodec.train.model import HIDDEN, NAMES, Model
 from gscodec.train.rate import CanonicalRate, laplace_bits
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, compare
@@ -31,7 +32,6 @@ from gscodec.train.views import Views, compare
 # attribute -> temporal frequencies that may be used; what is not listed is constant in a group
 FREQUENCIES = {"means": 10, "quats": 4, "log_scales": 3, "logit_opacities": 3, "sh0": 6}
 STARTS = 0.5  # steps: a residual that is there from the start, of a Gaussian that has moved in an earlier group
-HIDDEN = -20.0  # logit of the opacity of what is not born yet
 ROUND_DOWN = 0.1  # a coefficient below 0.6 steps is not coded, as the encoder does it
 RESIDUAL_RATE = 0.05  # in steps of the stream a step of the optimiser
 LAPLACE_RATE = 0.02
@@ -54,13 +54,14 @@ class GroupModel:
         graph: carries the N Gaussians of the last frame.
         key: canonical Gaussians that the group before has left, in the keyframe's pose; they stay as they are. None:
             all are new, and so are those that are born in this group.
-        tracked: T tracked models, later ones with those that were born at the end; poses: T poses of the nodes.
+        tracked: T tracked models, later ones with those that were born at the end and HIDDEN ones, which are dead;
+            poses: T poses of the nodes, later ones with those of what came in at the end.
         steps: the stream's quantization.
         moved: [N] bool, Gaussians that tracking has touched; the others have no residuals, unless they start with some.
 
     Attributes:
         key: canonical Gaussians; the first `known` of them are given.
-        born: [N] int, frame of the group from which each is shown.
+        born, end: [N] int, frames of the group from which, and before which, each is shown.
     """
 
     def __init__(
@@ -72,10 +73,13 @@ class GroupModel:
         steps: Steps,
         moved: torch.Tensor,
     ):
-        self.graph, self.poses = graph, poses
+        self.graph, self.poses = graph, _at_rest_until_born(poses)
         counts = torch.tensor([len(m) for m in tracked])
         self.born = (counts[:, None] <= torch.arange(counts[-1])).sum(0)
         tracked = [_padded(m, tracked[-1]) for m in tracked]
+        dead = torch.stack([m.params["logit_opacities"] <= HIDDEN for m in tracked])
+        dead &= torch.arange(len(tracked))[:, None] > self.born  # the padding is of the last frame
+        self.end = len(tracked) - dead.sum(0)
         self.known = 0 if key is None else len(key)
         self.key = self._canonical(key, tracked)
         self.basis = torch.from_numpy(dct_basis(len(tracked))).float()  # [T, T]
@@ -83,7 +87,7 @@ class GroupModel:
         self.canonical_rate = CanonicalRate(self.key.params["means"], steps)
         self.unit = {name: trajectory_step(getattr(steps, name), len(tracked)) for name in FREQUENCIES}
         self.unit["sh0"] *= float(STEP_WEIGHTS[0])  # Y, Co, Cg share one step; RGB errors add up over them
-        self.means, self.turned = zip(*(self._carry(p) for p in poses), strict=True)
+        self.means, self.turned = zip(*(self._carry(p) for p in self.poses), strict=True)
         self.coefficients = self._project(tracked)  # in units of the quantization step
         self.free = torch.stack([(c.detach().abs() > STARTS).any(2).any(0) for c in self.coefficients.values()]).any(0)
         self.free |= moved
@@ -94,9 +98,9 @@ class GroupModel:
         }
 
     def _held(self, x: list[torch.Tensor]) -> torch.Tensor:
-        """[T, N, ...]: before its birth a Gaussian is what it is at birth."""
+        """[T, N, ...]: before its birth a Gaussian is what it is at birth, and dead what it was last."""
         x = torch.stack(x)
-        frame = torch.maximum(torch.arange(len(x))[:, None], self.born)
+        frame = torch.arange(len(x))[:, None].clamp(min=self.born, max=self.end - 1)
         return x[frame, torch.arange(x.shape[1])]
 
     def _canonical(self, key: Model | None, tracked: list[Model]) -> Model:
@@ -126,7 +130,8 @@ class GroupModel:
             residual["quats"].append(dq[:, 1:] * torch.where(dq[:, :1] < 0, -1.0, 1.0))
             for name in ("log_scales", "sh0"):
                 residual[name].append(q[name] - p[name])
-            residual["logit_opacities"].append((q["logit_opacities"] - p["logit_opacities"])[:, None])
+            faded = (q["logit_opacities"] - p["logit_opacities"])[:, None]
+            residual["logit_opacities"].append(torch.where(q["logit_opacities"][:, None] > HIDDEN, faded, 0.0))
         out = {}
         for name, most in FREQUENCIES.items():
             low = self.basis[: min(most, len(tracked))]
@@ -162,7 +167,7 @@ class GroupModel:
             "means": means + self.residual("means", t),
             "quats": quat_multiply(torch.cat([w, dq], 1), quat_multiply(self.turned[t], p["quats"])),
             "log_scales": p["log_scales"] + self.residual("log_scales", t),
-            "logit_opacities": torch.where(self.born > t, HIDDEN, opacities),
+            "logit_opacities": torch.where((self.born <= t) & (t < self.end), opacities, HIDDEN),
             "sh0": p["sh0"] + self.residual("sh0", t),
         }
 
@@ -177,10 +182,11 @@ class GroupModel:
     def group(self, parents: np.ndarray | None) -> Group:
         """All frames in numpy; `parents` as in Group."""
         frames = len(self.poses)
-        lifetimes = np.stack([self.born.numpy(), np.full(len(self.born), frames)], 1).astype(np.int32)
+        lifetimes = torch.stack([self.born, self.end], 1).numpy().astype(np.int32)
+        cut = (lifetimes != [0, frames]).any()
         return Group(
             [self.gaussians(t) for t in range(frames)],
-            lifetimes=lifetimes if self.born.any() else None,
+            lifetimes=lifetimes if cut else None,
             nodes=self.nodes(),
             parents=parents,
         )
@@ -192,7 +198,7 @@ class GroupModel:
             near = quat_to_rotvec(pose.turned, near)
             rotations.append(near)
         translations = [pose.nodes - self.graph.nodes for pose in self.poses]
-        arrays = (self.graph.nodes, torch.stack(rotations), torch.stack(translations))
+        arrays = (self.graph.nodes, torch.stack(rotations), torch.stack(translations), self.key.params["means"])
         return Nodes(*(a.numpy().astype(np.float32) for a in arrays))
 
     def gaussians(self, t: int) -> Gaussians:
@@ -203,6 +209,16 @@ class GroupModel:
 def _padded(model: Model, last: Model) -> Model:
     """The model with the Gaussians that it does not have yet, as they are in `last`."""
     return Model({n: torch.cat([p, last.params[n][len(p) :]]) for n, p in model.params.items()})
+
+
+def _at_rest_until_born(poses: list[Pose]) -> list[Pose]:
+    """Poses of all nodes: before its birth a node is where it is at birth."""
+    whole = poses[-1:]
+    for pose in poses[-2::-1]:
+        known, later = len(pose.nodes), whole[0]
+        arrays = {f.name: torch.cat([getattr(pose, f.name), getattr(later, f.name)[known:]]) for f in fields(Pose)}
+        whole.insert(0, Pose(**arrays))
+    return whole
 
 
 class _Finetuner:

@@ -2,11 +2,14 @@
 
 HiFi4G's coarse deformation graph, and what the stream's nodes are (spec 13.2 and 13.3: same neighbours, same weights):
 tracking optimises the nodes, so a smooth motion is smooth by construction and cheap to code.
+
+What comes in later has nodes of its own. The decoder knows no owner, it takes the nearest nodes; so newcomers rest with
+their nodes at a free place beside all others, from which the nodes' translations bring them in.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -20,6 +23,9 @@ BLENDED = 4  # nodes that carry one Gaussian
 EDGES = 8  # neighbours of a node in the rigidity term
 HELD = 0.1  # weight from which a node has a hold on a Gaussian
 GRID = 1e-3  # of the radius: the lattice on which neighbours and weights are computed
+NEWCOMERS = 16  # nodes of what comes in at once
+ROOM = 2.0  # extents of the keyframe that the stream's lattice has along each axis
+PLACES = 16  # at most, that are tried for newcomers to rest
 
 
 def quat_multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
@@ -77,6 +83,17 @@ class Pose:
         zero = torch.zeros_like(graph.nodes)
         return Pose(graph.nodes, rotvec_to_quat(zero), zero, zero)
 
+    def ahead(self) -> Pose:
+        """One more such step."""
+        turned = torch.nn.functional.normalize(quat_multiply(rotvec_to_quat(self.turn), self.turned), dim=1)
+        return Pose(self.nodes + self.move, turned, self.turn, self.move)
+
+    def joined(self, nodes: torch.Tensor) -> Pose:
+        """With more nodes, which come in at `nodes` [K, 3] and have not turned or moved yet."""
+        zero = torch.zeros_like(nodes)
+        more = Pose(nodes, rotvec_to_quat(zero), zero, zero)
+        return Pose(*(torch.cat([getattr(self, f.name), getattr(more, f.name)]) for f in fields(Pose)))
+
 
 class _Weighted(torch.autograd.Function):
     """Sparse weights [N, M] times rows [M, C]; scipy's product takes a tenth of the time of gathering rows in torch."""
@@ -93,35 +110,48 @@ class _Weighted(torch.autograd.Function):
 
 
 class NodeGraph:
-    """Nodes of a keyframe and the weights by which they carry its Gaussians.
+    """Nodes of a keyframe and of what has come in since, and the weights by which they carry Gaussians.
 
     Args:
-        means: [N, 3] positions in the keyframe.
+        means: [N, 3] positions at rest; of what was there in the keyframe, those in the keyframe.
         low, step: [3] and world units, origin and spacing of the lattice; chosen: [M, 3] u32, nodes on it.
+        family: [M] int, 0: of the keyframe; else the number of the newcomers whose node it is.
+        extent: [3], of the keyframe.
 
     Attributes:
         means: as given.
-        nodes: [M, 3] positions of the nodes in the keyframe.
+        nodes: [M, 3] positions of the nodes at rest.
+        spacing: usual distance of neighbouring nodes.
     """
 
-    def __init__(self, means: torch.Tensor, low: torch.Tensor, step: float, chosen: np.ndarray):
-        from scipy.spatial import cKDTree
-
-        self.lattice = (low, step, chosen)
-        self.nodes = low + step * torch.from_numpy(chosen.astype(np.float32))
+    def __init__(
+        self, means: torch.Tensor, low: torch.Tensor, step: float, chosen: np.ndarray, family: np.ndarray, extent
+    ):
+        self.low, self.step, self.extent = low, step, extent
+        self.chosen, self.family = chosen, family
+        self._connect()
         self.means, self._blend = means[:0], None
         self.extend(means)
-        m, k = len(chosen), min(EDGES, len(chosen) - 1)
+
+    def _connect(self) -> None:
+        """Positions of the nodes, and the edges between them."""
+        from scipy.spatial import cKDTree
+
+        self.nodes = self.low + self.step * torch.from_numpy(self.chosen.astype(np.float32))
+        m, k = len(self.chosen), min(EDGES, len(self.chosen) - 1)
         near = cKDTree(self.nodes.numpy()).query(self.nodes.numpy(), k + 1)[1].reshape(m, -1)[:, 1:]
         self._edges = torch.from_numpy(near.astype(np.int64))
         length = (self.nodes[self._edges] - self.nodes[:, None]).norm(dim=2, keepdim=True)
         middle = length.median() if k else torch.ones(())
         hold = torch.exp2(-((length / (1.5 * middle)) ** 2))  # long edges bridge gaps: they hold less
-        self._hold = hold * GRID / step
+        self._hold, self.spacing = hold * GRID / self.step, float(middle)
 
     @staticmethod
-    def of(means: torch.Tensor, radius: float, moving: torch.Tensor, count: int = NODES) -> NodeGraph:
-        """Nodes for Gaussians at `means` [N, 3], most of them where `moving` ([N] bool); `radius` of these."""
+    def of(
+        means: torch.Tensor, sizes: torch.Tensor, radius: float, moving: torch.Tensor, count: int = NODES
+    ) -> NodeGraph:
+        """Nodes for Gaussians at `means` [N, 3] of `sizes` [N], most of them where `moving` ([N] bool); `radius` of
+        these. They are dense where the Gaussians are small: a wall behind needs few."""
         low, step = means.min(0).values, GRID * radius
         grid = torch.round((means - low) / step).numpy().astype(np.uint32)
         if (~moving).float().mean() < STILL_SHARE:  # nodes that stay among others that move would hold them
@@ -130,34 +160,88 @@ class NodeGraph:
         some = [np.zeros((0, 3), np.uint32)]
         for mask, most in ((moving, count - still), (~moving, still)):
             if mask.any() and most:
-                some.append(grid[mask.numpy()][farthest_points(means[mask].numpy(), most)])
+                some.append(grid[mask.numpy()][farthest_points(means[mask].numpy(), most, sizes[mask].numpy())])
         chosen = np.unique(np.concatenate(some), axis=0)
-        return NodeGraph(means, low, step, chosen[_native.morton_order(chosen)])
+        chosen = chosen[_native.morton_order(chosen)]
+        return NodeGraph(means, low, step, chosen, np.zeros(len(chosen), int), means.max(0).values - low)
 
     def extend(self, means: torch.Tensor) -> None:
-        """More Gaussians to carry, at [K, 3] in the keyframe."""
+        """More Gaussians to carry, at [K, 3] at rest."""
         from scipy.sparse import csr_matrix, vstack
 
-        low, step, chosen = self.lattice
-        grid = torch.round((means - low) / step).clamp(min=0).numpy().astype(np.uint32)
-        index, weight = _native.node_weights(grid, chosen, BLENDED)
+        index, weight = self._weights(means, self.chosen)
         parts = (
             weight.astype(np.float32).ravel(),
             index.astype(np.int32).ravel(),
-            index.shape[1] * np.arange(len(grid) + 1),
+            index.shape[1] * np.arange(len(means) + 1),
         )
-        rows = csr_matrix(parts, (len(grid), len(chosen)))
-        self._blend = rows if self._blend is None else vstack([self._blend, rows], format="csr")  # [N, M]
+        rows = csr_matrix(parts, (len(means), len(self.chosen)))
+        if self._blend is not None:
+            self._blend.resize(self._blend.shape[0], len(self.chosen))
+            rows = vstack([self._blend, rows], format="csr")
+        self._blend = rows  # [N, M]
         self._gather = self._blend.T.tocsr()
         self.means = torch.cat([self.means, means])
 
-    def carried_back(self, means: torch.Tensor, pose: Pose) -> torch.Tensor:
-        """[K, 3] positions in the keyframe of points at `means` in `pose`, by the motion of the nearest node."""
-        from scipy.spatial import cKDTree
+    def _weights(self, means: torch.Tensor, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes of `chosen` that carry Gaussians at `means` [N, 3], and their weights, [N, k] both."""
+        return _native.node_weights(self._on_lattice(means), chosen, BLENDED)
 
-        nearest = torch.from_numpy(cKDTree(pose.nodes.numpy()).query(means.numpy())[1])
-        back = quat_to_matrix(quat_conjugate(pose.turned[nearest]))
-        return self.nodes[nearest] + torch.einsum("kij,kj->ki", back, means - pose.nodes[nearest])
+    def _on_lattice(self, means: torch.Tensor) -> np.ndarray:
+        return torch.round((means - self.low) / self.step).clamp(min=0).numpy().astype(np.uint32)
+
+    def settle(self, means: torch.Tensor) -> torch.Tensor | None:
+        """Gives Gaussians that come in at `means` [K, 3] nodes of their own, at the end, and a place to rest.
+
+        Returns:
+            [3], from `means` to where they rest: there nobody else's nodes or weights change. None: no room is left.
+        """
+        own = means[torch.from_numpy(farthest_points(means.numpy(), NEWCOMERS))]
+        before = self._weights(self.means, self.chosen)
+        for shift in self._places(means):
+            young = np.unique(self._on_lattice(own + shift), axis=0)
+            chosen = np.concatenate([self.chosen, young[_native.morton_order(young)]])
+            after = self._weights(self.means, chosen)
+            alone = (self._weights(means + shift, chosen)[0] >= len(self.chosen)).all()
+            if alone and all(np.array_equal(a, b) for a, b in zip(before, after, strict=True)):
+                self.family = np.concatenate([self.family, np.full(len(young), self.family.max() + 1)])
+                self.chosen = chosen
+                self._connect()
+                return shift
+        return None
+
+    def _places(self, means: torch.Tensor):
+        """Shifts [3] of `means` to beside all that rest, along the axis with most room in the lattice."""
+        low, high = means.min(0).values, means.max(0).values
+        start, size = self.means.max(0).values, high - low
+        room = self.low + ROOM * self.extent.max() - size - start
+        axis = int(room.argmax())
+        for k in range(PLACES):
+            away = (0.5 + 0.5 * k) * size.max()
+            if away > room[axis]:
+                return
+            shift = self.low + self.extent / 2 - (low + high) / 2
+            shift[axis] = start[axis] + away - low[axis]
+            yield shift
+
+    def family_of(self) -> np.ndarray:
+        """[N] int, the family of the nodes that carry each Gaussian."""
+        return self.family[self._blend.indices[self._blend.indptr[:-1]]]
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything as arrays."""
+        return {n: np.asarray(getattr(self, n)) for n in ("means", "low", "step", "chosen", "family", "extent")}
+
+    @staticmethod
+    def restored(state: dict[str, np.ndarray]) -> NodeGraph:
+        """Inverse of `state`."""
+        means, low, extent = (torch.from_numpy(state[n]) for n in ("means", "low", "extent"))
+        return NodeGraph(means, low, float(state["step"]), state["chosen"], state["family"], extent)
+
+    def keep(self, chosen: torch.Tensor) -> None:
+        """Carries only the Gaussians of `chosen` ([N] bool)."""
+        self.means, self._blend = self.means[chosen], self._blend[chosen.numpy()]
+        self._gather = self._blend.T.tocsr()
 
     def __len__(self) -> int:
         return len(self.nodes)

@@ -13,6 +13,7 @@ from gscodec.gaussians import SH_C0, Gaussians
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 BETAS = (0.9, 0.99)  # short schedules: a second moment that forgets in 100 steps
 EPS = 1e-15
+HIDDEN = -20.0  # logit of the opacity of what is not there
 
 
 class Model:

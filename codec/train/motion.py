@@ -6,6 +6,8 @@ with fixed colours the motion follows the shading instead of the surface (lumber
 colours 26.1). The first half of the steps looks at small pictures, where large motion is near and a step is cheap.
 
 What does not change in the pictures (changes.py) does not move: its Gaussians and nodes stay as they are, to the bit.
+What comes in (births.py) has nodes of its own, unless it is beside what is there, and is looked for where it moves too
+fast to be followed (lost.py). What has faded away, or lies outside of the masks, is dead.
 
 A hash grid and MLP (V3) on top of the nodes gave nothing here, so that there is none: the nodes are what the stream can
 carry. V3's recipe, with the grid, is a baseline in bench/baselines/v3.py.
@@ -21,11 +23,12 @@ import torch
 
 from gscodec.bitstream.quantization import subject_radius
 from gscodec.render.workspace import Workspace
-from gscodec.train.births import born, wrong_pixels
+from gscodec.train.births import LEAST, born, wrong_pixels
 from gscodec.train.changes import Changes
 from gscodec.train.graph import NodeGraph, Pose, quat_conjugate, quat_multiply, rotvec_to_quat
-from gscodec.train.keyframe import Statistics
-from gscodec.train.model import NAMES, Model
+from gscodec.train.keyframe import PRUNE_OPACITY, Statistics, rotate
+from gscodec.train.lost import whereabouts
+from gscodec.train.model import HIDDEN, NAMES, Model
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, compare, look
 
@@ -39,6 +42,8 @@ MASK_LAMBDA = 3.0  # the silhouette counts more than in a keyframe: it does not 
 RATES = {"quats": 6e-4, "log_scales": 6e-3, "logit_opacities": 2e-2, "sh0": 5e-2, "shN": 2.5e-3}
 MEANS_RATE = 3e-5  # radii
 CALM = 0.995  # quantile of the pull in a keyframe
+CROWD = 2  # times the Gaussians that may live at once: those of a group, with its dead
+AWAY = 4.0  # times their distance from one another: newcomers so far from all else are strangers
 VISIBLE = 0.05  # blending weight from which a camera sees a Gaussian
 
 
@@ -84,7 +89,10 @@ class Tracker:
             seen = peek.behind(peek.advance(frames[1]), means.numpy(), visible)
             moving = seen if seen.any() else moving
         radius = subject_radius(means[moving].numpy())
-        graph = NodeGraph.of(means, radius, torch.from_numpy(moving))
+        sizes = torch.ones(len(key))
+        if not views.capture.has_alpha:  # there is a background
+            sizes = key.params["log_scales"].sort(1).values[:, 1:].mean(1).exp()  # without the thin axis
+        graph = NodeGraph.of(means, sizes, radius, torch.from_numpy(moving))
         own = Model({**key.params, "means": torch.zeros_like(means)})
         calm = float(torch.quantile(stats.mean_pull(), CALM))
         return Tracker(graph, own, views, settings, np.array([radius, loss, calm]), changes)
@@ -102,11 +110,22 @@ class Tracker:
 
     def advance(self, frame: int, on_step: Callable[[int, float], None] | None = None) -> float | None:
         """Moves model and pose on to `frame`, the next one; returns the image loss at the end, without the mask's, or
-        None where nothing has changed."""
+        None where nothing has changed or nothing is left; infinity if something comes after that."""
         self.moving = torch.from_numpy(self._moving(frame))
-        if not self.moving.any():
+        self.pull = torch.zeros(len(self.own))
+        changed = any(m.any() for m in self.masks)
+        if not self.alive.any():
+            return np.inf if changed else None
+        if self.moving.any():
+            self._find(frame)
+            self._fit(frame, on_step)
+        else:
             self.pose = replace(self.pose, turn=0 * self.pose.turn, move=0 * self.pose.move)
-            return None
+        outside = self.changes.outside(frame, self.model.params["means"].numpy())
+        self._bury(torch.from_numpy(outside) | (self.moving & self._faded))
+        return self.loss if changed and self.alive.any() else None
+
+    def _fit(self, frame: int, on_step) -> None:
         fit = _Fit(self, np.random.default_rng([self.settings.seed, frame, 1]))
         bound, loss = PAYS * self.loss + LOSS_FLOOR, np.inf
         for turn in range(ROUNDS):
@@ -116,11 +135,44 @@ class Tracker:
         self.own, self.pose = fit.result()
         self.loss = loss
         self.pull = fit.pull.mean_pull()
-        return loss
+
+    def _find(self, frame: int) -> None:
+        """Newcomers that are lost go to where `frame` shows them, with that speed, or die."""
+        family, next_pose = self.graph.family_of(), self.pose.ahead()
+        for k in np.setdiff1d(family[(self.moving & self.alive).numpy()], [0]):
+            some = torch.from_numpy(family == k) & self.alive
+            model = Model(self.carried(self.own, next_pose)[0])
+            shift = whereabouts(model, some, frame, self.views, self.changes, self.masks)
+            if shift is None:
+                self._bury(some)
+            else:
+                self.moving |= some
+                self.pose.move[torch.from_numpy(self.graph.family == k)] += shift
+
+    @property
+    def _faded(self) -> torch.Tensor:
+        return torch.sigmoid(self.own.params["logit_opacities"]) < PRUNE_OPACITY
+
+    def _bury(self, dead: torch.Tensor) -> None:
+        """Gaussians of `dead` ([N] bool) do not come back."""
+        self.own.params["logit_opacities"][dead] = HIDDEN
+        self.moving &= ~dead
+
+    @property
+    def alive(self) -> torch.Tensor:
+        """[N] bool: Gaussians that have not died."""
+        return self.own.params["logit_opacities"] > HIDDEN
+
+    def keep(self, chosen: torch.Tensor) -> None:
+        """Forgets the Gaussians outside of `chosen` ([N] bool)."""
+        self.graph.keep(chosen)
+        self.own.select(chosen)
+        self.moving = self.moving[chosen]
 
     def bear(self, frame: int, on_step: Callable[[int, float], None] | None = None) -> None:
         """Adds the Gaussians that `frame` needs besides, after `advance`."""
-        room = self.settings.gaussians_max - len(self.own)
+        most = self.settings.gaussians_max
+        room = min(most - int(self.alive.sum()), CROWD * most - len(self.own))
         pull = self.pull / self.calm
         wrong = wrong_pixels(self.model, self.masks, frame, self.views)
         young = born(self.model, pull, wrong, frame, self.views, self.settings, room, on_step)
@@ -129,11 +181,29 @@ class Tracker:
 
     def _add(self, young: Model) -> None:
         """Takes in Gaussians that were born in the pose of the last frame."""
-        self.graph.extend(self.graph.carried_back(young.params["means"], self.pose))
+        self.graph.extend(self._rest(young.params["means"]))
         means, turned = (x[len(self.own) :] for x in self.graph.carry(self.graph.means, self.pose))
         quats = quat_multiply(quat_conjugate(turned), young.params["quats"])
         self.own.append({**young.params, "means": young.params["means"] - means, "quats": quats})
         self.moving = torch.cat([self.moving, torch.ones(len(young), dtype=torch.bool)])
+
+    def _rest(self, means: torch.Tensor) -> torch.Tensor:
+        """[K, 3] where Gaussians rest that are born at `means`: beside the nearest one that there is, whose nodes carry
+        them, too. Strangers, away from all, have nodes of their own, and what is nearest to these goes with them."""
+        from scipy.spatial import cKDTree
+
+        params, turned = self.carried(self.own, self.pose)
+        there, turned, rest = params["means"][self.alive], turned[self.alive], self.graph.means[self.alive]
+        among = np.median(cKDTree(means.numpy()).query(means.numpy(), 2)[0][:, 1])
+        strange = torch.from_numpy(cKDTree(there.numpy()).query(means.numpy())[0] > AWAY * among)
+        first = len(self.graph)
+        shift = self.graph.settle(means[strange]) if strange.sum() >= LEAST else None
+        if shift is not None:
+            self.pose = self.pose.joined(self.graph.nodes[first:] - shift)
+            there, rest = torch.cat([there, means[strange]]), torch.cat([rest, means[strange] + shift])
+            turned = torch.cat([turned, rotvec_to_quat(torch.zeros(int(strange.sum()), 3))])
+        near = torch.from_numpy(cKDTree(there.numpy()).query(means.numpy())[1])
+        return rest[near] + rotate(quat_conjugate(turned[near]), means - there[near])
 
     def _round(self, fit: _Fit, frame: int, scale: float, on_step) -> float:
         """`motion_steps` views, the first half of them at `scale` of their size; returns the image loss at the end."""
@@ -161,16 +231,15 @@ class Tracker:
         own = {f"own.{n}": p.numpy() for n, p in self.own.params.items()}
         pose = {f"pose.{f.name}": getattr(self.pose, f.name).numpy() for f in fields(Pose)}
         fitted = {f"fitted.{i}": picture for i, picture in enumerate(self.changes.fitted)}
-        low, step, chosen = self.graph.lattice
-        numbers = {"numbers": np.array([self.radius, self.loss, self.calm]), "key_means": self.graph.means.numpy()}
-        return {**numbers, "low": low.numpy(), "step": np.array(step), "nodes": chosen, **own, **pose, **fitted}
+        graph = {f"graph.{n}": a for n, a in self.graph.state().items()}
+        numbers = np.array([self.radius, self.loss, self.calm])
+        return {"numbers": numbers, **graph, **own, **pose, **fitted}
 
     @staticmethod
     def restored(state: dict[str, np.ndarray], views: Views, settings: TrainSettings) -> Tracker:
         """Inverse of `state`."""
         own = Model({n: torch.from_numpy(state[f"own.{n}"]) for n in NAMES})
-        means, low = (torch.from_numpy(state[n]) for n in ("key_means", "low"))
-        graph = NodeGraph(means, low, float(state["step"]), state["nodes"])
+        graph = NodeGraph.restored({n[6:]: a for n, a in state.items() if n.startswith("graph.")})
         changes = Changes(views, [state[f"fitted.{i}"] for i in range(len(views.train_cameras))])
         tracker = Tracker(graph, own, views, settings, state["numbers"], changes)
         tracker.pose = Pose(*(torch.from_numpy(state[f"pose.{f.name}"]) for f in fields(Pose)))
@@ -196,9 +265,7 @@ class _Fit:
         self.pull = Statistics(len(self.own))
 
     def _pose(self) -> Pose:
-        pose, turn = self.t.pose, rotvec_to_quat(self.turn)
-        turned = torch.nn.functional.normalize(quat_multiply(turn, pose.turned), dim=1)
-        return Pose(pose.nodes + self.move, turned, self.turn, self.move)
+        return replace(self.t.pose, turn=self.turn, move=self.move).ahead()
 
     def step(self, target, fade: float, full: bool) -> float:
         """One view; rates times `fade`; a `full` one counts for what pulls at the Gaussians."""

@@ -115,23 +115,29 @@ class Subject:
         loss: image loss of their keyframe, which tells when they no longer serve.
         radius: of all Gaussians in the keyframe, world units.
         canonical: what all groups since the keyframe refer to; None before the first one is fine-tuned.
+        parents: [N], where each Gaussian is in the group before.
     """
 
     tracker: Tracker
     loss: float
     radius: float
     canonical: Model | None = None
+    parents: np.ndarray | None = None
+
+    def bury(self, canonical: Model) -> None:
+        """Goes on with `canonical`, all Gaussians of a group, but for the dead."""
+        alive = self.tracker.alive
+        self.parents = np.flatnonzero(alive.numpy())
+        self.tracker.keep(alive)
+        self.canonical = Model({n: p[alive] for n, p in canonical.params.items()})
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays."""
         canonical = {f"canonical.{n}": p.numpy() for n, p in self.canonical.params.items()}
-        views = self.tracker.views
-        cameras = {
-            "exposure": views.exposure.values,
-            "extrinsics": views.extrinsics.values,
-            "middle": views.extrinsics.middle,
-        }
-        return {"loss_radius": np.array([self.loss, self.radius]), **cameras, **canonical, **self.tracker.state()}
+        gains, poses = self.tracker.views.exposure, self.tracker.views.extrinsics
+        cameras = {"exposure": gains.values, "extrinsics": poses.values, "middle": poses.middle}
+        whole = {"loss_radius": np.array([self.loss, self.radius]), "parents": self.parents}
+        return {**whole, **cameras, **canonical, **self.tracker.state()}
 
     @staticmethod
     def restored(state: dict[str, np.ndarray], views: Views, settings: TrainSettings) -> Subject:
@@ -140,7 +146,7 @@ class Subject:
         loss, radius = state["loss_radius"].tolist()
         views.exposure.values, views.extrinsics.values = state["exposure"], state["extrinsics"]
         views.extrinsics.about(state["middle"], radius)
-        return Subject(Tracker.restored(state, views, settings), loss, radius, Model(canonical))
+        return Subject(Tracker.restored(state, views, settings), loss, radius, Model(canonical), state["parents"])
 
 
 def train_groups(
@@ -227,21 +233,26 @@ class _Run:
         self.views.restart()
         if self.subject is not None:
             self._follow(frames, track)
-        known = len(self.subject.canonical) if track.models else 0
-        if not track.models:  # nothing to follow, or lost at once
+        parents = self.subject.parents if track.models else None
+        if parents is None:  # nothing to follow, or lost at once
             self.subject = self._keyframe(frames)
             track.add(self.subject.tracker)
             self._follow(frames[1:], track)
         subject, done = self.subject, frames[: len(track.models)]
         if len(done) < len(frames):
             self.subject = None
-        if len(done) == 1 and not known:
+        if len(done) == 1 and parents is None:
             subject.canonical = track.models[0]
+            subject.parents = np.arange(len(subject.canonical))
             return Group([subject.canonical.gaussians()])
         model = self._finetuned(subject, done, track)
-        subject.canonical = model.key
-        index = np.arange(len(model.key), dtype=np.int32)
-        return model.group(np.where(index < known, index, -1) if known else None)
+        known = len(model.key) if parents is None else len(parents)
+        born = np.full(len(model.key) - known, -1)
+        group = model.group(None if parents is None else np.append(parents, born).astype(np.int32))
+        subject.bury(model.key)
+        if not len(subject.parents):
+            self.subject = None
+        return group
 
     def _keyframe(self, frames: range) -> Subject:
         """Of the first of `frames`."""

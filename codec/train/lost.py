@@ -1,0 +1,65 @@
+"""Newcomers that are lost: what falls is elsewhere in the next frame, out of the gradient's reach, or it is gone.
+
+In: the Gaussians of a frame as the motion so far continues, and which of them came in together. Out: the shift that
+brings these to where the pictures show them, or that they are nowhere. They are lost where the pictures are better
+without them; then a plane sweep looks where pictures are wrong without them, and what fits best there is taken.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gscodec.render.image import render_image
+from gscodec.sampling import farthest_points
+from gscodec.train.births import GREY, sweep_wrong, wrong_pixels
+from gscodec.train.model import HIDDEN, Model
+
+LOST = 1.002  # times the error without them; what is hidden makes none
+POINTS = 1000
+PLACES, ROUNDS = 8, 5  # that are tried, each the mean of the points around it
+
+
+def whereabouts(model: Model, some: torch.Tensor, frame: int, views, changes, masks) -> torch.Tensor | None:
+    """[3], the shift that brings Gaussians to where `frame` shows them; None: nowhere.
+
+    Args:
+        model: all Gaussians; some: [N] bool, those in question.
+        changes: fitted to `frame`; masks: [h, w] bool of each training camera, what has changed in it.
+    """
+    hidden = torch.where(some, HIDDEN, model.params["logit_opacities"])
+    others = Model({**model.params, "logit_opacities": hidden})
+    least, found = error(others, changes), None
+    if error(model, changes) < LOST * least:
+        return torch.zeros(3)
+    wrong = wrong_pixels(others, masks, frame, views)
+    points, _ = sweep_wrong(wrong, frame, views, POINTS)
+    means = model.params["means"]
+    centre = means[some].mean(0)
+    radius = float((means[some] - centre).norm(dim=1).quantile(0.9))
+    for place in _places(points, radius):
+        shift = torch.from_numpy(place).float() - centre
+        moved = Model({**model.params, "means": means + torch.where(some[:, None], shift, 0.0)})
+        if (e := error(moved, changes)) < least:
+            least, found = e, shift
+    return found
+
+
+def error(model: Model, changes) -> float:
+    """Mean absolute difference to the small pictures of `changes`, over all training cameras."""
+    g, views, differences = model.gaussians(), changes.views, []
+    for i, picture in zip(views.train_cameras, changes.fitted, strict=True):
+        camera = views.camera(i).resized(*picture.shape[1::-1])
+        shown = render_image(views.exposure.seen(g, i), camera, GREY)
+        differences.append(np.abs(shown.astype(np.float32) - picture).mean())
+    return float(np.mean(differences))
+
+
+def _places(points: np.ndarray, radius: float) -> list[np.ndarray]:
+    """Centres [3] of balls of this radius that hold many of the `points` [P, 3] (mean shift)."""
+    found = []
+    for place in points[farthest_points(points, PLACES)] if len(points) else ():
+        for _ in range(ROUNDS):
+            place = points[np.linalg.norm(points - place, axis=1) <= radius].mean(0)
+        found.append(place)
+    return found
