@@ -49,7 +49,7 @@ def error(model: Model, changes) -> float:
     """Mean absolute difference to the small pictures of `changes`, over all training cameras."""
     g, views, differences = model.gaussians(), changes.views, []
     for i, picture in zip(views.train_cameras, changes.fitted, strict=True):
-        camera = views.capture.cameras[i].resized(*picture.shape[1::-1])
+        camera = views.camera(i).resized(*picture.shape[1::-1])
         shown = render_image(views.exposure.seen(g, i), camera, GREY)
         differences.append(np.abs(shown.astype(np.float32) - picture).mean())
     return float(np.mean(differences))

@@ -134,17 +134,22 @@ class Subject:
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays."""
         canonical = {f"canonical.{n}": p.numpy() for n, p in self.canonical.params.items()}
-        log_gains = self.tracker.views.exposure.log_gains
-        whole = {"loss_radius": np.array([self.loss, self.radius]), "parents": self.parents, "log_gains": log_gains}
-        return {**whole, **canonical, **self.tracker.state()}
+        views, whole = self.tracker.views, {"loss_radius": np.array([self.loss, self.radius]), "parents": self.parents}
+        cameras = {
+            "exposure": views.exposure.values,
+            "extrinsics": views.extrinsics.values,
+            "middle": views.extrinsics.middle,
+        }
+        return {**whole, **cameras, **canonical, **self.tracker.state()}
 
     @staticmethod
     def restored(state: dict[str, np.ndarray], views: Views, settings: TrainSettings) -> Subject:
         """Inverse of `state`."""
         canonical = {n: torch.from_numpy(state[f"canonical.{n}"]) for n in NAMES}
-        views.exposure.log_gains = state["log_gains"]
-        tracker, numbers = Tracker.restored(state, views, settings), state["loss_radius"].tolist()
-        return Subject(tracker, *numbers, Model(canonical), state["parents"])
+        loss, radius = state["loss_radius"].tolist()
+        views.exposure.values, views.extrinsics.values = state["exposure"], state["extrinsics"]
+        views.extrinsics.about(state["middle"], radius)
+        return Subject(Tracker.restored(state, views, settings), loss, radius, Model(canonical), state["parents"])
 
 
 def train_groups(
