@@ -100,6 +100,10 @@ impl<C: Bins> Coder<'_, C> {
             if node.count == 1 && node.occupied() == 0 {
                 let point = points.get(node.start as usize).copied().unwrap_or(0);
                 out.push(node.code << (3 * rest) | self.c.bits(point & ((1 << (3 * rest)) - 1), 3 * rest));
+            } else if node.count == 1 {
+                let k = Split::new(node, level, &known, points, rest).child(self);
+                (mine, mask) = (seen(k, 1), 1 << k);
+                next.push(Node::new(node.code << 3 | k as u64, 1, node.start));
             } else {
                 let mut start = node.start;
                 let counts = Split::new(node, level, &known, points, rest).children(self);
@@ -184,7 +188,29 @@ impl Split {
         counts
     }
 
+    /// What `children` does for a single point, which most nodes have: where it is, without branches on what cannot be foreseen.
+    fn child<C: Bins>(self, coder: &mut Coder<C>) -> usize {
+        let [lx, ly, lz] = self.lower;
+        let c = context(halves(ly, 4, 0), halves(lz, 4, 0), sum(lx, 4, 4), self.upper[0]);
+        let x = 4 * self.upper_half(coder, 4, 0, c, 0);
+        let sx = halves(lx, 2, 4) * usize::from(x == 0);
+        let c = context(sx, halves(lz, 2, x), sum(ly, 6, x | 2), self.upper[1]);
+        let y = 2 * self.upper_half(coder, 6, x, c, 1);
+        let k = x | y;
+        let sx = halves(lx, 1, 4 | y) * usize::from(x == 0);
+        let sy = halves(ly, 1, k | 2) * usize::from(y == 0);
+        let c = context(sx, sy, sum(lz, 7, k | 1), self.upper[2]);
+        k | self.upper_half(coder, 7, k, c, 2)
+    }
+
+    /// 0 or 1: in which half the only point is.
+    #[inline(always)]
+    fn upper_half<C: Bins>(&self, coder: &mut Coder<C>, mask: usize, half: usize, c: usize, axis: usize) -> usize {
+        1 - self.split(coder, mask, half, 1, c, axis) as usize
+    }
+
     /// Of `n` points, how many lie in the lower half: the children k with k & mask = half.
+    #[inline(always)]
     fn split<C: Bins>(&self, coder: &mut Coder<C>, mask: usize, half: usize, n: u32, c: usize, axis: usize) -> u32 {
         let want = if C::DECODES {
             0
