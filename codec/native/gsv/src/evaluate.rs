@@ -325,11 +325,12 @@ fn dequantized(group: &Group, a: Attribute, shift: f32) -> Vec<f32> {
     };
     let scales: Vec<(f32, f32)> = scale.steps.iter().copied().zip(scale.offsets.iter().copied()).collect();
     let mut out = vec![0.0; values.len()];
-    let rows = RUN * scales.len().max(1);
+    let channels = scales.len().max(1);
+    let rows = RUN * channels;
     out.par_chunks_mut(rows)
         .zip(values.par_chunks(rows))
         .for_each(|(out, values)| {
-            for (out, row) in out.chunks_mut(scales.len()).zip(values.chunks(scales.len())) {
+            for (out, row) in out.chunks_mut(channels).zip(values.chunks(channels)) {
                 for ((out, v), (step, offset)) in out.iter_mut().zip(row).zip(&scales) {
                     *out = offset + step * *v as f32 + shift;
                 }
