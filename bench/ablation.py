@@ -1,8 +1,10 @@
-"""What each loss and tool of the training is worth: the bundled capture, trained without one of them at a time.
+"""What each loss and tool of the training is worth: two captures, trained without one of them at a time.
 
-One entry of bench/results/ablation.json per variant, all from the same seed and preset. `psnr_fg` is of the model
-before coding, `psnr_fg_coded` decoded from the stream, both on the test cameras. What has no setting of its own is
-taken out of the module that has it, by name, so that a variant whose tool is gone fails.
+lumberjack is the bundled capture, a subject with masks; stage (of the data folder, at half its size) a full room while
+a ball drops into it. One entry of bench/results/ablation.json per capture and variant, all from the same seed and
+preset. `psnr` is of the model before coding, `psnr_coded` decoded from the stream, both on the test cameras, of the
+subject where there are masks. What has no setting of its own is taken out of the module that has it, by name, so that
+a variant whose tool is gone fails.
 """
 
 from __future__ import annotations
@@ -14,20 +16,27 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from unittest.mock import patch
 
+import numpy as np
+
 from gscodec.bench import train
 from gscodec.bench.machine import ROOT, update_entries
+from gscodec.capture import Capture
+from gscodec.errors import UsageError
 from gscodec.train import changes, finetune, motion
+from gscodec.train import train as recipe
 
 WHOLE = "whole recipe"
-FRAMES = 10
+LUMBERJACK, STAGE = "lumberjack", "stage"
+FRAMES = {LUMBERJACK: (0, 10), STAGE: (7, 15)}  # the ball comes at 10
 
 
 @dataclass(frozen=True)
 class Variant:
-    """Changes to the settings, and (object, name, value) of what has none."""
+    """Changes to the settings, (object, name, value) of what has none, and the captures that use the tool."""
 
     settings: dict = field(default_factory=dict)
     patches: tuple[tuple[object, str, object], ...] = ()
+    captures: tuple[str, ...] = (LUMBERJACK, STAGE)
 
 
 def without(rates: dict[str, float], *names: str) -> dict[str, float]:
@@ -35,10 +44,11 @@ def without(rates: dict[str, float], *names: str) -> dict[str, float]:
     return {n: r for n, r in rates.items() if n not in names}
 
 
+NO_POINTS = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
 VARIANTS = {
     WHOLE: Variant(),
     "no D-SSIM": Variant({"ssim_lambda": 0.0}),
-    "no mask term": Variant({"mask_lambda": 0.0}),
+    "no mask term": Variant({"mask_lambda": 0.0}, captures=(LUMBERJACK,)),
     "no rigidity": Variant({"rigidity": 0.0}),
     "no rate term": Variant({"rate_lambda": 0.0}),
     "no fine-tuning": Variant({"finetune_steps": 0}),
@@ -51,23 +61,43 @@ VARIANTS = {
     "no noise on canonical values": Variant(
         patches=((finetune.GroupModel, "_relaxed", lambda group, generator: group.key.params),)
     ),
+    "no births": Variant(patches=((motion.Tracker, "bear", lambda *_: None),), captures=(STAGE,)),
+    "no plane sweep": Variant(patches=((recipe, "sweep", lambda *_: NO_POINTS),), captures=(STAGE,)),
+    "no shell of far points": Variant(patches=((recipe, "shell", lambda *_: NO_POINTS),), captures=(STAGE,)),
     "no node graph": Variant(  # every Gaussian for itself, at the rate of a node
         patches=((motion, "MOVE_RATE", 0.0), (motion, "TURN_RATE", 0.0), (motion, "MEANS_RATE", motion.MOVE_RATE))
     ),
 }
 
 
-def measure(names: list[str], preset: str, quality: float, out: Path) -> Iterator[dict]:
-    """Entries of the variants `names`, which also go into the result file `out` as they come."""
-    return update_entries(out, (_entry(name, preset, quality) for name in names), lambda e: [e["variant"], e["preset"]])
+def measure(
+    capture: str, names: list[str] | None, preset: str, quality: float, data: Path | None, out: Path
+) -> Iterator[dict]:
+    """Entries of the variants `names` (None: all that `capture` uses), which also go into the result file `out`.
+
+    Raises:
+        UsageError: the capture is not in the data folder.
+    """
+    found = _open(capture, data)
+    chosen = names or [n for n, v in VARIANTS.items() if capture in v.captures]
+    entries = ({"capture": capture, **_entry(found, name, preset, quality)} for name in chosen)
+    return update_entries(out, entries, lambda e: [e["capture"], e["variant"], e["preset"]])
 
 
-def _entry(name: str, preset: str, quality: float) -> dict:
+def _open(capture: str, data: Path | None) -> Capture:
     from gscodec.capture import open_capture
+
+    if capture == LUMBERJACK:
+        return open_capture(ROOT / "examples" / "lumberjack").frames(*FRAMES[capture])
+    if data is None:
+        raise UsageError(f"--capture {capture} needs the data folder, expected --data or GSCODEC_DATA")
+    return train.CASES[capture].open(data).frames(*FRAMES[capture]).scaled(0.5)
+
+
+def _entry(capture: Capture, name: str, preset: str, quality: float) -> dict:
     from gscodec.train.settings import train_settings
 
     variant = VARIANTS[name]
-    capture = open_capture(ROOT / "examples" / "lumberjack").frames(0, FRAMES)
     settings = train_settings(preset, quality=quality, **variant.settings)
     with ExitStack() as stack:
         for where, attribute, value in variant.patches:
@@ -80,13 +110,13 @@ def _entry(name: str, preset: str, quality: float) -> dict:
         "variant": name,
         "preset": preset,
         "quality": quality,
-        "frames": FRAMES,
-        "psnr_fg": model["psnr_fg"],
-        "psnr_fg_coded": stream["psnr_fg"],
-        "kb_per_frame": size / 1000 / FRAMES,
+        "frames": len(models),
+        "psnr": model["psnr_fg"] or model["psnr"],
+        "psnr_coded": stream["psnr_fg"] or stream["psnr"],
+        "kb_per_frame": size / 1000 / len(models),
         "haze": stream["haze"],
         "flicker": stream["flicker"],
         "gaussians": model["gaussians"],
         "groups": [len(g) for g in groups],
-        "seconds_per_frame": round(seconds / FRAMES, 2),
+        "seconds_per_frame": round(seconds / len(models), 2),
     }

@@ -341,24 +341,26 @@ def bench_train(
 
 @bench.command("ablation")
 def bench_ablation(
+    capture: Annotated[str, typer.Option(help="Comma-separated: lumberjack (bundled), stage.")] = "lumberjack",
     variant: Annotated[str | None, typer.Option(help="Comma-separated variants, see bench/ablation.py.")] = None,
     preset: Preset = "fast",
     quality: Quality = 50.0,
+    data: Annotated[Path | None, typer.Option(envvar="GSCODEC_DATA", help="Folder with the captures.")] = None,
     out: Annotated[Path, typer.Option(help="The result file; its other entries stay.")] = Path(
         "bench/results/ablation.json"
     ),
     as_json: Json = False,
 ) -> None:
-    """Training without one of its losses and tools at a time, on the bundled capture."""
+    """Training without one of its losses and tools at a time."""
     from gscodec.commands import bench_ablation as measure
 
     def line(e: dict) -> str:
         return (
-            f"{e['variant']:<30}{e['preset']:<7}{e['psnr_fg']:6.2f} dB, coded {e['psnr_fg_coded']:6.2f} dB  "
+            f"{e['capture']:<11}{e['variant']:<30}{e['preset']:<7}{e['psnr']:6.2f} dB, coded {e['psnr_coded']:6.2f}  "
             f"{e['kb_per_frame']:6.2f} kB/frame  {e['seconds_per_frame']:6.2f} s/frame"
         )
 
-    _show_entries(measure(variant, preset=preset, quality=quality, out=out), as_json, line)
+    _show_entries(measure(capture, variant, preset=preset, quality=quality, data=data, out=out), as_json, line)
 
 
 @bench.command("stress")

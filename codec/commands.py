@@ -330,16 +330,21 @@ def bench_train(
             yield from update(out, measure(capture, recipe, preset, frames, data, quality))
 
 
-def bench_ablation(variants: str | None, *, preset: str, quality: float, out: Path) -> Iterator[dict]:
-    """Yields what bench.ablation measures (comma-separated variants, None: all), and puts it into `out` as it comes.
+def bench_ablation(
+    capture: str, variants: str | None, *, preset: str, quality: float, data: Path | None, out: Path
+) -> Iterator[dict]:
+    """Yields what bench.ablation measures on `capture` (comma-separated variants, None: all that it uses), and puts it
+    into `out` as it comes.
 
     Raises:
-        UsageError: an unknown variant.
+        UsageError: an unknown capture or variant, or the capture is not in the data folder.
     """
     require("torch", "measuring training")
-    from gscodec.bench.ablation import VARIANTS, measure
+    from gscodec.bench.ablation import FRAMES, VARIANTS, measure
 
-    yield from measure(_names("--variant", variants, VARIANTS) or list(VARIANTS), preset, quality, out)
+    names = _names("--variant", variants, VARIANTS)
+    for name in _names("--capture", capture, FRAMES):
+        yield from measure(name, names, preset, quality, data, out)
 
 
 def bench_stress(cases: str | None, *, out: Path) -> Iterator[dict]:

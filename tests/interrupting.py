@@ -54,6 +54,7 @@ def gscodec(*args, at=None, by=signal.SIGKILL) -> int:
 
 
 def _run(args: list[str], at: tuple[str, int] | None, by: int) -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background jobs ignore
     settings.PRESETS["fast"], importance.SIZE = TINY, 128
     if at:
         _arm(*at, lambda: os.kill(os.getpid(), by))

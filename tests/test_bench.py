@@ -65,6 +65,23 @@ def test_training_has_a_chart_of_what_is_there(tmp_path):
     assert "V3" not in svg
 
 
+def test_ablation_shows_what_each_tool_is_worth(tmp_path):
+    pytest.importorskip("matplotlib")
+    keys = {"capture": "a", "preset": "fast", "frames": 10, "flicker": 0.5}
+    made = [
+        {**keys, "variant": v, "psnr_coded": p, "kb_per_frame": 4.0} for v, p in (("whole recipe", 26.0), ("x", 25))
+    ]
+    write_result(tmp_path / "ablation.json", {"entries": made})
+    assert [p.name for p in draw_charts(tmp_path, tmp_path / "charts")] == ["ablation.svg", "ablation.png"]
+
+
+def test_ablation_takes_out_what_is_there():
+    pytest.importorskip("torch")
+    from gscodec.bench.ablation import VARIANTS
+
+    assert [n for n, v in VARIANTS.items() for where, name, _ in v.patches if not hasattr(where, name)] == []
+
+
 def test_cameras_are_taken_out_of_training(tmp_path):
     capture = open_capture(ROOT / "examples" / "lumberjack")
     held = held_out(capture, ("cam16", "cam17"))

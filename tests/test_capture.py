@@ -180,7 +180,7 @@ def break_pose(values):
         (lambda f: f.__setitem__("frame", 7), "frame 0 is missing"),
         (lambda f: f.__setitem__("file_path", "images/none.png"), r"frame 0: image .*none.png is missing"),
         (lambda f: f.__setitem__("w", 99), r"image .*000.png is 24x16, expected 99x16"),
-        (lambda f: f.__setitem__("fl_x", -1), "focal length -1.0 x -1.0 is not positive"),
+        (lambda f: f.__setitem__("fl_x", -1), "focal length -1 x -1 is not positive"),
     ],
 )
 def test_a_broken_camera_is_left_out(rig, harm, message):
@@ -251,7 +251,7 @@ def test_bad_transforms_files(tmp_path, text, message):
 
 
 def test_detector_says_what_it_looked_for(tmp_path):
-    with pytest.raises(CaptureError, match=r"the folder is empty; looked for transforms.json .* and for calibration/"):
+    with pytest.raises(CaptureError, match=r"the folder is empty; looked for transforms.json .*, for images/ with"):
         open_capture(tmp_path)
     (tmp_path / "readme").touch()
     with pytest.raises(CaptureError, match="not a capture; looked for"):
@@ -399,10 +399,10 @@ def test_views_from_threads(qualisys):
 def test_short_videos_are_named(qualisys):
     path, save = qualisys
     write_video(path / "videos/a.mp4", 40)
-    with pytest.warns(UserWarning, match=r"a.mp4: short video, 40 of 60 frames; the capture ends at frame 40"):
+    with pytest.warns(UserWarning, match=r"a.mp4: short, 40 of 60 frames; the capture ends at frame 40"):
         assert save(a={}, b={})().frame_count == 40
     write_video(path / "videos/a.mp4", 20)
-    with pytest.warns(UserWarning, match=r"a.mp4: short video, 20 of 60 frames; the camera is left out"):
+    with pytest.warns(UserWarning, match=r"a.mp4: short, 20 of 60 frames; the camera is left out"):
         capture = save(a={}, b={})()
     assert (capture.frame_count, len(capture.cameras)) == (60, 1)
 
@@ -418,8 +418,8 @@ def test_video_at_another_scale(qualisys):
 @pytest.mark.parametrize(
     ("harm", "message"),
     [
-        ({"b": 9}, "its video is 64x48, expected 64x10"),
-        ({"r": 0}, "rotation r11..r33 is singular"),
+        ({"b": 9}, "a.mp4 is 64x48, expected 64x10"),
+        ({"r": 0}, "its pose is singular"),
         ({"x": "nan"}, "<transform> is missing or incomplete"),
         ({"f": ""}, "<intrinsic> is missing or incomplete, expected numbers focalLengthU"),
         ({"f": -1}, "focal length .* is not positive"),
@@ -459,7 +459,7 @@ def test_qualisys_masks(qualisys):
     assert capture.has_alpha
     assert (capture.view(0, 7).alpha == 7).all()
     (path / "masks/a/000.png").unlink()
-    with pytest.raises(CaptureError, match="59 masks for 60 frames"):
+    with pytest.warns(UserWarning, match="camera a is left out: .*: 59 masks for 60 frames"):
         save(a={}, b={})()
 
 

@@ -183,9 +183,8 @@ def test_the_command_finds_the_file_that_is_being_written(tmp_path, gsv):
     (tmp_path / "a.gsv.part").write_bytes(gsv.read_bytes())
     code = "from gscodec.cli import main; main()"
     command = [sys.executable, "-c", code, "play", str(tmp_path / "a.gsv"), "--no-browser"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as p:
+    with started(command) as p:
         assert "a.gsv.part plays at http://127.0.0.1:" in p.stdout.readline()
-        p.send_signal(signal.SIGINT)
 
 
 def test_the_command_refuses_what_is_no_stream(tmp_path):

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from gscodec.capture.actorshq import open_actorshq
 from gscodec.capture.capture import Capture
+from gscodec.capture.colmap import find_model, open_colmap
+from gscodec.capture.easyvolcap import open_easyvolcap
+from gscodec.capture.n3dv import open_n3dv
 from gscodec.capture.qualisys import open_qualisys
 from gscodec.capture.transforms import open_transforms
 from gscodec.errors import CaptureError
-
-LOOKED_FOR = (
-    "transforms.json or transforms_train.json (nerfstudio, instant-ngp)",
-    "calibration/*.qca.txt with videos/ (Qualisys)",
-)
 
 
 def _transforms(path: Path) -> list[tuple[Path, str]]:
@@ -31,17 +30,58 @@ def _qualisys(path: Path) -> Path | None:
     return found[0] if found else None
 
 
+def _open_qualisys(path: Path, calibration: Path) -> Capture:
+    root = path if path.is_dir() else calibration.parent
+    return open_qualisys(root.parent if root.name == "calibration" else root, calibration)
+
+
+def _file(path: Path, *names: str) -> Path | None:
+    """The first of the files `names` of the folder `path`, if all are there."""
+    return path / names[0] if all((path / n).is_file() for n in names) else None
+
+
+# layout -> what gives it away, path -> its calibration if that is there, (path, calibration) -> Capture
+LAYOUTS = {
+    "transforms": (
+        "transforms.json or transforms_train.json (nerfstudio, instant-ngp)",
+        _transforms,
+        lambda _, files: open_transforms(files),
+    ),
+    "n3dv": (
+        "poses_bounds.npy with a video for each camera (Neural 3D Video)",
+        lambda path: _file(path, "poses_bounds.npy"),
+        lambda _, poses: open_n3dv(poses),
+    ),
+    "easyvolcap": (
+        "intri.yml and extri.yml with images/ or videos/ (EasyVolcap, EasyMocap)",
+        lambda path: _file(path, "intri.yml", "extri.yml"),
+        lambda path, _: open_easyvolcap(path),
+    ),
+    "actorshq": (
+        "calibration.csv with rgbs/ (ActorsHQ)",
+        lambda path: _file(path, "calibration.csv"),
+        lambda _, calibration: open_actorshq(calibration),
+    ),
+    "qualisys": ("calibration/*.qca.txt with videos/ (Qualisys)", _qualisys, _open_qualisys),
+    "colmap": (
+        "images/ with sparse/ (COLMAP), in the folder or in one for each frame",
+        find_model,
+        lambda path, _: open_colmap(path),
+    ),
+}
+LOOKED_FOR = tuple(what for what, _, _ in LAYOUTS.values())
+
+
 def find_capture(path: Path) -> str | None:
-    """The layout of `path`, "transforms" or "qualisys"; None if it is not a capture."""
-    path = Path(path)
-    return "transforms" if _transforms(path) else "qualisys" if _qualisys(path) else None
+    """The layout of `path`, a key of `LAYOUTS`; None if it is not a capture."""
+    return next((name for name, (_, find, _) in LAYOUTS.items() if find(Path(path))), None)
 
 
 def open_capture(path: str | Path) -> Capture:
     """Opens a capture in any layout that is known.
 
     Args:
-        path: its folder, or the calibration file itself.
+        path: its folder, or the calibration file itself (transforms.json, *.qca.txt).
 
     Raises:
         CaptureError: nothing is there, the layout is unknown or the calibration or the images are unusable.
@@ -50,11 +90,9 @@ def open_capture(path: str | Path) -> Capture:
     path = Path(path)
     if not path.exists():
         raise CaptureError(f"{path}: no such file or folder, expected a capture")
-    if files := _transforms(path):
-        return open_transforms(files)
-    if calibration := _qualisys(path):
-        root = path if path.is_dir() else calibration.parent
-        return open_qualisys(root.parent if root.name == "calibration" else root, calibration)
+    for _, find, read in LAYOUTS.values():
+        if calibration := find(path):
+            return read(path, calibration)
     empty = path.is_dir() and not any(path.iterdir())
     what = "the folder is empty" if empty else "not a capture"
-    raise CaptureError(f"{path}: {what}; looked for {' and for '.join(LOOKED_FOR)}")
+    raise CaptureError(f"{path}: {what}; looked for {', for '.join(LOOKED_FOR)}")

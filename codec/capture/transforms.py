@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import warnings
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,12 +17,11 @@ import numpy as np
 
 from gscodec.camera import Camera
 from gscodec.capture.capture import Capture
-from gscodec.capture.images import SUFFIXES, View, image_size, read_image, read_mask
-from gscodec.capture.undistort import undistortion
+from gscodec.capture.images import SUFFIXES, image_size
+from gscodec.capture.rig import FPS, Feed, assemble, pinhole, usable
 from gscodec.errors import CaptureError
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")  # OpenCV's order
-FPS = 30.0  # where the file says nothing
 
 
 @dataclass
@@ -54,45 +52,15 @@ def open_transforms(files: list[tuple[Path, str]]) -> Capture:
         entries += _entries(data, path, split)
     source = files[0][0]
     times = _common_times(entries)
-    cameras, images = [], []
-    for name, own in _by_camera(entries).items():
-        try:
-            cameras.append(_camera(name, own, times))
-            by_time = {e.time: e for e in own}
-            images.append([by_time[t] for t in times])
-        except CaptureError as e:
-            warnings.warn(f"{source}: camera {name} is left out: {e}", stacklevel=3)
-            reason = str(e)
-    if not cameras:
-        raise CaptureError(f"{source}: no camera can be used; the last one: {reason}")
+
+    def make(name: str, own: list[Entry]) -> tuple[Camera, Feed]:
+        camera, by_time = _camera(name, own, times), {e.time: e for e in own}
+        return camera, Feed([by_time[t].image for t in times], [by_time[t].mask for t in times])
+
+    cameras, feeds = usable(source, _by_camera(entries), make)
     if not any(c.split == "train" for c in cameras):
         raise CaptureError(f"{source}: all {len(cameras)} cameras are test cameras, training needs split 'train' too")
-    return _capture(source.parent.resolve().name, fps, cameras, images)
-
-
-def _capture(name: str, fps: float, cameras: list[Camera], images: list[list[Entry]]) -> Capture:
-    alpha = [e[0].mask is not None or image_size(e[0].image)[2] for e in images]
-    pinholes, warps = zip(*(undistortion(c) for c in cameras), strict=True)
-
-    def read(index: int, frame: int) -> View:
-        entry, camera = images[index][frame], cameras[index]
-        view = read_image(entry.image)
-        if entry.mask is not None:
-            view = View(view.rgb, read_mask(entry.mask))
-            if view.alpha.shape != view.rgb.shape[:2]:
-                raise CaptureError(f"{entry.mask}: mask is {_size(view.alpha)}, its image {_size(view.rgb)}")
-        if view.rgb.shape[:2] != (camera.height, camera.width):
-            raise CaptureError(
-                f"{entry.image}: camera {camera.name}, frame {frame} is {_size(view.rgb)}, "
-                f"expected {camera.width}x{camera.height} as the calibration says"
-            )
-        return warps[index](view)
-
-    return Capture(name, fps, list(pinholes), len(images[0]), any(alpha), read)
-
-
-def _size(image: np.ndarray) -> str:
-    return f"{image.shape[1]}x{image.shape[0]}"
+    return assemble(source.parent.resolve().name, cameras, feeds, fps)
 
 
 def _load(path: Path) -> dict:
@@ -214,10 +182,7 @@ def _intrinsics(v: dict, width: int, height: int) -> np.ndarray:
         fy = 0.5 * height / math.tan(0.5 * float(v["camera_angle_y"])) if "camera_angle_y" in v else fx
     else:
         raise CaptureError("no focal length, expected fl_x (pixels) or camera_angle_x (radians)")
-    if not (fx > 0 and fy > 0 and math.isfinite(fx * fy)):
-        raise CaptureError(f"focal length {fx} x {fy} is not positive")
-    cx, cy = float(v.get("cx", width / 2)), float(v.get("cy", height / 2))
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return pinhole(fx, fy, float(v.get("cx", width / 2)), float(v.get("cy", height / 2)))
 
 
 def _viewmat(e: Entry) -> np.ndarray:

@@ -6,11 +6,13 @@ import json
 from pathlib import Path
 
 from gscodec.errors import UsageError, require
+from gscodec.metrics.ablation_chart import ablation_chart
 from gscodec.metrics.rd_chart import frames_chart, size_chart, time_chart
 from gscodec.metrics.speed_chart import speed_chart
 from gscodec.metrics.train_chart import train_chart
 
 CHARTS = {  # result file without .json -> chart -> function(result) that returns a matplotlib Figure
+    "ablation": {"ablation": ablation_chart},
     "raster": {"raster": speed_chart},
     "rd": {"rd_size": size_chart, "rd_time": time_chart, "rd_frames": frames_chart},
     "train": {"train": train_chart},

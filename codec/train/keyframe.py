@@ -20,6 +20,7 @@ RATES = {"quats": 2e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 5e-3
 MEANS_RATE = (1.6e-3, 1.6e-5)  # start, end, times the radius of the subject
 DENSIFY_EVERY = 100
 DENSIFY_FROM, DENSIFY_UNTIL = 0.1, 0.6  # of the steps
+EXPOSE_FROM = 0.3  # of the steps
 KEYFRAME_SHARE = 0.8  # of the Gaussians at most; the rest is for births
 GROWTH = 0.12  # share of the Gaussians that one round may add
 THINNING = 0.25  # share of the Gaussians that one round of thinning may take
@@ -92,13 +93,24 @@ def train_keyframe(
     workspace = Workspace()
     stats, losses = Statistics(len(model)), []
     model.restart()
+    views.exposure.restart()
+    views.extrinsics.restart()
+    views.extrinsics.about(model.params["means"].numpy().mean(0, dtype=np.float64), radius)
     for step in range(steps):
-        result = compare(model.params, views.draw(frame), settings, rng, workspace)
+        target = views.draw(frame)
+        result = compare(model.params, target, settings, rng, workspace)
         stats.add(result)
         losses.append(result.loss - settings.mask_lambda * result.mask)
         fade = step / max(steps - 1, 1)
         rate = radius * MEANS_RATE[0] * (MEANS_RATE[1] / MEANS_RATE[0]) ** fade
+        if step >= EXPOSE_FROM * steps:
+            views.exposure.learn(target.index, result.grad_gain, 0.1**fade)
+            arrays = [x[n].numpy() for x in (model.params, result.grads) for n in ("means", "quats")]
+            views.extrinsics.learn(target.index, views.extrinsics.gradient(*arrays), 0.1**fade)
         model.adam(result.grads, {"means": rate, **{n: r * 0.1**fade for n, r in RATES.items()}})
+        if step == int(DENSIFY_UNTIL * steps):
+            views.exposure.settle()
+            views.extrinsics.settle()
         if densify and (step + 1) % DENSIFY_EVERY == 0:
             if DENSIFY_FROM * steps < step < DENSIFY_UNTIL * steps:
                 grow(model, stats, int(KEYFRAME_SHARE * settings.gaussians_max), radius, rng)

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gscodec.camera import Camera
 from gscodec.capture import View
 from gscodec.render.step import RenderLoss, Workspace, render_loss
+from gscodec.train.calibration import Exposure, Extrinsics
 from gscodec.train.settings import TrainSettings
 
 CACHE_BYTES = 2 << 30  # of decoded targets
@@ -28,19 +30,25 @@ class Target:
         camera: pinhole camera of the crop.
         rgb: [H, W, 3] u8, unassociated.
         alpha: [H, W] u8 or None.
+        index: of the camera in the capture; gain: [3], its exposure.
     """
 
     camera: object
     rgb: np.ndarray
     alpha: np.ndarray | None
+    index: int
+    gain: np.ndarray | None = None
 
 
 class Views:
-    """The training views of a capture, `train_cameras` being their indices."""
+    """The training views of a capture, `train_cameras` being their indices; `exposure` and `extrinsics` say by how much
+    each differs from what the capture tells."""
 
     def __init__(self, capture, seed: int):
         self.capture = capture
         self.train_cameras = [i for i, c in enumerate(capture.cameras) if c.split == "train"]
+        self.exposure = Exposure(len(capture.cameras), self.train_cameras)
+        self.extrinsics = Extrinsics(len(capture.cameras), self.train_cameras)
         self._seed = seed
         self._held: OrderedDict[tuple, View | Target] = OrderedDict()
         self._bytes = 0
@@ -53,9 +61,14 @@ class Views:
 
     def target(self, camera: int, frame: int, scale: float = 1.0) -> Target:
         """View of camera index `camera` at `frame`, cropped to the subject, `scale` times its size (at most 1)."""
-        if scale == 1:
-            return self._hold((camera, frame, scale), lambda: self._cropped(camera, frame))
-        return self._hold((camera, frame, scale), lambda: shrink(self.target(camera, frame), scale))
+        load = lambda: self._cropped(camera, frame) if scale == 1 else shrink(self.target(camera, frame), scale)  # noqa: E731
+        held = self._hold((camera, frame, scale), load)
+        there = self.extrinsics.camera(camera, held.camera)
+        return replace(held, camera=there, gain=self.exposure.gain(camera))
+
+    def camera(self, index: int) -> Camera:
+        """Camera `index` of the capture where it really stands."""
+        return self.extrinsics.camera(index, self.capture.cameras[index])
 
     def _hold(self, key: tuple, load: Callable[[], View | Target]):
         """What `load` gives, which is kept as long as there is room."""
@@ -91,7 +104,7 @@ class Views:
         view, cam = self.view(camera, frame), self.capture.cameras[camera]
         h, w = view.rgb.shape[:2]
         if view.alpha is None or not view.alpha.any():
-            return Target(cam, np.ascontiguousarray(view.rgb), view.alpha)
+            return Target(cam, np.ascontiguousarray(view.rgb), view.alpha, camera)
         rows, cols = np.flatnonzero(view.alpha.any(1)), np.flatnonzero(view.alpha.any(0))
         top, bottom = max(rows[0] - MARGIN, 0), min(rows[-1] + 1 + MARGIN, h)
         left, right = max(cols[0] - MARGIN, 0), min(cols[-1] + 1 + MARGIN, w)
@@ -100,6 +113,7 @@ class Views:
             cam.cropped(left, top, right - left, bottom - top),
             np.ascontiguousarray(view.rgb[crop]),
             np.ascontiguousarray(view.alpha[crop]),
+            camera,
         )
 
 
@@ -117,6 +131,7 @@ def shrink(target: Target, scale: float) -> Target:
         target.camera.resized(*size),
         np.rint(rgb.clip(0, 255)).astype(np.uint8),
         None if target.alpha is None else np.rint(255 * small).astype(np.uint8),
+        target.index,
     )
 
 
@@ -133,6 +148,7 @@ def compare(params: dict, target: Target, settings: TrainSettings, rng, workspac
         ssim_lambda=settings.ssim_lambda,
         mask_lambda=settings.mask_lambda,
         workspace=workspace,
+        gain=target.gain,
     )
 
 

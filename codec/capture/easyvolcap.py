@@ -1,0 +1,82 @@
+"""EasyVolcap and EasyMocap -> Capture: intri.yml and extri.yml (OpenCV's), images/CAMERA/* or videos/CAMERA.mp4.
+
+World-to-camera, OpenCV axes: K_name [3, 3] in pixels with pixel centres at integers, D_name or dist_name as in OpenCV,
+Rot_name [3, 3] or R_name (a rotation vector), T_name; W_name and H_name where the calibration was of another size.
+Masks are masks/CAMERA/*.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gscodec.camera import Camera
+from gscodec.capture.capture import Capture
+from gscodec.capture.rig import Feed, assemble, find_video, numbered, pinhole, rigid, usable
+from gscodec.capture.video import Video
+from gscodec.errors import CaptureError, require
+
+
+class _Yaml:
+    """OpenCV's YAML files, which no YAML library reads."""
+
+    def __init__(self, path: Path):
+        cv2 = require("cv2", "reading calibrations")
+        try:
+            self._file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        except (cv2.error, SystemError) as e:
+            raise CaptureError(f"{path}: not a calibration file of OpenCV ({e})") from e
+        if not self._file.isOpened():
+            raise CaptureError(f"{path}: not a calibration file of OpenCV")
+
+    def names(self) -> list[str]:
+        """The list `names`; numbers may stand there without quotes."""
+        node = self._file.getNode("names")
+        items = [node.at(i) for i in range(node.size())]
+        return [i.string() if i.isString() else str(int(i.real())) for i in items]
+
+    def matrix(self, key: str, *shape: int) -> np.ndarray:
+        """Raises CaptureError where it is missing or has another shape."""
+        m = self._file.getNode(key).mat()
+        if m is None or m.size != np.prod(shape) or not np.isfinite(m).all():
+            raise CaptureError(f"{key} is missing, expected {' x '.join(map(str, shape))} finite numbers")
+        return m.reshape(shape).astype(np.float64)
+
+    def has(self, key: str) -> bool:
+        return not self._file.getNode(key).empty()
+
+    def number(self, key: str) -> int:
+        """0 where it is missing."""
+        return int(self._file.getNode(key).real())
+
+
+def open_easyvolcap(root: Path) -> Capture:
+    """Reads intri.yml and extri.yml in `root` and the images or videos beside them. All cameras are for training.
+
+    Raises:
+        CaptureError: a file is not a calibration, or no camera can be used.
+    """
+    intrinsics, extrinsics = _Yaml(root / "intri.yml"), _Yaml(root / "extri.yml")
+
+    def make(name: str, _) -> tuple[Camera, Feed]:
+        images = numbered(root / "images" / name)
+        feed = Feed(images or Video(find_video([root / "videos"], name)), numbered(root / "masks" / name))
+        return _camera(name, intrinsics, extrinsics, feed), feed
+
+    return assemble(root.resolve().name, *usable(root / "intri.yml", dict.fromkeys(intrinsics.names()), make))
+
+
+def _camera(name: str, intrinsics: _Yaml, extrinsics: _Yaml, feed: Feed) -> Camera:
+    K = intrinsics.matrix(f"K_{name}", 3, 3)
+    K = pinhole(K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
+    if extrinsics.has(f"Rot_{name}"):
+        R = extrinsics.matrix(f"Rot_{name}", 3, 3)
+    else:
+        R = require("cv2", "reading rotation vectors").Rodrigues(extrinsics.matrix(f"R_{name}", 3))[0]
+    viewmat = rigid(R, extrinsics.matrix(f"T_{name}", 3))
+    keys = [k for k in (f"D_{name}", f"dist_{name}") if intrinsics.has(k)]
+    distortion = intrinsics.matrix(keys[0], 5) if keys else np.zeros(0)
+    width = intrinsics.number(f"W_{name}") or feed.width
+    height = intrinsics.number(f"H_{name}") or feed.height
+    return Camera(name, K, viewmat, width, height, distortion)

@@ -1,0 +1,48 @@
+"""Neural 3D Video (Li et al. 2022) -> Capture: one camNN.mp4 a camera and poses_bounds.npy.
+
+A row of poses_bounds.npy (LLFF, Mildenhall et al. 2019) has a [3, 5] matrix, camera-to-world with the axes down, right
+and back, then height, width and focal length in pixels, and two depths that are not used. Rows are in the order of the
+videos' names. The first camera is the test camera, as every paper on the dataset has it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gscodec.camera import Camera
+from gscodec.capture.capture import Capture
+from gscodec.capture.rig import VIDEOS, Feed, assemble, numbered, pinhole, rigid, usable
+from gscodec.capture.video import Video
+from gscodec.errors import CaptureError
+
+
+def open_n3dv(poses: Path) -> Capture:
+    """Reads poses_bounds.npy and the videos beside it.
+
+    Raises:
+        CaptureError: the file is not an LLFF calibration, or has not one row a video, or no camera can be used.
+    """
+    try:
+        rows = np.load(poses, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as e:
+        raise CaptureError(f"{poses}: not a numpy file ({e}), expected poses_bounds.npy of LLFF") from e
+    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f" or not np.isfinite(rows).all():
+        raise CaptureError(f"{poses}: shape {list(rows.shape)}, expected 17 finite numbers for each camera (LLFF)")
+    videos = numbered(poses.parent, VIDEOS)
+    if len(videos) != len(rows):
+        raise CaptureError(f"{poses}: {len(rows)} cameras, expected as many as there are videos: {len(videos)}")
+    made = {v.stem: (row[:15].reshape(3, 5), v) for row, v in zip(rows, videos, strict=True)}
+    first = next(iter(made))
+    cameras, feeds = usable(
+        poses, made, lambda n, item: (_camera(n, item[0], "test" if n == first else "train"), Feed(Video(item[1])))
+    )
+    return assemble(poses.parent.resolve().name, cameras, feeds)
+
+
+def _camera(name: str, m: np.ndarray, split: str) -> Camera:
+    R = np.stack([m[:, 1], m[:, 0], -m[:, 2]])  # rows: the camera's axes right, down and forward, in the world
+    height, width, focal = m[:, 4]
+    K = pinhole(focal, focal, width / 2, height / 2)
+    return Camera(name, K, rigid(R, -R @ m[:, 3]), round(width), round(height), split=split)

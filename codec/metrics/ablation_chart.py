@@ -1,0 +1,33 @@
+"""bench/results/ablation.json -> what the training loses, and what it costs, without each of its losses and tools."""
+
+from __future__ import annotations
+
+WHOLE = "whole recipe"
+PANELS = {"psnr_coded": "PSNR of the decoded stream, dB", "kb_per_frame": "kB a frame", "flicker": "flicker"}
+LESS, MORE = "#1f5fb4", "#c76f14"
+
+
+def ablation_chart(result: dict):
+    """A row for each capture, bars of the difference to the whole recipe (matplotlib)."""
+    from matplotlib.figure import Figure
+
+    captures = list(dict.fromkeys(e["capture"] for e in result["entries"]))
+    most = max(sum(e["capture"] == c for e in result["entries"]) for c in captures)
+    figure = Figure(figsize=(11, len(captures) * (0.24 * most + 0.8)), layout="constrained")
+    for row, capture in zip(figure.subplots(len(captures), 3, squeeze=False), captures, strict=True):
+        entries = {e["variant"]: e for e in result["entries"] if e["capture"] == capture}
+        whole = entries.pop(WHOLE)
+        for axes, (key, label) in zip(row, PANELS.items(), strict=True):
+            change = [e[key] - whole[key] for e in entries.values()]
+            colors = [LESS if c < 0 else MORE for c in change]
+            axes.barh(list(entries), change, color=colors, height=0.7)
+            axes.axvline(0, color="#444444", linewidth=0.8)
+            axes.invert_yaxis()
+            axes.grid(axis="x", alpha=0.25)
+            axes.set(xlabel=f"change of {label} (whole recipe: {whole[key]:.2f})")
+            axes.tick_params(axis="y", length=0, labelleft=key == "psnr_coded")
+        row[0].set_title(f"{capture}, {whole['frames']} frames, {whole['preset']}", loc="left", weight="bold")
+    machine = result["machine"]
+    text = f"test cameras; {machine['cpu']}, {machine['cores']} cores; commit {result['commit']}"
+    figure.text(0.995, 0.995, text, ha="right", va="top", fontsize=7, color="#888888")
+    return figure
