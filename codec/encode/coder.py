@@ -7,6 +7,7 @@ The coder remembers the last independent group as it was coded, and where the Ga
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -30,15 +31,20 @@ class CodedGroup:
     independent: bool
 
 
-def _decoded(payload: bytes):
-    return _native.DecodedGroup(payload, len(_native.levels()))
+@dataclass(frozen=True)
+class _Payload:
+    data: bytes
+
+    @cached_property
+    def decoded(self):
+        """`_native.DecodedGroup`, made when the first group refers to it."""
+        return _native.DecodedGroup(self.data, len(_native.levels()))
 
 
 @dataclass(frozen=True)
 class _Reference:
     coded: Coded
-    decoded: object  # _native.DecodedGroup
-    payload: bytes
+    payload: _Payload
     frames: int  # of it and of the groups since
     back: int  # groups since, itself included
     index: np.ndarray  # of each Gaussian of the group before: which one it is in the reference, -1: none
@@ -63,8 +69,8 @@ class GroupCoder:
         if parents is None or r.frames + len(group) > self._random_access:
             return self._independent(group, quality)
         integers = predict_group(group, parents, r.back, r.coded, quality=quality, **self._options)
-        payload, units = _native.encode_group(integers, r.decoded)
-        if len(payload) > DOUBT * len(r.payload):
+        payload, units = _native.encode_group(integers, r.payload.decoded)
+        if len(payload) > DOUBT * len(r.payload.data):
             other = self._independent(group, quality)
             if len(other.payload) <= len(payload):
                 return other
@@ -76,7 +82,7 @@ class GroupCoder:
         payload, units = _native.encode_group(coded.integers)
         if self._random_access > len(group):
             index = np.arange(len(group.frames[0]))
-            self._reference = _Reference(coded, _decoded(payload), payload, len(group), 1, index)
+            self._reference = _Reference(coded, _Payload(payload), len(group), 1, index)
         return CodedGroup(payload, units, len(coded.source), True)
 
     def state(self) -> dict[str, np.ndarray]:
@@ -85,13 +91,13 @@ class GroupCoder:
         if r is None:
             return {}
         numbers = {"frames": np.array(r.frames), "back": np.array(r.back)}
-        return {**numbers, "index": r.index, "payload": np.frombuffer(r.payload, np.uint8), **r.coded.state()}
+        return {**numbers, "index": r.index, "payload": np.frombuffer(r.payload.data, np.uint8), **r.coded.state()}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Goes on behind the groups after which another coder had this `state`."""
         if "payload" in state:
-            payload, numbers = state["payload"].tobytes(), (int(state["frames"]), int(state["back"]))
-            self._reference = _Reference(Coded.restored(state), _decoded(payload), payload, *numbers, state["index"])
+            payload, numbers = _Payload(state["payload"].tobytes()), (int(state["frames"]), int(state["back"]))
+            self._reference = _Reference(Coded.restored(state), payload, *numbers, state["index"])
 
     def _parents(self, group: Group) -> np.ndarray | None:
         """[N] int, which Gaussian of the reference each one is, -1: none; None: nothing is known."""

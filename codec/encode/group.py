@@ -8,6 +8,7 @@ what motion leaves over. Every later stage works on the values that the decoder 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -61,6 +62,19 @@ class Stack:
         """All Gaussians as they are at frame `t`."""
         arrays = (self.means, self.quats, self.log_scales, self.logit_opacities, self.sh0, self.shN)
         return Gaussians(*(a[t] for a in arrays))
+
+    @cached_property
+    def appearance(self) -> dict[str, np.ndarray]:
+        """[T, N, C] f32 of each attribute that only adds up over time."""
+        frames, n, k, _ = self.shN.shape
+        arrays = {
+            "log_scales": self.log_scales,
+            "logit_opacities": self.logit_opacities[..., None],
+            "sh0": decorrelate(self.sh0),
+        }
+        if k:
+            arrays["shN"] = decorrelate(self.shN).reshape(frames, n, 3 * k)
+        return arrays
 
 
 def stack_group(group: Group) -> Stack:
@@ -131,19 +145,6 @@ class Grid:
         return self.origin.astype(np.float64) + self.step * integers.astype(np.float64)
 
 
-def _appearance(s: Stack) -> dict[str, np.ndarray]:
-    """[T, N, C] f32 of each attribute that only adds up over time."""
-    frames, n, k, _ = s.shN.shape
-    arrays = {
-        "log_scales": s.log_scales,
-        "logit_opacities": s.logit_opacities[..., None],
-        "sh0": decorrelate(s.sh0),
-    }
-    if k:
-        arrays["shN"] = decorrelate(s.shN).reshape(frames, n, 3 * k)
-    return arrays
-
-
 def _residual(s: Stack, channels: dict, x: np.ndarray, motion: NodeMotion | None) -> dict[str, np.ndarray]:
     """[T, N, C] f32 of each attribute: what canonical values and nodes leave over; held outside a lifetime, in which
     the nodes go on."""
@@ -156,7 +157,7 @@ def _residual(s: Stack, channels: dict, x: np.ndarray, motion: NodeMotion | None
         "means": s.means - (x[None].astype(np.float32) if motion is None else motion.carried),
         "quats": np.copysign(1, dq[..., :1]) * dq[..., 1:],
     }
-    for name, values in _appearance(s).items():
+    for name, values in s.appearance.items():
         residual[name] = values - dequantize_channels(channels[name])[None].astype(np.float32)
     return {n: s.held(r) for n, r in residual.items()}
 
@@ -278,14 +279,14 @@ def layer_of(weight: np.ndarray, layers: int) -> np.ndarray:
 
 def canonical_appearance(s: Stack) -> dict[str, np.ndarray]:
     """[N, C] f64 of each attribute that only adds up over time: the mean over the frames."""
-    return {n: v.mean(0, dtype=np.float64) for n, v in _appearance(s).items()}
+    return {n: v.mean(0, dtype=np.float64) for n, v in s.appearance.items()}
 
 
 def measure_stack(s: Stack, cameras: list[Camera] = ()) -> Importance:
     """What each Gaussian of a group matters, from its first, middle and last frame."""
     frames, count = s.means.shape[:2]
     if not count:
-        sizes = {"means": 3, "quats": 3} | {n: v.shape[2] for n, v in _appearance(s).items()}
+        sizes = {"means": 3, "quats": 3} | {n: v.shape[2] for n, v in s.appearance.items()}
         return Importance({n: np.zeros((0, c)) for n, c in sizes.items()}, np.zeros(0))
     return measure([s.frame(t) for t in sorted({0, frames // 2, frames - 1})], cameras)
 
@@ -295,7 +296,7 @@ def _steps(s: Stack, measured: Importance, error: float, nominal: Steps) -> dict
     if not len(measured.removal):
         return {n: np.full(w.shape[1], getattr(nominal, n), np.float32) for n, w in measured.weights.items()}
     middle = s.only(len(s.means) // 2)
-    values = {n: v[0] for n, v in _appearance(middle).items()}
+    values = {n: v[0] for n, v in middle.appearance.items()}
     values |= {"means": middle.means[0], "quats": middle.quats[0, :, 1:]}
     return steps_for_error(measured.weights, values, error, subject_radius(middle.means[0]))
 

@@ -1,6 +1,6 @@
 //! Payload -> group in integers (spec 3 to 12). The mirror of encode.rs.
 //!
-//! Points first, since all contexts come from them; then every other unit, in parallel. Memory is taken only for what
+//! Points first, since all contexts come from them, and beside them the nodes; then every other unit, in parallel. Memory is taken only for what
 //! the header announces and the level allows, and trajectories grow against what is left of the level's symbols.
 //! Damage (spec 3) is an error, or what is not affected is decoded and the rest stands still or takes its offsets.
 
@@ -15,7 +15,7 @@ use crate::inventory::{self, Damage};
 use crate::levels::Level;
 use crate::lifetimes;
 use crate::morton;
-use crate::neighbors::{self, Contexts, Near};
+use crate::neighbors::{self, Contexts};
 use crate::positions;
 use crate::range_coder::Decoder;
 use crate::trajectories::{self, Kind, Stop, Trajectories};
@@ -97,27 +97,22 @@ fn decode(units: &[Unit], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
     let known_layers = decoder.reference.map_or(header.layers.len(), |r| r.layers.len()); // a prefix refers to a prefix
     let count = known_layers.min(how.layers);
     let points = |k: usize| decoder.points_of_layer(k);
-    let (layers, node_positions) = rayon::join(
+    let (layers, nodes) = rayon::join(
         || (0..count).into_par_iter().map(points).collect::<Result<Vec<_>>>(),
-        || decoder.points(UnitType::NodePositions, 0, header.nodes.count),
+        || decoder.nodes(),
     );
-    let (layers, node_positions) = (layers?, node_positions?);
-    let near_nodes = neighbors::nearest(&node_positions);
-    let decode = |(i, u): (usize, &Unit)| decoder.part(i, u, &layers, &near_nodes).map(|p| p.map(|p| (i, p)));
-    let parts = units
-        .par_iter()
-        .enumerate()
-        .filter(|(_, u)| u.damage.is_none())
-        .map(decode)
+    let (layers, (node_positions, node_trajectories)) = (layers?, nodes?);
+    let mut sound: Vec<(usize, &Unit)> = units.iter().enumerate().filter(|(_, u)| u.damage.is_none()).collect();
+    sound.sort_by_key(|(_, u)| std::cmp::Reverse(u.payload.len())); // long ones first, so that threads end together
+    let parts = sound
+        .into_iter()
+        .par_bridge()
+        .map(|(i, u)| decoder.part(i, u, &layers).map(|p| p.map(|p| (i, p))))
         .collect::<Result<Vec<_>>>()?;
     let mut slots: Vec<Slot> = (0..count).map(|_| Slot::new(&header)).collect();
-    let mut node_trajectories = Trajectories::default();
     for (i, part) in parts.into_iter().flatten() {
-        let (layer, attribute) = (usize::from(units[i].layer), units[i].attribute);
-        match (part, slots.get_mut(layer)) {
-            (Part::Trajectories(t), _) if attribute.is_none() => node_trajectories = t,
-            (part, Some(slot)) => slot.place(&header, attribute, part),
-            _ => {}
+        if let Some(slot) = slots.get_mut(usize::from(units[i].layer)) {
+            slot.place(&header, units[i].attribute, part);
         }
     }
     let mut group = assemble(layers, slots, decoder.reference, &header);
@@ -199,7 +194,25 @@ impl GroupDecoder<'_> {
         Ok(survivors)
     }
 
-    fn part(&self, i: usize, unit: &Unit, layers: &[LayerPoints], near_nodes: &[Near]) -> Result<Option<Part>> {
+    /// Nodes and their motion, which need nothing of the Gaussians.
+    fn nodes(&self) -> Result<(Vec<[u32; 3]>, Trajectories)> {
+        let h = &self.header.nodes;
+        let positions = self.points(UnitType::NodePositions, 0, h.count)?;
+        let Some(i) = inventory::find(self.units, (UnitType::NodeTrajectories, 0, None)) else {
+            return Ok((positions, Trajectories::default()));
+        };
+        let (unit, near, k) = (
+            &self.units[i],
+            neighbors::nearest(&positions),
+            usize::from(h.coefficients),
+        );
+        let mut c = Decoder::new(unit.payload);
+        let t = trajectories::code(&mut c, Kind::Nodes, k, &near, &Trajectories::new(6), u64::MAX); // counted from the header
+        finish(c, t.is_ok(), i, unit)?;
+        Ok((positions, t.unwrap_or_default()))
+    }
+
+    fn part(&self, i: usize, unit: &Unit, layers: &[LayerPoints]) -> Result<Option<Part>> {
         let h = self.header;
         let Some(layer) = layers.get(usize::from(unit.layer)) else {
             return Ok(None);
@@ -226,11 +239,6 @@ impl GroupDecoder<'_> {
                 let t = trajectories::code(&mut c, Kind::Gaussians, k, near, &source, self.budget());
                 self.count(t, i, unit)?
             }
-            (Some(UnitType::NodeTrajectories), _) => {
-                let k = usize::from(h.nodes.coefficients);
-                let t = trajectories::code(&mut c, Kind::Nodes, k, near_nodes, &Trajectories::new(6), u64::MAX);
-                self.count(t, i, unit)?
-            }
             (Some(UnitType::LayerCorrection), _) => return correction(i, unit).map(Some),
             _ => return Ok(None),
         };
@@ -245,7 +253,6 @@ impl GroupDecoder<'_> {
 
     fn count(&self, t: std::result::Result<Trajectories, Stop>, i: usize, unit: &Unit) -> Result<(Part, bool)> {
         let symbols = match &t {
-            Ok(_) if unit.attribute.is_none() => 0, // nodes are counted from the header
             Ok(t) => t.symbols() as u64,
             Err(Stop::Symbols) => self.level.symbols + 1,
             Err(Stop::Broken) => return Ok((Part::Trajectories(Trajectories::default()), false)),

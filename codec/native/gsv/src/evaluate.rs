@@ -1,7 +1,7 @@
 //! Integers of a group -> f32 attributes of frame t (spec 13).
 //!
-//! Canonical values are dequantized once. A frame copies them and adds what moves: the nodes' blend where there are nodes,
-//! and the trajectories of those Gaussians that have any. Nothing is predicted from the result, so f32 will do.
+//! Canonical values are dequantized once. A frame is their copy, or what the nodes make of them where there are nodes, with
+//! the trajectories of those Gaussians that have any. Nothing is predicted from the result, so f32 will do.
 
 use crate::attributes::Attribute;
 use crate::blend::Blend;
@@ -23,6 +23,16 @@ pub struct Frame {
     pub sh_n: Vec<f32>,            // [N, K, 3]
 }
 
+/// The buffers of a frame, to be filled. Lengths are those of `Frame`.
+pub struct FrameMut<'a> {
+    pub means: &'a mut [[f32; 3]],
+    pub quats: &'a mut [[f32; 4]],
+    pub log_scales: &'a mut [f32],
+    pub logit_opacities: &'a mut [f32],
+    pub sh0: &'a mut [f32],
+    pub sh_n: &'a mut [f32],
+}
+
 /// Trajectories of one attribute, with the Gaussians that have any.
 struct Motion {
     attribute: Attribute,
@@ -34,7 +44,7 @@ struct Motion {
 /// A group made ready to be evaluated at any frame.
 pub struct Evaluator {
     group: Group,
-    canonical: Frame,
+    canonical: Frame, // means: from the origin of the grid
     motions: Vec<Motion>,
     blend: Blend,
     nodes: Vec<[f32; 3]>, // from the origin of the grid
@@ -43,26 +53,20 @@ pub struct Evaluator {
 impl Evaluator {
     pub fn new(mut group: Group) -> Evaluator {
         let h = &group.header;
-        let point = |p: &[u32; 3]| std::array::from_fn(|a| h.origin[a] + h.grid_step * p[a] as f32);
-        let nodes = group
-            .node_positions
-            .iter()
-            .map(|p| p.map(|v| h.grid_step * v as f32))
-            .collect();
-        let blend = Blend::new(&group.positions, &group.node_positions, usize::from(h.nodes.neighbors));
-        let canonical = Frame {
-            means: group.positions.iter().map(point).collect(),
-            quats: dequantized(&group, Attribute::Quats)
-                .as_chunks()
-                .0
-                .iter()
-                .map(|v| unit(*v))
-                .collect(),
-            log_scales: shifted(dequantized(&group, Attribute::LogScales), group.correction()[0]),
-            logit_opacities: shifted(dequantized(&group, Attribute::LogitOpacities), group.correction()[1]),
-            sh0: colours(dequantized(&group, Attribute::Sh0)),
-            sh_n: colours(dequantized(&group, Attribute::ShN)),
-        };
+        let place = |p: &[u32; 3]| p.map(|v| h.grid_step * v as i32 as f32); // below 2^21, and signed ones convert faster
+        let nodes = group.node_positions.iter().map(place).collect();
+        let [scales_shift, opacities_shift] = group.correction();
+        let (blend, canonical) = rayon::join(
+            || Blend::new(&group.positions, &group.node_positions, usize::from(h.nodes.neighbors)),
+            || Frame {
+                means: group.positions.par_iter().map(place).collect(),
+                quats: quaternions(&dequantized(&group, Attribute::Quats, 0.0)),
+                log_scales: dequantized(&group, Attribute::LogScales, scales_shift),
+                logit_opacities: dequantized(&group, Attribute::LogitOpacities, opacities_shift),
+                sh0: colours(dequantized(&group, Attribute::Sh0, 0.0)),
+                sh_n: colours(dequantized(&group, Attribute::ShN, 0.0)),
+            },
+        );
         let motion = |(h, coefficients): (&crate::header::TrajectoryHeader, Trajectories)| Motion {
             attribute: h.attribute,
             step: h.step,
@@ -106,53 +110,144 @@ impl Evaluator {
 
     /// Evaluates frame `t` (clamped to the group) into `frame`, whose buffers are reused.
     pub fn frame(&self, t: u16, frame: &mut Frame) {
-        frame.clone_from(&self.canonical);
+        let rest = &self.canonical;
+        frame.means.resize(rest.means.len(), [0.0; 3]);
+        frame.quats.resize(rest.quats.len(), [0.0; 4]);
+        frame.log_scales.resize(rest.log_scales.len(), 0.0);
+        frame.logit_opacities.resize(rest.logit_opacities.len(), 0.0);
+        frame.sh0.resize(rest.sh0.len(), 0.0);
+        frame.sh_n.resize(rest.sh_n.len(), 0.0);
+        let out = FrameMut {
+            means: &mut frame.means,
+            quats: &mut frame.quats,
+            log_scales: &mut frame.log_scales,
+            logit_opacities: &mut frame.logit_opacities,
+            sh0: &mut frame.sh0,
+            sh_n: &mut frame.sh_n,
+        };
+        self.frame_into(t, out);
+    }
+
+    /// Evaluates frame `t` (clamped to the group) into buffers as long as those of `Frame`.
+    pub fn frame_into(&self, t: u16, out: FrameMut) {
         let frames = self.group.header.frames;
-        let basis = basis(frames, t.min(frames - 1));
-        if self.blend.per > 0 {
-            self.move_with_nodes(&basis, frame);
-        }
-        let mut values = [
-            (Attribute::Means, frame.means.as_flattened_mut()),
-            (Attribute::LogScales, &mut frame.log_scales),
-            (Attribute::LogitOpacities, &mut frame.logit_opacities),
-            (Attribute::Quats, frame.quats.as_flattened_mut()),
-            (Attribute::Sh0, &mut frame.sh0),
-            (Attribute::ShN, &mut frame.sh_n),
+        let basis = &basis(frames, t.min(frames - 1))[..];
+        let rest = &self.canonical;
+        let still = [
+            (Attribute::LogScales, &rest.log_scales, out.log_scales),
+            (Attribute::LogitOpacities, &rest.logit_opacities, out.logit_opacities),
+            (Attribute::Sh0, &rest.sh0, out.sh0),
+            (Attribute::ShN, &rest.sh_n, out.sh_n),
         ];
-        values.par_iter_mut().for_each(|(attribute, values)| {
-            let Some(m) = self.motions.iter().find(|m| m.attribute == *attribute) else {
-                return;
-            };
-            if *attribute == Attribute::Quats {
-                m.turn(&basis, values.as_chunks_mut().0);
-            } else {
-                m.add(&basis, values, m.coefficients.channels);
-            }
-        });
+        let (means, quats) = (out.means, out.quats);
+        rayon::join(
+            || {
+                self.move_with_nodes(basis, means, quats);
+                let motion = |a| self.motions.iter().find(|m| m.attribute == a);
+                rayon::join(
+                    || motion(Attribute::Quats).map(|m| m.turn(basis, quats)),
+                    || motion(Attribute::Means).map(|m| m.add(basis, means.as_flattened_mut(), 3)),
+                );
+            },
+            || {
+                still.into_par_iter().for_each(|(attribute, rest, values)| {
+                    values.iter_mut().zip(rest).for_each(|(v, r)| *v = *r);
+                    if let Some(m) = self.motions.iter().find(|m| m.attribute == attribute) {
+                        m.add(basis, values, m.coefficients.channels);
+                    }
+                });
+            },
+        );
     }
 
     /// Spec 13.3.
-    fn move_with_nodes(&self, basis: &[f32], frame: &mut Frame) {
-        let h = &self.group.header.nodes;
+    fn move_with_nodes(&self, basis: &[f32], means: &mut [[f32; 3]], quats: &mut [Quat]) {
+        let (h, origin) = (&self.group.header.nodes, self.group.header.origin);
         let pose = |(j, n): (usize, &[f32; 3])| {
             let [rx, ry, rz, tx, ty, tz] = transform(self.group.node_trajectories.get(j), 6, basis);
             let q = from_rotation_vector([rx, ry, rz].map(|v| v * h.rotation_step));
             pose(q, *n, [tx, ty, tz].map(|v| v * h.translation_step))
         };
         let poses: Vec<Pose> = self.nodes.iter().enumerate().map(pose).collect();
-        let aligned = poses.iter().all(|p| p[12] > std::f32::consts::FRAC_1_SQRT_2); // each within 45 degrees of 1 (in 4D)
-        let (per, origin, step) = (self.blend.per, self.group.header.origin, self.group.header.grid_step);
-        let near = self.blend.index.par_chunks(per).zip(self.blend.weight.par_chunks(per));
-        let out = frame.means.par_iter_mut().zip(&mut frame.quats);
-        let rest = near.zip(&self.group.positions);
-        out.zip(rest)
-            .with_min_len(2048)
-            .for_each(|((x, q), ((index, weight), p))| {
-                let (moved, turn) = blended(p.map(|v| step * v as f32), &poses, aligned, index, weight);
-                *x = std::array::from_fn(|a| origin[a] + moved[a]);
-                *q = multiply(turn, *q);
+        let moving = Moving {
+            aligned: poses.iter().all(|p| p[4][0] > std::f32::consts::FRAC_1_SQRT_2), // each within 45 degrees of 1 (in 4D)
+            origin,
+            poses,
+        };
+        let (rest, per) = (&self.canonical, self.blend.per);
+        let out = means.par_chunks_mut(RUN).zip(quats.par_chunks_mut(RUN));
+        let rest = rest.means.par_chunks(RUN).zip(rest.quats.par_chunks(RUN));
+        if per == 0 {
+            out.zip(rest).for_each(|((x, q), (x0, q0))| {
+                x.iter_mut().zip(x0).for_each(|(x, x0)| *x = add(origin, *x0));
+                q.iter_mut().zip(q0).for_each(|(q, q0)| *q = *q0);
             });
+            return;
+        }
+        let blend = self
+            .blend
+            .index
+            .par_chunks(RUN * per)
+            .zip(self.blend.weight.par_chunks(RUN * per));
+        out.zip(rest).zip(blend).for_each(|((out, rest), (index, weight))| {
+            if per == 4 {
+                moving.run(
+                    out,
+                    rest,
+                    index.as_chunks::<4>().0.iter().zip(weight.as_chunks::<4>().0),
+                );
+            } else {
+                moving.run(out, rest, index.chunks(per).zip(weight.chunks(per)));
+            }
+        });
+    }
+}
+
+/// Gaussians of one task.
+const RUN: usize = 2048;
+
+/// All nodes at one frame.
+struct Moving {
+    poses: Vec<Pose>,
+    /// No two quaternions of `poses` are more than a right angle apart.
+    aligned: bool,
+    origin: [f32; 3],
+}
+
+impl Moving {
+    /// Means and quaternions of Gaussians that rest where `rest` says, by the nodes and weights of each.
+    #[inline]
+    fn run<I: AsRef<[u32]>, W: AsRef<[f32]>>(
+        &self,
+        out: (&mut [[f32; 3]], &mut [Quat]),
+        rest: (&[[f32; 3]], &[Quat]),
+        blend: impl Iterator<Item = (I, W)>,
+    ) {
+        let (out, rest) = (out.0.iter_mut().zip(out.1), rest.0.iter().zip(rest.1));
+        for (((x, q), (x0, q0)), (index, weight)) in out.zip(rest).zip(blend) {
+            let (moved, turn) = self.blended(*x0, index.as_ref(), weight.as_ref());
+            (*x, *q) = (add(self.origin, moved), multiply(turn, *q0));
+        }
+    }
+
+    #[inline(always)]
+    fn blended(&self, x: [f32; 3], index: &[u32], weight: &[f32]) -> ([f32; 3], Quat) {
+        let pose = |j: &u32| self.poses.get(*j as usize).unwrap_or(&REST);
+        let first = index.first().map_or(&REST, pose);
+        let mut sum: Pose = [[0.0; 4]; 5];
+        for (p, w) in index.iter().map(pose).zip(weight) {
+            sum.iter_mut().zip(p).for_each(|(s, p)| *s = plus(*s, *w, *p));
+            if !self.aligned && dot(p[4], first[4]) < 0.0 {
+                sum[4] = plus(sum[4], -2.0 * w, p[4]);
+            }
+        }
+        let [r0, r1, r2, shift, q] = sum;
+        let [x, y, z, _] = plus(plus(plus(shift, x[0], r0), x[1], r1), x[2], r2);
+        let length = dot(q, q).sqrt();
+        if length < 1e-12 {
+            return ([x, y, z], first[4]);
+        }
+        ([x, y, z], q.map(|v| v / length))
     }
 }
 
@@ -179,73 +274,73 @@ impl Motion {
         for &i in &self.moving {
             let d: [f32; 3] = transform(self.coefficients.get(i as usize), 3, basis);
             if let Some(q) = quats.get_mut(i as usize) {
-                *q = normalize(multiply(unit(d.map(|v| v * self.step)), *q));
+                *q = normalize(multiply(with_real_part(d.map(|v| v * self.step)), *q));
             }
         }
     }
 }
 
-/// Motion of one node at frame t, places counted from the origin of the grid: three rows of four, x -> R (x - n) + n + T, then the quaternion of R. One array, so that a
-/// blend is a weighted sum of arrays.
-type Pose = [f32; 16];
+/// Motion of one node at frame t, places counted from the origin of the grid: x -> R (x - n) + n + T as the columns of R and what is
+/// added, and the quaternion of R. All of four numbers, so that a blend is a weighted sum of what registers hold.
+type Pose = [[f32; 4]; 5];
+const REST: Pose = [
+    [1.0, 0.0, 0.0, 0.0],
+    [0.0, 1.0, 0.0, 0.0],
+    [0.0, 0.0, 1.0, 0.0],
+    [0.0; 4],
+    [1.0, 0.0, 0.0, 0.0],
+];
 
 fn pose(q: Quat, centre: [f32; 3], shift: [f32; 3]) -> Pose {
-    let mut p = [0.0; 16];
+    let mut p = REST;
     for (a, row) in matrix(q).into_iter().enumerate() {
-        p[4 * a..4 * a + 3].copy_from_slice(&row);
-        p[4 * a + 3] = centre[a] + shift[a] - (0..3).map(|b| row[b] * centre[b]).sum::<f32>();
+        (0..3).for_each(|b| p[b][a] = row[b]);
+        p[3][a] = centre[a] + shift[a] - (0..3).map(|b| row[b] * centre[b]).sum::<f32>();
     }
-    p[12..].copy_from_slice(&q);
+    p[4] = q;
     p
 }
 
-/// `aligned`: no two quaternions of `poses` are more than a right angle apart.
+/// a + w b
 #[inline]
-fn blended(x: [f32; 3], poses: &[Pose], aligned: bool, index: &[u32], weight: &[f32]) -> ([f32; 3], Quat) {
-    let first = index.first().and_then(|j| poses.get(*j as usize));
-    let Some(first) = first else {
-        return (x, [1.0, 0.0, 0.0, 0.0]);
-    };
-    let mut sum = [0.0; 16];
-    for (p, w) in index.iter().filter_map(|j| poses.get(*j as usize)).zip(weight) {
-        (0..16).for_each(|a| sum[a] += w * p[a]);
-        if !aligned && (12..16).map(|a| p[a] * first[a]).sum::<f32>() < 0.0 {
-            (12..16).for_each(|a| sum[a] -= 2.0 * w * p[a]);
-        }
-    }
-    let moved =
-        std::array::from_fn(|a| sum[4 * a] * x[0] + sum[4 * a + 1] * x[1] + sum[4 * a + 2] * x[2] + sum[4 * a + 3]);
-    let length = (12..16).map(|a| sum[a] * sum[a]).sum::<f32>().sqrt();
-    let (from, scale) = if length < 1e-12 {
-        (first, 1.0)
-    } else {
-        (&sum, 1.0 / length)
-    };
-    (moved, std::array::from_fn(|a| scale * from[12 + a]))
+fn plus(a: [f32; 4], w: f32, b: [f32; 4]) -> [f32; 4] {
+    std::array::from_fn(|i| a[i] + w * b[i])
 }
 
-/// offset + step * integer, C per Gaussian; empty if the group lacks the attribute.
-fn dequantized(group: &Group, a: Attribute) -> Vec<f32> {
+fn dot(a: [f32; 4], b: [f32; 4]) -> f32 {
+    (0..4).map(|i| a[i] * b[i]).sum()
+}
+
+fn add(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
+    [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
+}
+
+/// offset + step * integer + shift, C per Gaussian; empty if the group lacks the attribute.
+///
+/// `shift` makes up for the layers behind that are not there (spec 10.2).
+fn dequantized(group: &Group, a: Attribute, shift: f32) -> Vec<f32> {
     let at = group.header.attributes().iter().position(|b| *b == a);
     let Some((values, scale)) = at.and_then(|k| Some((group.channels.get(k)?, group.header.scales.get(k)?))) else {
         return Vec::new();
     };
     let scales: Vec<(f32, f32)> = scale.steps.iter().copied().zip(scale.offsets.iter().copied()).collect();
-    let rows = values.chunks(scales.len().max(1));
-    rows.flat_map(|row| {
-        row.iter()
-            .zip(&scales)
-            .map(|(v, (step, offset))| offset + step * *v as f32)
-    })
-    .collect()
+    let mut out = vec![0.0; values.len()];
+    let channels = scales.len().max(1);
+    let rows = RUN * channels;
+    out.par_chunks_mut(rows)
+        .zip(values.par_chunks(rows))
+        .for_each(|(out, values)| {
+            for (out, row) in out.chunks_mut(channels).zip(values.chunks(channels)) {
+                for ((out, v), (step, offset)) in out.iter_mut().zip(row).zip(&scales) {
+                    *out = offset + step * *v as f32 + shift;
+                }
+            }
+        });
+    out
 }
 
-/// Spec 10.2: makes up for the layers behind that are not there.
-fn shifted(mut values: Vec<f32>, by: f32) -> Vec<f32> {
-    if by != 0.0 {
-        values.iter_mut().for_each(|v| *v += by);
-    }
-    values
+fn quaternions(vectors: &[f32]) -> Vec<Quat> {
+    vectors.as_chunks().0.par_iter().map(|v| unit(*v)).collect()
 }
 
 fn colours(mut values: Vec<f32>) -> Vec<f32> {
@@ -272,21 +367,32 @@ fn basis(frames: u16, t: u16) -> Vec<f32> {
 /// Sum over frequencies, per channel; the channels that an attribute lacks are 0.
 fn transform<const C: usize>(coefficients: &[i32], channels: usize, basis: &[f32]) -> [f32; C] {
     let mut sum = [0.0; C];
-    for (row, b) in coefficients.chunks(channels.max(1)).zip(basis) {
-        row.iter().zip(&mut sum).for_each(|(v, s)| *s += *v as f32 * b);
+    let mut add = |row: &[i32], b: &f32| row.iter().zip(&mut sum).for_each(|(v, s)| *s += *v as f32 * b);
+    if channels == C {
+        let rows = coefficients.as_chunks::<C>().0; // of a length that the compiler knows
+        rows.iter().zip(basis).for_each(|(row, b)| add(row, b));
+    } else {
+        let rows = coefficients.chunks(channels.max(1));
+        rows.zip(basis).for_each(|(row, b)| add(row, b));
     }
     sum
 }
 
 fn unit(v: [f32; 3]) -> Quat {
+    normalize(with_real_part(v))
+}
+
+/// A unit quaternion, unless `v` is longer than 1.
+fn with_real_part(v: [f32; 3]) -> Quat {
     let w = (1.0 - v.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
-    normalize([w, v[0], v[1], v[2]])
+    [w, v[0], v[1], v[2]]
 }
 
 fn normalize(q: Quat) -> Quat {
     let length = q.iter().map(|v| v * v).sum::<f32>().sqrt();
     if length > 0.0 {
-        q.map(|v| v / length)
+        let scale = 1.0 / length;
+        q.map(|v| scale * v)
     } else {
         [1.0, 0.0, 0.0, 0.0]
     }
@@ -319,11 +425,10 @@ fn matrix([w, x, y, z]: Quat) -> [[f32; 3]; 3] {
 }
 
 /// Hamilton product.
+#[inline]
 fn multiply([aw, ax, ay, az]: Quat, [bw, bx, by, bz]: Quat) -> Quat {
-    [
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    ]
+    let sum = plus([0.0; 4], aw, [bw, bx, by, bz]);
+    let sum = plus(sum, ax, [-bx, bw, -bz, by]);
+    let sum = plus(sum, ay, [-by, bz, bw, -bx]);
+    plus(sum, az, [-bz, -by, bx, bw])
 }

@@ -1,7 +1,7 @@
 //! The nodes nearest to points (spec 13.2), exactly: a run of points shares the few nodes that can be near any of them.
 //!
 //! Gaussians come in Morton order, so runs are compact. A node is of interest to a run if it is no farther from the box around
-//! it than enough nodes are from every point of the box. Where a hostile file makes boxes useless (all nodes on a sphere, all
+//! it than enough nodes are from every point of the box; the same again for the short runs of which it consists. Where a hostile file makes boxes useless (all nodes on a sphere, all
 //! Gaussians around its centre) that is all nodes for all points, which the level caps (spec 5).
 //! Coordinates are below 2^21: sums of squares of their differences are exact in f64, which vectorizes.
 
@@ -12,33 +12,56 @@ const FAR: Key = (u64::MAX, u32::MAX);
 /// Most neighbours that are asked for: one more than there are weights.
 const NEAREST_MAX: usize = NEIGHBORS_MAX + 1;
 
-/// Coordinates of nodes, axis by axis.
+/// Points of a short run.
+const SHORT: usize = 16;
+
+/// Coordinates of nodes, axis by axis, and their numbers.
 #[derive(Default)]
-struct Nodes([Vec<f64>; 3]);
+struct Nodes {
+    axes: [Vec<f64>; 3],
+    index: Vec<u32>,
+}
 
 impl Nodes {
-    fn new(nodes: impl Iterator<Item = [f64; 3]>) -> Nodes {
-        let mut out = Nodes::default();
-        for n in nodes {
-            out.0.iter_mut().zip(n).for_each(|(axis, v)| axis.push(v));
-        }
-        out
-    }
-
-    fn get(&self, j: usize) -> [f64; 3] {
-        [0, 1, 2].map(|a| self.0[a][j])
+    fn push(&mut self, place: [f64; 3], index: u32) {
+        self.axes.iter_mut().zip(place).for_each(|(axis, v)| axis.push(v));
+        self.index.push(index);
     }
 
     /// Sums over the axes of the squares of `f` into `out`.
     #[inline]
     fn sums(&self, out: &mut Vec<f64>, f: impl Fn(usize, f64) -> f64) {
         out.clear();
-        out.resize(self.0[0].len(), 0.0);
-        for (a, axis) in self.0.iter().enumerate() {
+        out.resize(self.index.len(), 0.0);
+        for (a, axis) in self.axes.iter().enumerate() {
             for (sum, v) in out.iter_mut().zip(axis) {
                 let d = f(a, *v);
                 *sum += d * d;
             }
+        }
+    }
+
+    /// Into `few` those among which the `count` nearest to each of `points` are. `d`: space for distances.
+    fn near(&self, points: &[[u32; 3]], count: usize, d: &mut Vec<f64>, few: &mut Nodes) {
+        let bounds = |a: usize| {
+            points
+                .iter()
+                .fold((u32::MAX, 0), |(l, h), p| (l.min(p[a]), h.max(p[a])))
+        };
+        let box_ = [0, 1, 2].map(bounds).map(|(l, h)| (f64::from(l), f64::from(h)));
+        self.sums(d, |a, v| (v - box_[a].0).abs().max((v - box_[a].1).abs()));
+        let mut farthest = [f64::INFINITY; NEAREST_MAX];
+        for d in d.iter() {
+            if *d < farthest[count - 1] {
+                insert(&mut farthest[..count], *d);
+            }
+        }
+        let reach = farthest[count - 1];
+        self.sums(d, |a, v| (box_[a].0 - v).max(v - box_[a].1).max(0.0));
+        few.axes.iter_mut().for_each(Vec::clear);
+        few.index.clear();
+        for (i, _) in d.iter().enumerate().filter(|(_, d)| **d <= reach) {
+            few.push([0, 1, 2].map(|a| self.axes[a][i]), self.index[i]);
         }
     }
 }
@@ -51,8 +74,10 @@ pub struct NodeSearch {
 impl NodeSearch {
     /// For the `count` nearest, 1 to `NEIGHBORS_MAX + 1`.
     pub fn new(nodes: &[[u32; 3]], count: usize) -> Self {
+        let mut all = Nodes::default();
+        nodes.iter().zip(0..).for_each(|(n, i)| all.push(n.map(f64::from), i));
         NodeSearch {
-            nodes: Nodes::new(nodes.iter().map(|n| n.map(f64::from))),
+            nodes: all,
             count: count.clamp(1, NEAREST_MAX),
         }
     }
@@ -60,36 +85,21 @@ impl NodeSearch {
     /// Calls `found` with the nearest nodes of each point by (squared distance, index); places beyond the number of nodes hold
     /// the maximum.
     pub fn run(&self, points: &[[u32; 3]], mut found: impl FnMut(&[Key])) {
-        let bounds = |a: usize| {
-            points
-                .iter()
-                .fold((u32::MAX, 0), |(l, h), p| (l.min(p[a]), h.max(p[a])))
-        };
-        let box_ = [0, 1, 2].map(bounds).map(|(l, h)| (f64::from(l), f64::from(h)));
-        let mut d = Vec::new();
-        self.nodes
-            .sums(&mut d, |a, v| (v - box_[a].0).abs().max((v - box_[a].1).abs()));
-        let mut farthest = [f64::INFINITY; NEAREST_MAX];
-        for d in &d {
-            if *d < farthest[self.count - 1] {
-                insert(&mut farthest[..self.count], *d);
-            }
-        }
-        let reach = farthest[self.count - 1];
-        self.nodes
-            .sums(&mut d, |a, v| (box_[a].0 - v).max(v - box_[a].1).max(0.0));
-        let near: Vec<u32> = (0u32..).zip(&d).filter(|(_, d)| **d <= reach).map(|(j, _)| j).collect();
-        let few = Nodes::new(near.iter().map(|j| self.nodes.get(*j as usize)));
-        for p in points {
-            let p = p.map(f64::from);
-            few.sums(&mut d, |a, v| v - p[a]);
-            let mut best = [FAR; NEAREST_MAX];
-            for (d, j) in d.iter().zip(&near) {
-                if *d < best[self.count - 1].0 as f64 {
-                    insert(&mut best[..self.count], (*d as u64, *j));
+        let (mut d, mut some, mut few) = (Vec::new(), Nodes::default(), Nodes::default());
+        self.nodes.near(points, self.count, &mut d, &mut some);
+        for points in points.chunks(SHORT) {
+            some.near(points, self.count, &mut d, &mut few);
+            for p in points {
+                let p = p.map(f64::from);
+                few.sums(&mut d, |a, v| v - p[a]);
+                let mut best = [FAR; NEAREST_MAX];
+                for (d, j) in d.iter().zip(&few.index) {
+                    if *d < best[self.count - 1].0 as f64 {
+                        insert(&mut best[..self.count], (*d as u64, *j));
+                    }
                 }
+                found(&best[..self.count]);
             }
-            found(&best[..self.count]);
         }
     }
 }

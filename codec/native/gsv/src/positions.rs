@@ -37,8 +37,13 @@ impl Node {
     }
 }
 
-/// Points per child (bit 2: half along x, bit 1: y, bit 0: z), at most 255, as contexts see them.
-type Seen = [u8; 8];
+/// Points per child (bit 2: half along x, bit 1: y, bit 0: z), at most 255, as contexts see them: byte k is child k.
+type Seen = u64;
+
+/// `count` points of child `k`.
+fn seen(k: usize, count: u32) -> Seen {
+    u64::from(count.min(255)) << (8 * k)
+}
 
 /// Where the children of a node are in the next level.
 #[derive(Clone, Copy, Default)]
@@ -84,28 +89,32 @@ struct Coder<'a, C> {
 impl<C: Bins> Coder<'_, C> {
     /// Splits the nodes of one level, of which `rest` bits an axis are unknown; the next level.
     fn level(&mut self, level: &[Node], points: &[u64], rest: u32, out: &mut Vec<u64>) -> Vec<Node> {
-        let mut seen: Vec<Seen> = Vec::with_capacity(level.len());
+        let mut known: Vec<Seen> = Vec::with_capacity(level.len());
         let mut children: Vec<Children> = Vec::with_capacity(level.len());
         let mut next = Vec::with_capacity(level.len() * 2);
         for node in level {
             if !self.c.alive() {
                 break;
             }
-            let (first, mut mask, mut mine) = (next.len() as u32, 0, [0; 8]);
+            let (first, mut mask, mut mine) = (next.len() as u32, 0, 0);
             if node.count == 1 && node.occupied() == 0 {
-                let known = points.get(node.start as usize).copied().unwrap_or(0);
-                out.push(node.code << (3 * rest) | self.c.bits(known & ((1 << (3 * rest)) - 1), 3 * rest));
+                let point = points.get(node.start as usize).copied().unwrap_or(0);
+                out.push(node.code << (3 * rest) | self.c.bits(point & ((1 << (3 * rest)) - 1), 3 * rest));
+            } else if node.count == 1 {
+                let k = Split::new(node, level, &known, points, rest).child(self);
+                (mine, mask) = (seen(k, 1), 1 << k);
+                next.push(Node::new(node.code << 3 | k as u64, 1, node.start));
             } else {
                 let mut start = node.start;
-                let counts = Split::new(node, level, &seen, points, rest).children(self);
+                let counts = Split::new(node, level, &known, points, rest).children(self);
                 for (k, &n) in counts.iter().enumerate().filter(|(_, n)| **n > 0) {
-                    mine[k] = n.min(255) as u8;
+                    mine |= seen(k, n);
                     mask |= 1 << k;
                     next.push(Node::new(node.code << 3 | k as u64, n, start));
                     start += n;
                 }
             }
-            seen.push(mine);
+            known.push(mine);
             children.push(Children { first, mask });
         }
         link(level, &children, &mut next);
@@ -125,7 +134,7 @@ struct Split {
 }
 
 impl Split {
-    fn new(node: &Node, level: &[Node], seen: &[Seen], points: &[u64], rest: u32) -> Split {
+    fn new(node: &Node, level: &[Node], known: &[Seen], points: &[u64], rest: u32) -> Split {
         let mut want = [0; 8];
         let mine = points
             .get(node.start as usize..)
@@ -135,9 +144,9 @@ impl Split {
         }
         Split {
             want,
-            lower: node.lower.map(|q| seen.get(q as usize).copied().unwrap_or([0; 8])),
+            lower: node.lower.map(|q| known.get(q as usize).copied().unwrap_or(0)),
             upper: node.upper.map(|q| level.get(q as usize).map_or(0, |n| n.count)),
-            own: [0; 8],
+            own: 0,
             count: node.count,
             occupied: node.occupied(),
             depth: (rest as usize - 1).min(7),
@@ -148,40 +157,66 @@ impl Split {
     fn children<C: Bins>(mut self, coder: &mut Coder<C>) -> [u32; 8] {
         let mut counts = [0; 8];
         let [lx, ly, lz] = self.lower;
-        let c = context(halves(&ly, 4, 0), halves(&lz, 4, 0), sum(&lx, 4, 4), self.upper[0]);
+        let c = context(halves(ly, 4, 0), halves(lz, 4, 0), sum(lx, 4, 4), self.upper[0]);
         let low = self.split(coder, 4, 0, self.count, c, 0);
         for (x, n) in [(0, low), (4, self.count - low)].into_iter().filter(|(_, n)| *n > 0) {
             let sx = if x == 0 {
-                halves(&lx, 2, 4)
+                halves(lx, 2, 4)
             } else {
-                halves(&self.own, 2, 0)
+                halves(self.own, 2, 0)
             };
-            let c = context(sx, halves(&lz, 2, x), sum(&ly, 6, x | 2), self.upper[1]);
+            let c = context(sx, halves(lz, 2, x), sum(ly, 6, x | 2), self.upper[1]);
             let low = self.split(coder, 6, x, n, c, 1);
             for (y, n) in [(0, low), (2, n - low)].into_iter().filter(|(_, n)| *n > 0) {
                 let k = x | y;
                 let sx = if x == 0 {
-                    halves(&lx, 1, 4 | y)
+                    halves(lx, 1, 4 | y)
                 } else {
-                    halves(&self.own, 1, y)
+                    halves(self.own, 1, y)
                 };
                 let sy = if y == 0 {
-                    halves(&ly, 1, k | 2)
+                    halves(ly, 1, k | 2)
                 } else {
-                    halves(&self.own, 1, x)
+                    halves(self.own, 1, x)
                 };
-                let c = context(sx, sy, u32::from(lz[k | 1]), self.upper[2]);
+                let c = context(sx, sy, sum(lz, 7, k | 1), self.upper[2]);
                 let low = self.split(coder, 7, k, n, c, 2);
                 (counts[k], counts[k | 1]) = (low, n - low);
-                (self.own[k], self.own[k | 1]) = (low.min(255) as u8, (n - low).min(255) as u8);
+                self.own |= seen(k, low) | seen(k | 1, n - low);
             }
         }
         counts
     }
 
+    /// What `children` does for a single point, which most nodes have: where it is, without branches on what cannot be foreseen.
+    fn child<C: Bins>(self, coder: &mut Coder<C>) -> usize {
+        let [lx, ly, lz] = self.lower;
+        let c = context(halves(ly, 4, 0), halves(lz, 4, 0), sum(lx, 4, 4), self.upper[0]);
+        let x = 4 * self.upper_half(coder, 4, 0, c, 0);
+        let sx = halves(lx, 2, 4) * usize::from(x == 0);
+        let c = context(sx, halves(lz, 2, x), sum(ly, 6, x | 2), self.upper[1]);
+        let y = 2 * self.upper_half(coder, 6, x, c, 1);
+        let k = x | y;
+        let sx = halves(lx, 1, 4 | y) * usize::from(x == 0);
+        let sy = halves(ly, 1, k | 2) * usize::from(y == 0);
+        let c = context(sx, sy, sum(lz, 7, k | 1), self.upper[2]);
+        k | self.upper_half(coder, 7, k, c, 2)
+    }
+
+    /// 0 or 1: in which half the only point is.
+    #[inline(always)]
+    fn upper_half<C: Bins>(&self, coder: &mut Coder<C>, mask: usize, half: usize, c: usize, axis: usize) -> usize {
+        1 - self.split(coder, mask, half, 1, c, axis) as usize
+    }
+
     /// Of `n` points, how many lie in the lower half: the children k with k & mask = half.
+    #[inline(always)]
     fn split<C: Bins>(&self, coder: &mut Coder<C>, mask: usize, half: usize, n: u32, c: usize, axis: usize) -> u32 {
-        let want: u32 = (0..8).filter(|k| k & mask == half).map(|k| self.want[k]).sum();
+        let want = if C::DECODES {
+            0
+        } else {
+            (0..8).filter(|k| k & mask == half).map(|k| self.want[k]).sum()
+        };
         let bucket = if n <= 8 {
             n as usize - 1
         } else {
@@ -204,23 +239,39 @@ impl Split {
     }
 }
 
+/// Bytes of the children k with k & mask = half, at mask * 8 + half.
+const CHILDREN: [u64; 64] = {
+    let mut table = [0; 64];
+    let mut at = 0;
+    while at < 64 {
+        let (mask, half, mut k) = (at / 8, at % 8, 0);
+        while k < 8 {
+            if k & mask == half {
+                table[at] |= 0xFF << (8 * k);
+            }
+            k += 1;
+        }
+        at += 1;
+    }
+    table
+};
+
 /// Points of the children whose bits under `mask` are `half`.
 #[inline]
-fn sum(seen: &Seen, mask: usize, half: usize) -> u32 {
-    (0..8).filter(|k| k & mask == half).map(|k| u32::from(seen[k])).sum()
+fn sum(seen: Seen, mask: usize, half: usize) -> u32 {
+    const EVEN: u64 = 0x00FF_00FF_00FF_00FF;
+    let own = seen & CHILDREN[(mask * 8 + half) & 63];
+    let pairs = (own & EVEN) + (own >> 8 & EVEN);
+    (pairs.wrapping_mul(0x0001_0001_0001_0001) >> 48) as u32
 }
 
 /// On which side of the axis `bit` a neighbour has more points, of the part of it given by the bits above `bit`:
 /// 0: it has none, 1: on the low side, 2: on the high side, 3: as many.
 #[inline]
-fn halves(seen: &Seen, bit: usize, part: usize) -> usize {
+fn halves(seen: Seen, bit: usize, part: usize) -> usize {
     let mask = [7, 7, 6, 6, 4][bit]; // the axis and those split before it
-    match (sum(seen, mask, part), sum(seen, mask, part | bit)) {
-        (0, 0) => 0,
-        (l, h) if l > h => 1,
-        (l, h) if l < h => 2,
-        _ => 3,
-    }
+    let (low, high) = (sum(seen, mask, part), sum(seen, mask, part | bit));
+    usize::from(low + high > 0) * (usize::from(low >= high) + 2 * usize::from(low <= high))
 }
 
 #[inline]

@@ -151,12 +151,9 @@ impl Bins for Decoder<'_> {
     fn bin(&mut self, _: bool, p: u32) -> bool {
         let bound = ((u64::from(self.range) * u64::from(p)) >> 16) as u32;
         let bin = self.code < bound;
-        if bin {
-            self.range = bound;
-        } else {
-            self.range -= bound;
-            self.code -= bound;
-        }
+        let (range, code) = (self.range - bound, self.code.wrapping_sub(bound));
+        self.range = std::hint::select_unpredictable(bin, bound, range);
+        self.code = std::hint::select_unpredictable(bin, self.code, code);
         while self.range < TOP {
             self.range <<= 8;
             self.code = self.code << 8 | self.byte();

@@ -3,7 +3,7 @@
 use super::values::{bytes_of, raise};
 use gsv::attributes::sh_coefficients;
 use gsv::decode::{Decoding, decode_damaged, decode_group};
-use gsv::evaluate::{Evaluator, Frame};
+use gsv::evaluate::{Evaluator, FrameMut};
 use gsv::group::{BIRTH, Group};
 use gsv::inventory::Damage;
 use gsv::levels::Level;
@@ -14,7 +14,7 @@ use numpy::ndarray::{Array2, Array3};
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods};
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
-use pyo3::types::{PyDict, PyList};
+use pyo3::types::{PyDict, PyList, PySlice};
 
 /// A decoded group: integers, and f32 attributes of any frame.
 #[pyclass(frozen, module = "gscodec._native")]
@@ -102,21 +102,43 @@ impl DecodedGroup {
         integers(py, &self.evaluator)
     }
 
-    /// Attributes of frame `t` of all Gaussians, f32.
+    /// Attributes of frame `t` of all Gaussians, f32: views of one array, since few large pages are had faster than many small ones.
     fn frame<'py>(&self, py: Python<'py>, t: u16) -> PyResult<Bound<'py, PyDict>> {
         self.check(t)?;
-        let mut frame = Frame::default();
-        py.detach(|| self.evaluator.frame(t, &mut frame));
-        let n = self.count();
-        let k = sh_coefficients(self.sh_degree());
-        let d = PyDict::new(py);
-        let flat = |v: Vec<[f32; 3]>| v.into_flattened().into_pyarray(py).reshape([n, 3]);
-        d.set_item("means", flat(frame.means)?)?;
-        d.set_item("quats", frame.quats.into_flattened().into_pyarray(py).reshape([n, 4])?)?;
-        d.set_item("log_scales", frame.log_scales.into_pyarray(py).reshape([n, 3])?)?;
-        d.set_item("logit_opacities", frame.logit_opacities.into_pyarray(py))?;
-        d.set_item("sh0", frame.sh0.into_pyarray(py).reshape([n, 3])?)?;
-        d.set_item("shN", frame.sh_n.into_pyarray(py).reshape([n, k, 3])?)?;
+        let (n, k) = (self.count(), sh_coefficients(self.sh_degree()));
+        let shapes = [
+            ("means", vec![n, 3]),
+            ("quats", vec![n, 4]),
+            ("log_scales", vec![n, 3]),
+            ("logit_opacities", vec![n]),
+            ("sh0", vec![n, 3]),
+            ("shN", vec![n, k, 3]),
+        ];
+        let all = PyArray1::<f32>::zeros(py, n * (14 + 3 * k), false);
+        {
+            let mut own = all.readwrite();
+            let (means, rest) = own.as_slice_mut()?.split_at_mut(3 * n);
+            let (quats, rest) = rest.split_at_mut(4 * n);
+            let (log_scales, rest) = rest.split_at_mut(3 * n);
+            let (logit_opacities, rest) = rest.split_at_mut(n);
+            let (sh0, sh_n) = rest.split_at_mut(3 * n);
+            let out = FrameMut {
+                means: means.as_chunks_mut().0,
+                quats: quats.as_chunks_mut().0,
+                log_scales,
+                logit_opacities,
+                sh0,
+                sh_n,
+            };
+            py.detach(|| self.evaluator.frame_into(t, out));
+        }
+        let (d, mut start) = (PyDict::new(py), 0);
+        for (name, shape) in shapes {
+            let end = start + shape.iter().product::<usize>();
+            let part = all.get_item(PySlice::new(py, start as isize, end as isize, 1))?;
+            d.set_item(name, part.call_method1("reshape", (shape,))?)?;
+            start = end;
+        }
         Ok(d)
     }
 
