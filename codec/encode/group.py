@@ -26,7 +26,7 @@ GRID_BITS_MAX = 21
 SHIFTED = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
 LEVEL_RANGE = (3, 97)  # percentiles of log sensitivity between which layers are even
 LEAST_LEVEL = 1e-4  # of the mean sensitivity
-STILL_LAYERS, STILL_LEAST = 3, 50_000  # layers of a single frame of so many Gaussians
+STILL_LAYERS, STILL_LEAST = 3, 1000  # layers of a single frame of so many Gaussians
 SHIFT_MOST = 8  # doublings of a layer's step
 PRUNE = 0.3  # a Gaussian goes if the picture without it errs by less than this share of the error per coded Gaussian
 
