@@ -17,6 +17,7 @@ from gscodec.errors import CaptureError, UsageError
 from gscodec.gaussians import GaussianSequence, Group
 from gscodec.metrics.image import psnr
 from gscodec.render.image import render_image, render_rgba
+from gscodec.train.calibration import Extrinsics
 from gscodec.train.carve import carve, meeting_point, project
 from gscodec.train.cluster import train_segment
 from gscodec.train.finetune import GroupModel
@@ -158,11 +159,24 @@ def test_exposure_of_each_camera_is_found(darkest):
     views, model = Views(dataclasses.replace(capture, read=dimmed), 0), initial_model(capture, 0, TINY)
     train_keyframe(model, views, 0, TINY, steps=400, radius=1.0)
     true = np.log(gains[:-1]) - np.log(gains[:-1]).mean()
-    np.testing.assert_allclose(views.exposure.log_gains[:-1], true[:, None] + np.zeros(3), atol=0.04)
-    assert darkest < 1 or not views.exposure.log_gains.any()
+    np.testing.assert_allclose(views.exposure.values[:-1], true[:, None] + np.zeros(3), atol=0.04)
+    assert darkest < 1 or not views.exposure.values.any()
     shown = render_image(views.exposure.seen(model.gaussians(), 0), capture.cameras[0], (0, 0, 0))
     plain = render_image(model.gaussians(), capture.cameras[0], (0, 0, 0))
     np.testing.assert_allclose(shown, plain * views.exposure.gain(0), atol=2)
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.03])
+def test_pose_of_each_camera_is_found(wrong):
+    """Up to what all cameras share; right ones stay as they are."""
+    capture = capture_of(turning(300, frames=1))
+    told, trained = Extrinsics(len(capture.cameras), list(range(len(capture.cameras) - 1))), slice(0, -1)
+    told.values[trained] = np.random.default_rng(3).uniform(-wrong, wrong, (len(capture.cameras) - 1, 6))
+    cameras = [told.camera(i, c) for i, c in enumerate(capture.cameras)]
+    views, model = Views(dataclasses.replace(capture, cameras=cameras), 0), initial_model(capture, 0, TINY)
+    train_keyframe(model, views, 0, TINY, steps=400, radius=1.0)
+    left = views.extrinsics.values[trained] + told.values[trained] - told.values[trained].mean(0)
+    assert np.sqrt(np.mean(left**2)) <= 0.5 * np.sqrt(np.mean(told.values[trained] ** 2))
 
 
 def test_tracking_finds_the_turn(capture):

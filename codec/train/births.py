@@ -86,7 +86,7 @@ def wrong_pixels(model: Model, masks: list[np.ndarray], frame: int, views) -> li
     blob = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (BLOB, BLOB))
     for camera, mask in zip(views.train_cameras, masks, strict=True):
         truth = blend(views.view(camera, frame), GREY)
-        shown = render_image(views.exposure.seen(g, camera), views.capture.cameras[camera], GREY)
+        shown = render_image(views.exposure.seen(g, camera), views.camera(camera), GREY)
         error = np.abs(shown - truth).max(2)
         small = cv2.resize(error, mask.shape[::-1], interpolation=cv2.INTER_AREA)
         wrong = (mask & (small > WRONG)).astype(np.uint8)
@@ -97,7 +97,7 @@ def wrong_pixels(model: Model, masks: list[np.ndarray], frame: int, views) -> li
 def _points(wrong: list[np.ndarray], frame: int, views, most: int, seed: int) -> Model:
     """At most `most` Gaussians on surfaces in the pixels that are wrong."""
     taken = [views.view(i, frame) for i in views.train_cameras]
-    pictures = [(views.capture.cameras[i], v.rgb, v.alpha) for i, v in zip(views.train_cameras, taken, strict=True)]
+    pictures = [(views.camera(i), v.rgb, v.alpha) for i, v in zip(views.train_cameras, taken, strict=True)]
     return from_points(*sweep(pictures, most, seed, wrong), opacity=0.5)
 
 

@@ -38,6 +38,7 @@ LAPLACE_RATE = 0.02
 MEANS_RATE = 4e-5  # of the canonical means, times the radius
 CANONICAL_SHARE = 0.3  # of the keyframe's rates
 CANONICAL_PRICE = 3.0  # of a canonical bit, in bits of residuals
+LOSS_SHARE = 0.05  # of one step in the mean of the losses
 RATE_EVERY = 4  # the rate term has every coefficient, an image few of them: once in so many steps, so much stronger
 
 
@@ -218,6 +219,8 @@ class _Finetuner:
         self.optimizer = torch.optim.Adam([{"params": [p], "base": r} for p, r in rates], betas=(0.9, 0.99), fused=True)
         canonical = {n: CANONICAL_SHARE * r for n, r in keyframe.RATES.items()}
         self.canonical_rates = {"means": MEANS_RATE * radius, **canonical} if group.known < len(group.key) else {}
+        self.loss = 0.0  # mean of the last steps'
+        self.canonical_bits, _ = group.canonical_rate.gradients(group.key.params, self.noise)
 
     def step(self, t: int, fade: float) -> float:
         """One step on frame `t`, all rates times `fade`; returns the image loss."""
@@ -227,26 +230,36 @@ class _Finetuner:
         params = group.frame(t, self.noise)
         target = self.views.draw(self.frames[t])
         result = compare(params, target, self.settings, self.rng, self.workspace)
+        self.loss += (result.loss - self.loss) * (LOSS_SHARE if self.loss else 1.0)
         heads, seeds = [params[n] for n in names], [result.grads[n] for n in names]
-        price = 0.0
-        if self.rng.integers(RATE_EVERY) == 0:
-            pixels = target.rgb.shape[0] * target.rgb.shape[1] * len(self.frames)
-            price = RATE_EVERY * self.settings.rate_lambda / pixels
-            heads.append(price * group.bits(self.noise))
+        extra: dict[str, torch.Tensor] = {}
+        if self.settings.rate_lambda and self.rng.integers(RATE_EVERY) == 0:
+            bits = group.bits(self.noise)
+            price = self._price(float(bits.detach()))
+            heads.append(price * bits)
             seeds.append(torch.ones(()))
+            if self.canonical_rates:
+                self.canonical_bits, rate = group.canonical_rate.gradients(group.key.params, self.noise)
+                extra = {n: CANONICAL_PRICE * price * g for n, g in rate.items()}
         self.optimizer.zero_grad()
         torch.autograd.backward(heads, seeds)
         self.optimizer.step()
         if self.canonical_rates:
             back = quat_conjugate(group.turned[t])
             grads = {**result.grads, "quats": quat_multiply(back, result.grads["quats"])}  # to the canonical pose
-            if price:
-                rate = group.canonical_rate.gradients(group.key.params, CANONICAL_PRICE * price, self.noise)
-                grads |= {n: grads[n] + g for n, g in rate.items()}
-            for g in grads.values():
+            for n, g in grads.items():
+                g += extra.get(n, 0)
                 g[: group.known] = 0
             group.key.adam(grads, {n: r * fade for n, r in self.canonical_rates.items()})
         return result.loss
+
+    def _price(self, bits: float) -> float:
+        """Of a bit, in image loss, where the residuals take `bits`.
+
+        What counts is by which share bits and loss change. A group is priced as if it stood alone, so that a bit costs
+        the same in all groups of a subject.
+        """
+        return RATE_EVERY * self.settings.rate_lambda * self.loss / (bits + self.canonical_bits)
 
 
 def finetune(

@@ -94,6 +94,8 @@ def train_keyframe(
     stats, losses = Statistics(len(model)), []
     model.restart()
     views.exposure.restart()
+    views.extrinsics.restart()
+    views.extrinsics.about(model.params["means"].numpy().mean(0, dtype=np.float64), radius)
     for step in range(steps):
         target = views.draw(frame)
         result = compare(model.params, target, settings, rng, workspace)
@@ -101,11 +103,14 @@ def train_keyframe(
         losses.append(result.loss - settings.mask_lambda * result.mask)
         fade = step / max(steps - 1, 1)
         rate = radius * MEANS_RATE[0] * (MEANS_RATE[1] / MEANS_RATE[0]) ** fade
-        model.adam(result.grads, {"means": rate, **{n: r * 0.1**fade for n, r in RATES.items()}})
         if step >= EXPOSE_FROM * steps:
             views.exposure.learn(target.index, result.grad_gain, 0.1**fade)
+            arrays = [x[n].numpy() for x in (model.params, result.grads) for n in ("means", "quats")]
+            views.extrinsics.learn(target.index, views.extrinsics.gradient(*arrays), 0.1**fade)
+        model.adam(result.grads, {"means": rate, **{n: r * 0.1**fade for n, r in RATES.items()}})
         if step == int(DENSIFY_UNTIL * steps):
             views.exposure.settle()
+            views.extrinsics.settle()
         if densify and (step + 1) % DENSIFY_EVERY == 0:
             if DENSIFY_FROM * steps < step < DENSIFY_UNTIL * steps:
                 grow(model, stats, int(KEYFRAME_SHARE * settings.gaussians_max), radius, rng)

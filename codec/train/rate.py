@@ -108,13 +108,14 @@ class CanonicalRate:
         return laplace_bits(x - mean, width.clamp(min=LEAST_WIDTH).log()).sum()
 
     def gradients(
-        self, params: dict[str, torch.Tensor], price: float, generator: torch.Generator
-    ) -> dict[str, torch.Tensor]:
-        """Gradients of `price` times all bits by the attributes that have any."""
+        self, params: dict[str, torch.Tensor], generator: torch.Generator
+    ) -> tuple[float, dict[str, torch.Tensor]]:
+        """All bits, and their gradients by the attributes that have any."""
         leaves = {n: p.detach().clone().requires_grad_() for n, p in params.items()}
         bits = self.bits(leaves, generator)
-        grads = torch.autograd.grad(price * sum(bits.values()), [leaves[n] for n in bits])
-        return dict(zip(bits, grads, strict=True))
+        total = sum(bits.values())
+        grads = torch.autograd.grad(total, [leaves[n] for n in bits])
+        return float(total.detach()), dict(zip(bits, grads, strict=True))
 
 
 def vector_part(quats: torch.Tensor, order: torch.Tensor) -> torch.Tensor:

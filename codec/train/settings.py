@@ -21,7 +21,7 @@ class TrainSettings:
         mask_lambda: weight of the alpha loss where the capture has masks.
         cut_ratio: a frame whose image loss exceeds the keyframe's by this factor starts a group of its own.
         rigidity: weight of the as-rigid-as-possible term.
-        rate_lambda: loss per bit and pixel of the residual trajectories.
+        rate_lambda: by which share the image loss may rise where bits fall by one.
         quality: quantization the rate term assumes (0 to 100).
         seed: of everything random.
     """
@@ -36,7 +36,7 @@ class TrainSettings:
     mask_lambda: float = 0.1
     cut_ratio: float = 2.0
     rigidity: float = 0.1
-    rate_lambda: float = 0.02
+    rate_lambda: float = 0.25
     quality: float = 50.0
     seed: int = 0
 

@@ -125,16 +125,22 @@ class Subject:
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays."""
         canonical = {f"canonical.{n}": p.numpy() for n, p in self.canonical.params.items()}
-        log_gains = self.tracker.views.exposure.log_gains
-        numbers = {"loss_radius": np.array([self.loss, self.radius]), "log_gains": log_gains}
-        return {**numbers, **canonical, **self.tracker.state()}
+        views = self.tracker.views
+        cameras = {
+            "exposure": views.exposure.values,
+            "extrinsics": views.extrinsics.values,
+            "middle": views.extrinsics.middle,
+        }
+        return {"loss_radius": np.array([self.loss, self.radius]), **cameras, **canonical, **self.tracker.state()}
 
     @staticmethod
     def restored(state: dict[str, np.ndarray], views: Views, settings: TrainSettings) -> Subject:
         """Inverse of `state`."""
         canonical = {n: torch.from_numpy(state[f"canonical.{n}"]) for n in NAMES}
-        views.exposure.log_gains = state["log_gains"]
-        return Subject(Tracker.restored(state, views, settings), *state["loss_radius"].tolist(), Model(canonical))
+        loss, radius = state["loss_radius"].tolist()
+        views.exposure.values, views.extrinsics.values = state["exposure"], state["extrinsics"]
+        views.extrinsics.about(state["middle"], radius)
+        return Subject(Tracker.restored(state, views, settings), loss, radius, Model(canonical))
 
 
 def train_groups(

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gscodec.camera import Camera
 from gscodec.capture import View
 from gscodec.render.step import RenderLoss, Workspace, render_loss
-from gscodec.train.exposure import Exposure
+from gscodec.train.calibration import Exposure, Extrinsics
 from gscodec.train.settings import TrainSettings
 
 CACHE_BYTES = 2 << 30  # of decoded targets
@@ -40,12 +41,14 @@ class Target:
 
 
 class Views:
-    """The training views of a capture, `train_cameras` being their indices, `exposure` how bright each is."""
+    """The training views of a capture, `train_cameras` being their indices; `exposure` and `extrinsics` say by how much
+    each differs from what the capture tells."""
 
     def __init__(self, capture, seed: int):
         self.capture = capture
         self.train_cameras = [i for i, c in enumerate(capture.cameras) if c.split == "train"]
         self.exposure = Exposure(len(capture.cameras), self.train_cameras)
+        self.extrinsics = Extrinsics(len(capture.cameras), self.train_cameras)
         self._seed = seed
         self._held: OrderedDict[tuple, View | Target] = OrderedDict()
         self._bytes = 0
@@ -59,7 +62,13 @@ class Views:
     def target(self, camera: int, frame: int, scale: float = 1.0) -> Target:
         """View of camera index `camera` at `frame`, cropped to the subject, `scale` times its size (at most 1)."""
         load = lambda: self._cropped(camera, frame) if scale == 1 else shrink(self.target(camera, frame), scale)  # noqa: E731
-        return replace(self._hold((camera, frame, scale), load), gain=self.exposure.gain(camera))
+        held = self._hold((camera, frame, scale), load)
+        there = self.extrinsics.camera(camera, held.camera)
+        return replace(held, camera=there, gain=self.exposure.gain(camera))
+
+    def camera(self, index: int) -> Camera:
+        """Camera `index` of the capture where it really stands."""
+        return self.extrinsics.camera(index, self.capture.cameras[index])
 
     def _hold(self, key: tuple, load: Callable[[], View | Target]):
         """What `load` gives, which is kept as long as there is room."""
