@@ -17,7 +17,7 @@ from gscodec.bitstream.quantization import Steps, error_for, steps_for, subject_
 from gscodec.camera import Camera
 from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
-from gscodec.encode.importance import Importance, measure, steps_for_error
+from gscodec.encode.importance import Importance, coarsest, measure, steps_for_error
 from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes, rebase
 from gscodec.gaussians import Gaussians, Group
 from gscodec.gaussians import Nodes as GivenNodes
@@ -236,7 +236,8 @@ def code_group(
     nominal = steps_for(quality, subject_radius(s.means[middle]))
     even = _steps(s.take(source), measured.take(source), error, nominal)
     layer = layer_of(measured.take(source), layers)
-    shifts = layer_shifts(measured.take(source), layer, layers)
+    room = {n: np.log2(coarsest(n, subject_radius(s.means[middle])) / v.mean()) for n, v in even.items()}
+    shifts = layer_shifts(measured.take(source), layer, layers, room)
     steps = _steps(s.take(source), measured.take(source), error, nominal, {n: v[layer] for n, v in shifts.items()})
     rest = middle if group.nodes is None else 0
     grid = Grid.around(s.means[rest, source], float(steps["means"][0]))
@@ -303,14 +304,15 @@ def shifts_of(integers: dict) -> dict[str, np.ndarray]:
     return dict(zip(names, np.array(shifts, int).T, strict=True))
 
 
-def layer_shifts(measured: Importance, layer: np.ndarray, layers: int) -> dict[str, np.ndarray]:
-    """[L] int of each attribute: how often each layer's step is doubled, by its mean sensitivity."""
+def layer_shifts(measured: Importance, layer: np.ndarray, layers: int, room: dict) -> dict[str, np.ndarray]:
+    """[L] int of each attribute: how often each layer's step is doubled, by its mean sensitivity; `room`: so often at
+    most, since the derivative says too little farther off."""
     count = np.maximum(np.bincount(layer, minlength=layers), 1)
     shifts = {}
     for n, w in measured.weights.items():
         own = (w / np.maximum(w.sum(0) / max(len(w), 1), 1e-30)).mean(1)
         mean = np.maximum(np.bincount(layer, own, minlength=layers) / count, 1e-9)
-        shifts[n] = np.clip(np.rint(0.5 * np.log2(mean.max() / mean)), 0, SHIFT_MOST).astype(int)
+        shifts[n] = np.clip(np.rint(0.5 * np.log2(mean.max() / mean)), 0, np.clip(room[n], 0, SHIFT_MOST)).astype(int)
     return shifts
 
 

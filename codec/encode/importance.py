@@ -107,5 +107,9 @@ def steps_for_error(
     for _ in range(50):
         share = (low + high) / 2
         low, high = (share, high) if np.minimum(share, energy).sum() < error else (low, share)
-    caps = {**COARSEST, "means": COARSEST["means"] * radius}
-    return {n: np.minimum(np.sqrt(12 * high / s), caps[n]).astype(np.float32) for n, s in sums.items()}
+    return {n: np.minimum(np.sqrt(12 * high / s), coarsest(n, radius)).astype(np.float32) for n, s in sums.items()}
+
+
+def coarsest(attribute: str, radius: float) -> float:
+    """The largest step of an attribute at which its sensitivity means anything."""
+    return COARSEST[attribute] * (radius if attribute == "means" else 1.0)
