@@ -71,7 +71,10 @@ def encode(
     gop: Gop = 20,
     keep_all: Annotated[bool, typer.Option("--keep-all", help="Keep Gaussians that nobody can see.")] = False,
     random_access: RandomAccess = 60,
-    layers: Annotated[int, typer.Option(help="Layers of importance; the first ones alone are a coarser picture.")] = 1,
+    layers: Annotated[
+        int | None,
+        typer.Option(help="Layers of importance; the first ones alone are a coarser picture.", show_default="auto"),
+    ] = None,
     ray: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Train on this Ray cluster; its machines see SEQ too.")
     ] = None,

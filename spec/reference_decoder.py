@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from reference_container import LEVELS, BitstreamError, LimitError, read_container, require
+from reference_entropy import MAX_VALUE
 from reference_integers import (
     class_nodes,
     class_trajectories,
@@ -77,17 +78,19 @@ class Group:
 
 def decode_layer(found, k, header, reference, spend):
     """Clauses 8 to 10 and 12: one layer -> positions [N, 3], channels, lifetimes or None, trajectories."""
-    layer = header.layers[k]
+    layer, shifts = header.layers[k], header.shifts[k]
     points, near_births = [], []
     if layer.births or not header.reference:
-        points = decode_positions(found[POSITIONS, k, 0], layer.births, header.grid_bits, "positions")
+        points = decode_positions(found[POSITIONS, k, 0], layer.births, header.grid_bits - shifts[MEANS], "positions")
         near_births = find_neighbors(points)
-    positions = np.array(points, np.int32).reshape(layer.births, 3)
+    positions = np.array(points, np.int32).reshape(layer.births, 3) << shifts[MEANS]
     channels = {}
     for a, (steps, _) in header.channels.items():
         if (CHANNELS, k, a) in found:
             q = decode_channels(found[CHANNELS, k, a], a, len(steps), near_births, f"channels of {ATTRIBUTES[a]}")
-            channels[a] = np.array(q, np.int32).reshape(len(steps), layer.births)
+            q = np.array(q, np.int64).reshape(len(steps), layer.births) << shifts[a]
+            require((abs(q) <= MAX_VALUE).all(), f"channels of {ATTRIBUTES[a]}: a value beyond {MAX_VALUE}")
+            channels[a] = q.astype(np.int32)
         else:
             channels[a] = np.zeros((len(steps), 0), np.int32)
     if reference:

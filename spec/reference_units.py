@@ -117,6 +117,7 @@ class Header:
     layers: list
     channels: dict  # attribute -> (steps, offsets)
     trajectories: dict  # attribute -> (K_a, step)
+    shifts: list  # of each layer, attribute -> low bits that are not coded; MEANS: of positions
     node_count: int = 0
     neighbors: int = 0
     node_coefficients: int = 0
@@ -128,7 +129,8 @@ def read_opening(r):
     """Clause 4: frames, flags, reference (0: independent) and the sizes of the units behind the header, if it tells."""
     frames, flags = r.u16(), r.u8()
     require(frames >= 1, "group_header: frames is 0")
-    require(flags < 8, f"group_header: flags are {flags:#x}, bits 3 to 7 must be 0")
+    wanted = "bits 4 to 7 must be 0, and bit 3 in a predicted group"
+    require(flags < (8 if flags & 1 else 16), f"group_header: flags are {flags:#x}, {wanted}")
     require(not flags & 2, "group_header: unsupported tool step_classes")
     reference = r.u16() if flags & 1 else 0
     require(reference or not flags & 1, "group_header: reference is 0, expected >= 1")
@@ -188,6 +190,16 @@ def read_channels(r, sh_degree):
     return channels
 
 
+def read_shifts(r, layer_count, grid_bits, attributes):
+    """Clause 4: of each layer attribute -> shift, MEANS: of positions."""
+    shifts = [{a: r.u8() for a in (MEANS, *attributes)} for _ in range(layer_count)]
+    for shift in (s for own in shifts for s in own.values()):
+        require(shift <= 15, f"group_header: shift is {shift}, expected 0 to 15")
+    for own in shifts:
+        require(own[MEANS] < grid_bits, f"group_header: shift of positions is {own[MEANS]}, of {grid_bits} bits")
+    return shifts
+
+
 def expected_map_width_log2(count):
     """Clause 7.2."""
     return (count.bit_length() - 1) >> 1 if count else 0
@@ -196,15 +208,18 @@ def expected_map_width_log2(count):
 def read_group_header(payload, reference=None):
     """Clause 4. `reference`: the Header of the group that a predicted one refers to."""
     r = Reader(payload, 0, len(payload), "group_header")
-    frames, _, back, _ = read_opening(r)
+    frames, flags, back, _ = read_opening(r)
     if back:
         require(reference is not None and not reference.reference, "group_header: no independent group to refer to")
         layers, channels = read_layers(r, reference), reference.channels
         grid = reference.origin, reference.grid_step, reference.grid_bits, reference.sh_degree
+        shifts = reference.shifts
     else:
         grid = read_grid(r)
         layers = read_layers(r, None)
         channels = read_channels(r, grid[3])
+        unshifted = [dict.fromkeys((MEANS, *channels), 0)] * len(layers)
+        shifts = read_shifts(r, len(layers), grid[2], channels) if flags & 8 else unshifted
     sh_degree = grid[3]
     trajectories, last = {}, 0
     for _ in range(r.u8()):
@@ -214,7 +229,7 @@ def read_group_header(payload, reference=None):
         require(1 <= coefficients <= frames, f"group_header: {coefficients} coefficients, expected 1 to {frames}")
         trajectories[attribute] = coefficients, r.f32("trajectory step", positive=True)
         last = attribute
-    header = Header(frames, back, *grid, layers, channels, trajectories, r.u32())
+    header = Header(frames, back, *grid, layers, channels, trajectories, shifts, r.u32())
     if header.node_count:
         header.neighbors, header.node_coefficients = r.u8(), r.u16()
         require(1 <= header.neighbors <= 8, f"group_header: neighbors is {header.neighbors}, expected 1 to 8")

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from gscodec.bitstream.transform import dct_basis
 from gscodec.decode import Stream, open_stream
 from gscodec.encode.canonical import canonical_axes, quat_multiply
 from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
-from gscodec.encode.group import group_integers, stack_group
+from gscodec.encode.group import group_integers, shifts_of, stack_group
 from gscodec.encode.motion import carry, choose_nodes
 from gscodec.encode.writer import StreamWriter
 from gscodec.errors import BitstreamError, CaptureError, UsageError
@@ -215,6 +216,21 @@ def test_a_predicted_group_costs_less_and_keeps_the_content(tmp_path, layers):
             shape = np.linalg.norm(ca - cb, axis=(1, 2)) / np.linalg.norm(ca, axis=(1, 2))
             errors.append([np.abs(a.means - b.means).mean(), np.abs(a.sh0 - b.sh0).mean(), np.median(shape)])
         assert (np.array(errors[1]) < 1.5 * np.array(errors[0])).all(), errors
+
+
+def test_layers_have_the_steps_of_their_sensitivity():
+    g = blob(3000)
+    faint = replace(g, logit_opacities=(g.logit_opacities - 4 * (np.arange(3000) % 2)).astype(np.float32))
+    group = Group([faint])
+    integers = group_integers(group, 80, keep_all=True, layers=3)
+    shifts, layer = shifts_of(integers), np.repeat(np.arange(3), integers["layers"])
+    assert all(s.min() == 0 for s in shifts.values())
+    assert any(s[2] > s[0] for s in shifts.values())
+    for name, c in integers["channels"].items():
+        assert (c["values"] % 2 ** shifts[name][layer] == 0).all()
+    assert (integers["positions"] % 2 ** shifts["means"][layer, None] == 0).all()
+    sizes = [len(_native.encode_group(group_integers(group, 80, keep_all=True, layers=n))[0]) for n in (1, 3)]
+    assert sizes[1] < sizes[0]
 
 
 def test_a_group_that_refers_to_a_damaged_one_is_named(tmp_path):

@@ -58,7 +58,7 @@ class GroupCoder:
         random_access: frames from one independent group to the next at most; 0 or 1: every group is independent.
     """
 
-    def __init__(self, *, keep_all: bool, layers: int, random_access: int, cameras: list[Camera] = ()):
+    def __init__(self, *, keep_all: bool, layers: int | None, random_access: int, cameras: list[Camera] = ()):
         self._options = {"keep_all": keep_all, "cameras": cameras}
         self._layers = layers
         self._random_access, self._reference = random_access, None

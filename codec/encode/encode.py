@@ -34,14 +34,15 @@ class EncodeSettings:
         keep_all: also code Gaussians that are never visible.
         random_access: frames from one independent group to the next at most; the groups between are predicted from it
             where their parents are known and it is cheaper. 0 or 1: every group is independent.
-        layers: layers of importance in each group; any first few decode alone.
+        layers: layers of importance in each group, each with its own steps; any first few decode alone. None: what is
+            smallest.
     """
 
     quality: float = 50.0
     bitrate: float | None = None
     keep_all: bool = False
     random_access: int = 60
-    layers: int = 1
+    layers: int | None = None
 
     def __post_init__(self):
         if not 0 <= self.quality <= 100:
@@ -50,7 +51,7 @@ class EncodeSettings:
             raise UsageError(f"--bitrate {self.bitrate:g} is out of range, expected bits per second above 0")
         if self.random_access < 0:
             raise UsageError(f"--random-access {self.random_access} is out of range, expected 0 frames or more")
-        if not 1 <= self.layers <= LAYERS_MAX:
+        if self.layers is not None and not 1 <= self.layers <= LAYERS_MAX:
             raise UsageError(f"--layers {self.layers} is out of range, expected 1 to {LAYERS_MAX}")
 
 

@@ -18,12 +18,17 @@ from gscodec.bitstream.quantization import Steps, error_for, steps_for, subject_
 from gscodec.camera import Camera
 from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
-from gscodec.encode.importance import Importance, measure, steps_for_error
+from gscodec.encode.importance import Importance, coarsest, measure, steps_for_error
 from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes
 from gscodec.gaussians import Gaussians, Group
 from gscodec.gaussians import Nodes as GivenNodes
 
 GRID_BITS_MAX = 21
+SHIFTED = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
+LEVEL_RANGE = (3, 97)  # percentiles of log sensitivity between which layers are even
+LEAST_LEVEL = 1e-4  # of the mean sensitivity
+STILL_LAYERS, STILL_LEAST = 3, 1000  # layers of a single frame of so many Gaussians
+SHIFT_MOST = 8  # doublings of a layer's step
 PRUNE = 0.3  # a Gaussian goes if the picture without it errs by less than this share of the error per coded Gaussian
 
 
@@ -98,14 +103,22 @@ def align_axes(s: Stack, middle: int, turn: np.ndarray, order: np.ndarray) -> St
 
 
 def quantize_channels(
-    values: np.ndarray, steps: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float
+    values: np.ndarray, steps: np.ndarray, weights: np.ndarray, layers: list[tuple], shifts: np.ndarray, price: float
 ) -> dict:
-    """[N, C] floats -> channels of `encode_group`; offsets are the medians, so that small integers are common."""
+    """[N, C] floats -> channels of `encode_group`; offsets are the medians, so that small integers are common.
+
+    Args:
+        layers: of each its Gaussians (slice) and their neighbours (`rdo.neighbours`).
+        shifts: [L] low bits that each layer leaves out.
+    """
     offsets = np.median(values, axis=0) if len(values) else np.zeros(values.shape[1])
     offsets = offsets.astype(np.float32)
-    x = (values - offsets) / steps
-    q = [rdo.keyframe(x[:, c], weights[:, c] * steps[c] ** 2, near, price) for c in range(len(steps))]
-    return {"values": np.array(q).astype(np.int32), "steps": steps.tolist(), "offsets": offsets.tolist()}
+    q = np.zeros((len(steps), len(values)), np.int32)
+    for (own, near), shift in zip(layers, shifts, strict=True):
+        for c, step in enumerate(steps * 2.0**shift):
+            x = (values[own, c] - offsets[c]) / step
+            q[c, own] = rdo.keyframe(x, weights[own, c] * step**2, near, price).astype(np.int32) << shift
+    return {"values": q, "steps": steps.tolist(), "offsets": offsets.tolist()}
 
 
 def dequantize_channels(channels: dict) -> np.ndarray:
@@ -135,10 +148,11 @@ class Grid:
         """Its entries in the input of `encode_group`."""
         return {"origin": self.origin.tolist(), "grid_step": self.step, "grid_bits": self.bits}
 
-    def to_integers(self, means: np.ndarray) -> np.ndarray:
-        """[N, 3] world -> [N, 3] u32."""
-        q = np.rint((means - self.origin) / self.step)
-        return np.clip(q, 0, 2**self.bits - 1).astype(np.uint32)
+    def to_integers(self, means: np.ndarray, shift: np.ndarray | int = 0) -> np.ndarray:
+        """[N, 3] world -> [N, 3] u32, multiples of 2^shift ([N])."""
+        unit = 2 ** np.broadcast_to(shift, len(means))[:, None]
+        q = np.rint((means - self.origin) / (self.step * unit))
+        return (np.clip(q, 0, 2**self.bits // unit - 1) * unit).astype(np.uint32)
 
     def to_world(self, integers: np.ndarray) -> np.ndarray:
         """[N, 3] u32 -> [N, 3] f64 world."""
@@ -190,7 +204,9 @@ class Coded:
         }
         layers = np.asarray(self.integers["layers"])
         steps = {f"steps.{n}": v for n, v in self.steps.items()}
-        return {**whole, **grid, **channels, **steps, "layers": layers, "positions": self.integers["positions"]}
+        shifts = np.asarray(self.integers["shifts"] or ())
+        whole |= {"layers": layers, "shifts": shifts, "positions": self.integers["positions"]}
+        return {**whole, **grid, **channels, **steps}
 
     @staticmethod
     def restored(state: dict[str, np.ndarray]) -> Coded:
@@ -203,12 +219,13 @@ class Coded:
                 _, attribute, key = name.split(".")
                 channels.setdefault(attribute, {})[key] = v if key == "values" else v.tolist()
         lists = {"layers": state["layers"].tolist(), "positions": state["positions"], "channels": channels}
+        lists["shifts"] = state["shifts"].tolist() or None
         whole = (state[n] for n in ("source", "turn", "order"))
         return Coded(grid.header() | lists, *whole, grid, steps, float(state["node_step"]))
 
 
 def code_group(
-    group: Group, quality: float, *, keep_all: bool = False, layers: int = 1, cameras: list[Camera] = ()
+    group: Group, quality: float, *, keep_all: bool = False, layers: int | None = None, cameras: list[Camera] = ()
 ) -> Coded:
     """An independent group in integers.
 
@@ -216,36 +233,47 @@ def code_group(
         group: T >= 1 frames of N Gaussians.
         quality: 0 to 100.
         keep_all: code every Gaussian, also the invisible ones.
-        layers: number of layers of falling importance, each as large as all before it together.
+        layers: number of layers of falling importance; None: STILL_LAYERS for many Gaussians in a single frame, else 1.
         cameras: from which the subject was captured, if it was.
     """
-    s = stack_group(group)
+    s, layers = stack_group(group), layers or _layers(group)
     frames, middle = len(s.means), len(s.means) // 2
     turn, axes = canonical_axes(s.quats[middle], s.log_scales[middle])
     s = align_axes(s, middle, turn, axes)
     measured, error = measure_stack(s, cameras), error_for(quality)
     source = np.arange(len(turn)) if keep_all else np.flatnonzero(measured.removal >= PRUNE * error / max(len(turn), 1))
     nominal = steps_for(quality, subject_radius(s.means[middle]))
-    steps = _steps(s.take(source), measured.take(source), error, nominal)
+    even = _steps(s.take(source), measured.take(source), error, nominal)
+    layer = layer_of(measured.take(source), layers)
+    room = {n: np.log2(coarsest(n, subject_radius(s.means[middle])) / v.mean()) for n, v in even.items()}
+    shifts = layer_shifts(measured.take(source), layer, layers, room)
+    steps = _steps(s.take(source), measured.take(source), error, nominal, {n: v[layer] for n, v in shifts.items()})
     given = group.nodes if frames > 1 else None
     rest = s.means[middle] if given is None else given.rest
     grid = Grid.around(rest[source], float(steps["means"][0]), room=0 if given is None else 1)
-    source = source[_native.morton_order(grid.to_integers(rest[source]))]
+    shifts["means"] = np.minimum(shifts["means"], grid.bits - 1)
+    order = _native.morton_order(grid.to_integers(rest[source]))
+    source, layer = source[order], layer[order]
     nodes, x, quats = _rest_pose(s.take(source), rest[source], grid, nominal.node_translation, given)
-    positions = grid.to_integers(x)
+    positions = grid.to_integers(x, shifts["means"][layer])
     order = _native.morton_order(positions)
-    layer = layer_of(prominence(s.take(source[order])), layers)
-    order = order[layer.argsort(kind="stable")]
-    positions, quats, source = positions[order], quats[order], source[order]
+    order = order[layer[order].argsort(kind="stable")]
+    positions, quats, source, layer = positions[order], quats[order], source[order], layer[order]
     s, measured = s.take(source), measured.take(source)
-    near, price = rdo.neighbours(positions), rdo.bit_price(error, max(len(source), 1))
+    price, counts = rdo.bit_price(error, max(len(source), 1)), np.bincount(layer, minlength=layers)
+    parts = [
+        (slice(b - n, b), rdo.neighbours(positions[b - n : b])) for n, b in zip(counts, counts.cumsum(), strict=True)
+    ]
     values = canonical_appearance(s) | {"quats": quats[:, 1:]}
-    channels = {n: quantize_channels(v, steps[n], measured.weights[n], near, price) for n, v in values.items()}
-    channels["quats"] = inside_unit_ball(channels["quats"])
+    channels = {
+        n: quantize_channels(v, steps[n], measured.weights[n], parts, shifts[n], price) for n, v in values.items()
+    }
+    channels["quats"] = inside_unit_ball(channels["quats"], shifts["quats"][layer])
     out = {
         "frames": frames,
         **grid.header(),
-        "layers": np.bincount(layer, minlength=layers).tolist(),
+        "layers": counts.tolist(),
+        "shifts": np.stack([shifts[n] for n in SHIFTED if n in shifts], 1).tolist() if layers > 1 else None,
         "positions": positions,
         "channels": channels,
         "trajectories": {},
@@ -255,8 +283,13 @@ def code_group(
     if frames > 1 and len(positions):
         x = grid.to_world(positions)
         motion = nodes and carry(nodes, positions, x, frames)
-        out |= motion_integers(s, channels, steps, measured, price, x, nodes, motion)
-    return Coded(out, source, turn[source], axes[source], grid, steps, nominal.node_translation)
+        out |= motion_integers(s, channels, even, measured, price, x, nodes, motion)
+    return Coded(out, source, turn[source], axes[source], grid, even, nominal.node_translation)
+
+
+def _layers(group: Group) -> int:
+    """Layers that make a group smallest: trajectories of a Gaussian miss their neighbours in other layers."""
+    return STILL_LAYERS if len(group) == 1 and len(group.frames[0]) >= STILL_LEAST else 1
 
 
 def group_integers(group: Group, quality: float, **options) -> dict:
@@ -264,17 +297,33 @@ def group_integers(group: Group, quality: float, **options) -> dict:
     return code_group(group, quality, **options).integers
 
 
-def prominence(s: Stack) -> np.ndarray:
-    """[N] f32, opacity times the area of the two longest axes, in the frame where it is largest."""
-    largest_two = s.log_scales.sum(2) - s.log_scales.min(2)
-    return (np.exp(largest_two) / (1 + np.exp(-s.logit_opacities))).max(0)
+def layer_of(measured: Importance, layers: int) -> np.ndarray:
+    """[N] int, layer of each Gaussian: equal ranges of the logarithm of sensitivity, the most sensitive in layer 0."""
+    if not len(measured.removal) or layers == 1:
+        return np.zeros(len(measured.removal), int)
+    appearance = [w / np.maximum(w.mean(0), 1e-30) for n, w in measured.weights.items() if n != "means"]
+    level = np.log2(np.concatenate(appearance, 1) + LEAST_LEVEL).mean(1)
+    edges = np.linspace(*np.percentile(level, LEVEL_RANGE), layers + 1)[1:-1]
+    return layers - 1 - np.searchsorted(edges, level)
 
 
-def layer_of(weight: np.ndarray, layers: int) -> np.ndarray:
-    """[N] int, layer of each Gaussian of importance `weight` [N]: the most important 1 / 2^(layers - 1) are layer 0."""
-    share = np.empty(len(weight))  # of Gaussians that are more important
-    share[weight.argsort()[::-1]] = np.arange(len(weight)) / max(len(weight), 1)
-    return np.searchsorted(0.5 ** np.arange(layers - 1, 0, -1), share, side="right")
+def shifts_of(integers: dict) -> dict[str, np.ndarray]:
+    """[L] int of each attribute: low bits that the layers of a group in integers leave out."""
+    names = [n for n in SHIFTED if n == "means" or n in integers["channels"]]
+    shifts = integers["shifts"] or np.zeros((len(integers["layers"]), len(names)), int)
+    return dict(zip(names, np.array(shifts, int).T, strict=True))
+
+
+def layer_shifts(measured: Importance, layer: np.ndarray, layers: int, room: dict) -> dict[str, np.ndarray]:
+    """[L] int of each attribute: how often each layer's step is doubled, by its mean sensitivity; `room`: so often at
+    most, since the derivative says too little farther off."""
+    count = np.maximum(np.bincount(layer, minlength=layers), 1)
+    shifts = {}
+    for n, w in measured.weights.items():
+        own = (w / np.maximum(w.sum(0) / max(len(w), 1), 1e-30)).mean(1)
+        mean = np.maximum(np.bincount(layer, own, minlength=layers) / count, 1e-9)
+        shifts[n] = np.clip(np.rint(0.5 * np.log2(mean.max() / mean)), 0, np.clip(room[n], 0, SHIFT_MOST)).astype(int)
+    return shifts
 
 
 def canonical_appearance(s: Stack) -> dict[str, np.ndarray]:
@@ -291,14 +340,16 @@ def measure_stack(s: Stack, cameras: list[Camera] = ()) -> Importance:
     return measure([s.frame(t) for t in sorted({0, frames // 2, frames - 1})], cameras)
 
 
-def _steps(s: Stack, measured: Importance, error: float, nominal: Steps) -> dict[str, np.ndarray]:
-    """[C] f32 step of each channel of each attribute."""
+def _steps(
+    s: Stack, measured: Importance, error: float, nominal: Steps, shifts: dict[str, np.ndarray] | None = None
+) -> dict[str, np.ndarray]:
+    """[C] f32 step of each channel of each attribute; those of a Gaussian are 2^shifts ([N] each) times that."""
     if not len(measured.removal):
         return {n: np.full(w.shape[1], getattr(nominal, n), np.float32) for n, w in measured.weights.items()}
     middle = s.only(len(s.means) // 2)
     values = {n: v[0] for n, v in middle.appearance.items()}
     values |= {"means": middle.means[0], "quats": middle.quats[0, :, 1:]}
-    return steps_for_error(measured.weights, values, error, subject_radius(middle.means[0]))
+    return steps_for_error(measured.weights, values, error, subject_radius(middle.means[0]), shifts)
 
 
 def _rest_pose(
@@ -344,10 +395,11 @@ def motion_integers(s: Stack, channels, steps, measured: Importance, price: floa
     return out
 
 
-def inside_unit_ball(channels: dict) -> dict:
-    """Rounding may leave the unit ball; pull such vector parts back by one step per component, towards zero."""
+def inside_unit_ball(channels: dict, shifts: np.ndarray) -> dict:
+    """Rounding may leave the unit ball; pull such vector parts back by one step (2^shift, [N]) per component, towards
+    zero."""
     v = dequantize_channels(channels)
     outside = (v**2).sum(1) > 1
     values = channels["values"].copy()
-    values[:, outside] -= np.sign(v[outside].T).astype(np.int32)
+    values[:, outside] -= np.sign(v[outside].T).astype(np.int32) << shifts[outside]
     return {**channels, "values": values}

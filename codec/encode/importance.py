@@ -87,7 +87,9 @@ def _derivatives(g: Gaussians, grads: dict) -> dict[str, np.ndarray]:
     return {n: d for n, d in derivatives.items() if d.shape[1]}
 
 
-def steps_for_error(weights: dict, values: dict, error: float, radius: float) -> dict[str, np.ndarray]:
+def steps_for_error(
+    weights: dict, values: dict, error: float, radius: float, shifts: dict | None = None
+) -> dict[str, np.ndarray]:
     """Steps [C] of each attribute at which the picture's mean squared error is `error`, at the fewest bits.
 
     Every channel takes the same share of the error, or all of its energy where that is less (reverse water-filling:
@@ -95,13 +97,19 @@ def steps_for_error(weights: dict, values: dict, error: float, radius: float) ->
 
     Args:
         weights: of Importance. values: attribute -> [N, C], what is to be quantized; means: all axes have one step.
+        shifts: attribute -> [N], a Gaussian's steps are 2^shift times those of the attribute; None: all have the same.
     """
-    sums = {n: np.maximum(w.sum(0), 1e-30) for n, w in weights.items()}
+    coarser = {n: 1.0 if shifts is None else 4.0 ** shifts[n][:, None] for n in weights}
+    sums = {n: np.maximum((w * coarser[n]).sum(0), 1e-30) for n, w in weights.items()}
     sums["means"] = np.full(3, sums["means"].mean())
     energy = np.concatenate([(weights[n] * (v - np.median(v, 0)) ** 2).sum(0) for n, v in values.items()])
     low, high = 0.0, error
     for _ in range(50):
         share = (low + high) / 2
         low, high = (share, high) if np.minimum(share, energy).sum() < error else (low, share)
-    caps = {**COARSEST, "means": COARSEST["means"] * radius}
-    return {n: np.minimum(np.sqrt(12 * high / s), caps[n]).astype(np.float32) for n, s in sums.items()}
+    return {n: np.minimum(np.sqrt(12 * high / s), coarsest(n, radius)).astype(np.float32) for n, s in sums.items()}
+
+
+def coarsest(attribute: str, radius: float) -> float:
+    """The largest step of an attribute at which its sensitivity means anything."""
+    return COARSEST[attribute] * (radius if attribute == "means" else 1.0)

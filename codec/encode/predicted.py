@@ -26,7 +26,7 @@ from gscodec.encode.group import (
     layer_of,
     measure_stack,
     motion_integers,
-    prominence,
+    shifts_of,
     stack_group,
 )
 from gscodec.encode.motion import NodeMotion, Nodes, carry, choose_nodes, given_nodes
@@ -78,15 +78,19 @@ def predict_group(
     places = _carry_back(new, middle, rest, x, nodes, motion, grid)
     order = _native.morton_order(places)
     places, births, new = places[order], births[order], new.take(order)
+    before = reference.integers
+    born_in = layer_of(measured.take(births), len(before["layers"]))
+    shifts = {n: v[born_in] for n, v in shifts_of(before).items()}
+    unit = 1 << shifts["means"][:, None].astype(np.uint32)
+    places = places // unit * unit
     new_motion = nodes and carry(nodes, places, grid.to_world(places), len(s.means))
     new, quats = _canonical_births(new, middle, new_motion)
 
     values = canonical_appearance(new) | {"quats": quats}
-    before = reference.integers
-    channels = {n: _with_births(c, known, values[n], n) for n, c in before["channels"].items()}
+    channels = {n: _with_births(c, known, values[n], shifts[n], n) for n, c in before["channels"].items()}
     s = _join(old, new)
     layer = np.repeat(np.arange(len(before["layers"])), before["layers"])[known]
-    layer = np.concatenate([layer, layer_of(prominence(s), len(before["layers"]))[len(known) :]])
+    layer = np.concatenate([layer, born_in])
     place = np.lexsort((np.arange(len(layer)) >= len(known), layer))  # in each layer survivors, then births
     s, positions = s.take(place), np.concatenate([positions, places])[place]
     measured = measured.take(np.concatenate([survivors, births])[place])
@@ -160,11 +164,13 @@ def _canonical_births(s: Stack, middle: int, motion: NodeMotion | None) -> tuple
     return align_axes(s, middle, turn, order), quats[:, 1:]
 
 
-def _with_births(c: dict, known: np.ndarray, values: np.ndarray, name: str) -> dict:
-    """Channels of the survivors, those at `known` of the reference's, and of births with `values` [B, C]."""
+def _with_births(c: dict, known: np.ndarray, values: np.ndarray, shifts: np.ndarray, name: str) -> dict:
+    """Channels of the survivors, those at `known` of the reference's, and of births with `values` [B, C], whose steps
+    are 2^shifts ([B]) times those of the attribute."""
     steps, offsets = np.array(c["steps"], np.float32), np.array(c["offsets"], np.float32)
-    own = c | {"values": np.rint((values - offsets) / steps).astype(np.int32).T}
-    own = inside_unit_ball(own) if name == "quats" else own
+    unit = 2.0 ** shifts[:, None]
+    own = c | {"values": (np.rint((values - offsets) / (steps * unit)) * unit).astype(np.int32).T}
+    own = inside_unit_ball(own, shifts) if name == "quats" else own
     return c | {"values": np.concatenate([c["values"][:, known], own["values"]], 1)}
 
 

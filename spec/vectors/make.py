@@ -21,6 +21,7 @@ from parts import (  # noqa: E402
     change_predicted,
     change_unit,
     change_unit_of_predicted,
+    coarser,
     deaths_of_others,
     drop,
     duplicates,
@@ -69,6 +70,7 @@ MOTION = {"nodes": 12, "trajectories": {"means": 4, "quats": 3, "logit_opacities
 REFERENCE = make_group(120, 4, nodes=5, trajectories={"means": 2, "sh0": 2}, lifetimes=True)
 FULL = make_group(160, 6, seed=4, nodes=8, trajectories={"means": 3, "quats": 6, "sh0": 1}, lifetimes=True)
 UNCHANGED = predicted(REFERENCE, FULL, deaths=lambda i: False, births=0)
+SHIFTS = [[0, 0, 0, 0, 0], [1, 2, 3, 0, 4], [3, 15, 1, 2, 3]]
 LAYERED = layered(make_group(100, 3, nodes=4, trajectories={"means": 2}), [[0], [1, 2], [3, 4, 5]])
 
 VALID = {  # name: (what it is about, bytes)
@@ -180,6 +182,10 @@ VALID = {  # name: (what it is about, bytes)
     "layers_predicted": (
         "a predicted group with layers, births in each",
         lambda: predicted_file(LAYERED, predicted(LAYERED, FULL, births=4)),
+    ),
+    "layer_shifts": (
+        "layers that leave out low bits",
+        lambda: groups_file(coarser(layered(FULL, [[0, 2], [1], [3, 4]]), SHIFTS)),
     ),
     "no_groups": ("a stream without groups yet", lambda: groups_file(finish=False)),
 }
@@ -300,7 +306,10 @@ INVALID = {  # name: (error, part of the package's message, bytes)
     ),
     "layer_unannounced": (B, "announces", lambda: layers_file(lambda u: u.append(unit_dict(1, layer=3)))),
     "header_step_classes": (B, "not yet supported", header(flags=2)),
-    "header_flags": (B, "flags", header(flags=8)),
+    "header_flags": (B, "flags", header(flags=16)),
+    "header_shift": (B, "shift", header(flags=8, shifts=[0, 16, 0, 0, 0])),
+    "header_shift_positions": (B, "shift", header(flags=8, shifts=[HEADER["grid_bits"], 0, 0, 0, 0])),
+    "predicted_shifts": (B, "flags", change_predicted(lambda h: h[:2] + bytes([h[2] | 8]) + h[3:])),
     "header_layers": (B, "layers", header(layer_count=17, layer_counts=[(40, 2)] * 17)),
     "header_layers_missing": (B, "positions", header(layer_count=2, layer_counts=[(40, 2), (40, 2)])),
     "header_no_layers": (B, "layer", header(layer_count=0, layer_counts=[])),

@@ -149,6 +149,19 @@ def layered(group, shares, corrections=None):
     return result | ({"corrections": corrections} if corrections else {})
 
 
+def coarser(group, shifts):
+    """A layered group dict whose layer k leaves out shifts[k] low bits of positions and of each attribute."""
+    layer = np.repeat(np.arange(len(group["layers"])), group["layers"])
+    shifts = np.array(shifts)
+    cut = lambda v, s: (v >> s << s).astype(v.dtype)  # noqa: E731
+    channels = {
+        name: c | {"values": cut(c["values"], shifts[layer, i])}
+        for i, (name, c) in enumerate(group["channels"].items(), 1)
+    }
+    positions = cut(group["positions"], shifts[layer, :1].astype(np.uint32))
+    return group | {"positions": positions, "channels": channels, "shifts": shifts.tolist()}
+
+
 def predicted(reference, group, *, back=1, deaths=lambda i: i % 5 == 0, births=9):
     """A predicted group dict: of `reference` those that do not die, and in each layer `births` Gaussians of `group`.
 
@@ -515,6 +528,7 @@ def pack_header(**changes):
     data += b"".join(struct.pack(">IB", *layer) for layer in h["layer_counts"]) + bytes([len(h["channels"])])
     for attribute, pairs in h["channels"]:
         data += bytes([attribute]) + b"".join(struct.pack(">ff", *pair) for pair in pairs)
+    data += bytes(h.get("shifts", b""))
     data += bytes([len(h["trajectories"])]) + b"".join(struct.pack(">BHf", *t) for t in h["trajectories"])
     data += struct.pack(">I", h["node_count"])
     if h["node_count"]:

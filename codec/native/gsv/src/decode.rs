@@ -5,6 +5,7 @@
 //! Damage (spec 3) is an error, or what is not affected is decoded and the rest stands still or takes its offsets.
 
 use crate::assemble::{LayerPoints, Part, Slot, append, assemble};
+use crate::attributes::Attribute;
 use crate::channels;
 use crate::deaths;
 use crate::error::{Error, Result};
@@ -20,6 +21,7 @@ use crate::positions;
 use crate::range_coder::Decoder;
 use crate::trajectories::{self, Kind, Stop, Trajectories};
 use crate::unit::{self, ALL_LAYERS, Unit, UnitType};
+use crate::values::MAX_VALUE;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -143,9 +145,14 @@ impl GroupDecoder<'_> {
         };
         let unit = &self.units[i];
         let mut c = Decoder::new(unit.payload);
-        let codes = positions::code(&mut c, &[], count, u32::from(self.header.grid_bits));
+        let shift = match kind {
+            UnitType::Positions => self.header.shift(usize::from(layer), Attribute::Means),
+            _ => 0,
+        };
+        let codes = positions::code(&mut c, &[], count, u32::from(self.header.grid_bits) - shift);
         finish(c, true, i, unit)?;
-        Ok(codes.into_iter().map(morton::decode).collect())
+        let points = codes.into_iter().map(morton::decode);
+        Ok(points.map(|p| p.map(|v| v << shift)).collect())
     }
 
     /// Survivors, then births. Where their positions are damaged there are no births, where deaths are nobody dies.
@@ -222,8 +229,11 @@ impl GroupDecoder<'_> {
             (Some(UnitType::Channels), Some(a)) => {
                 let (channels, near) = (a.channels(h.sh_degree), layer.contexts.births());
                 let mut values = vec![0; near.len() * channels];
-                let sound = channels::code(&mut c, a, channels, near, &mut values);
-                (Part::Channels(values), sound)
+                let read = channels::code(&mut c, a, channels, near, &mut values);
+                let shift = h.shift(usize::from(unit.layer), a);
+                let fit = values.iter().all(|v| v.abs() <= MAX_VALUE >> shift);
+                values.iter_mut().for_each(|v| *v <<= shift);
+                (Part::Channels(values), read && fit)
             }
             (Some(UnitType::Lifetimes | UnitType::Trajectories), _) if !layer.whole => return Ok(None),
             (Some(UnitType::Lifetimes), _) => {

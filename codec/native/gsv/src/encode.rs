@@ -106,12 +106,17 @@ fn layer<'a>(
     }
     if h.reference == 0 || births > 0 {
         let own = &group.positions[range.end - births..range.end];
-        push(UnitType::Positions, None, points(own, u32::from(h.grid_bits)));
+        let shift = h.shift(k, Attribute::Means);
+        push(UnitType::Positions, None, points(own, u32::from(h.grid_bits), shift));
         for (a, values) in h.attributes().iter().zip(&group.channels) {
             let c = a.channels(h.sh_degree);
             let own = &values[(range.end - births) * c..range.end * c];
             let near = contexts.births();
-            let code = coded(move |e| _ = channels::code(e, *a, c, near, &mut own.to_vec()));
+            let shift = h.shift(k, *a);
+            let code = coded(move |e| {
+                let mut coarse: Vec<i32> = own.iter().map(|v| v >> shift).collect();
+                channels::code(e, *a, c, near, &mut coarse);
+            });
             push(UnitType::Channels, Some(*a), code);
         }
     }
@@ -146,7 +151,7 @@ fn nodes<'a>(units: &mut Vec<Pending<'a>>, group: &'a Group, near: &'a [Near]) {
     let coded = [
         (
             UnitType::NodePositions,
-            points(&group.node_positions, u32::from(h.grid_bits)),
+            points(&group.node_positions, u32::from(h.grid_bits), 0),
         ),
         (UnitType::NodeTrajectories, motion),
     ];
@@ -167,10 +172,11 @@ fn coded<'a>(f: impl Fn(&mut Encoder) + Sync + 'a) -> Code<'a> {
     })
 }
 
-fn points(points: &[[u32; 3]], bits: u32) -> Code<'_> {
+/// `points` without their lowest `shift` bits.
+fn points(points: &[[u32; 3]], bits: u32, shift: u32) -> Code<'_> {
     coded(move |c| {
-        let codes: Vec<u64> = points.iter().map(|p| morton::encode(*p)).collect();
-        positions::code(c, &codes, codes.len() as u32, bits);
+        let codes: Vec<u64> = points.iter().map(|p| morton::encode(p.map(|v| v >> shift))).collect();
+        positions::code(c, &codes, codes.len() as u32, bits - shift);
     })
 }
 

@@ -91,6 +91,7 @@ impl Group {
             let range = self.range(k..k + 1);
             let middle = range.start + layer.survivors() as usize;
             points("positions", &self.positions[middle..range.end], h.grid_bits)?;
+            self.validate_shifts(k, &range)?;
             let Some(r) = reference.filter(|_| h.reference > 0) else {
                 continue;
             };
@@ -111,6 +112,24 @@ impl Group {
             })?;
         }
         Ok(())
+    }
+
+    /// Integers of layer `k`, whose Gaussians are at `range`, have the low bits 0 that it leaves out.
+    fn validate_shifts(&self, k: usize, range: &std::ops::Range<usize>) -> Result<()> {
+        let h = &self.header;
+        let holds = |shift: u32, v: i32| v & ((1 << shift) - 1) == 0;
+        let shift = h.shift(k, Attribute::Means);
+        let mut whole = self.positions[range.clone()]
+            .iter()
+            .flatten()
+            .all(|v| holds(shift, *v as i32));
+        for ((values, scale), a) in self.channels.iter().zip(&h.scales).zip(h.attributes()) {
+            let (shift, c) = (h.shift(k, *a), scale.steps.len());
+            whole &= values[range.start * c..range.end * c].iter().all(|v| holds(shift, *v));
+        }
+        must(whole, || {
+            format!("layer {k}: expected integers that are multiples of 2^shift, as its shifts say")
+        })
     }
 
     /// Whether Gaussian `i` has the canonical integers of `j` of the reference.

@@ -13,6 +13,9 @@ use crate::map;
 const FLAG_PREDICTED: u8 = 1;
 const FLAG_STEP_CLASSES: u8 = 2;
 const FLAG_UNIT_SIZES: u8 = 4;
+const FLAG_LAYER_SHIFTS: u8 = 8;
+/// Low bits that a layer may leave out.
+pub const SHIFT_MAX: u8 = 15;
 /// Layers of a group.
 pub const LAYERS_MAX: usize = 16;
 
@@ -67,6 +70,8 @@ pub struct Header {
     pub layers: Vec<LayerHeader>,
     /// In the order of `Attribute::canonical(sh_degree)`.
     pub scales: Vec<Scale>,
+    /// Of each layer: how many low bits of positions, then of each attribute's integers, are 0 and not coded. Empty: none.
+    pub shifts: Vec<[u8; 6]>,
     pub trajectories: Vec<TrajectoryHeader>,
     /// `count` 0: none.
     pub nodes: NodeHeader,
@@ -121,6 +126,7 @@ impl Header {
             self.grid(f)?;
             self.layers(f, None)?;
             self.scales(f)?;
+            self.shifts(f)?;
         }
         self.trajectories(f)?;
         self.nodes(f)
@@ -133,13 +139,23 @@ impl Header {
         if !sizes.is_empty() {
             flags |= FLAG_UNIT_SIZES;
         }
+        if self.reference == 0 && !self.shifts.is_empty() {
+            flags |= FLAG_LAYER_SHIFTS;
+        }
         f.u8(&mut flags)?;
         f.must(flags & FLAG_STEP_CLASSES == 0, || {
             "a group without step classes: not yet supported by this version".into()
         })?;
-        f.must(flags & !(FLAG_PREDICTED | FLAG_UNIT_SIZES) == 0, || {
+        let known = match flags & FLAG_PREDICTED {
+            0 => FLAG_UNIT_SIZES | FLAG_LAYER_SHIFTS,
+            _ => FLAG_UNIT_SIZES | FLAG_PREDICTED,
+        };
+        f.must(flags & !known == 0, || {
             format!("reserved flags to be 0, found {flags:#04x}")
         })?;
+        if flags & FLAG_LAYER_SHIFTS != 0 {
+            self.shifts.resize(self.layers.len().max(1), Default::default());
+        }
         if flags & FLAG_PREDICTED != 0 {
             f.u16(&mut self.reference)?;
             f.must(self.reference > 0, || "a reference >= 1, found 0".into())?;
@@ -219,6 +235,29 @@ impl Header {
             }
         }
         Ok(())
+    }
+
+    /// One set for each layer, where the opening has announced them.
+    fn shifts<F: Fields>(&mut self, f: &mut F) -> Result<()> {
+        if self.shifts.is_empty() {
+            return Ok(());
+        }
+        let (kinds, bits) = (1 + self.attributes().len(), self.grid_bits);
+        self.shifts.resize(self.layers.len(), Default::default());
+        for own in &mut self.shifts {
+            for (i, shift) in own.iter_mut().take(kinds).enumerate() {
+                f.u8(shift)?;
+                let (found, most) = (*shift, if i == 0 { SHIFT_MAX.min(bits - 1) } else { SHIFT_MAX });
+                f.must(found <= most, || format!("a shift of 0 to {most}, found {found}"))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Low bits that layer `k` leaves out of an attribute's integers, `Means`: of positions.
+    pub fn shift(&self, k: usize, attribute: Attribute) -> u32 {
+        let own = self.shifts.get(k).and_then(|s| s.get(attribute as usize - 1));
+        own.map_or(0, |s| u32::from(*s))
     }
 
     fn trajectories<F: Fields>(&mut self, f: &mut F) -> Result<()> {

@@ -151,7 +151,8 @@ fn later_versions() {
     for (flags, part) in [
         (1, "refers to"),
         (2, "step classes: not yet supported"),
-        (8, "reserved flags"),
+        (9, "reserved flags"),
+        (16, "reserved flags"),
     ] {
         header[2] = flags | header[2] & 4;
         let mut bad = Vec::new();

@@ -49,6 +49,20 @@ proptest! {
     }
 
     #[test]
+    fn layers_leave_out_low_bits(s in shape(), shift in 1..6u32) {
+        let (mut g, plain) = (group(&s), group(&s));
+        let kinds = g.header.attributes().len();
+        let own = [0, 1, 2, 3, 4, 5].map(|i| if (1..=kinds).contains(&i) { shift as u8 } else { 0 });
+        g.header.shifts = vec![own; g.layers.len()];
+        g.channels.iter_mut().flatten().for_each(|v| *v = *v >> shift << shift);
+        same(&g, &decoded(&g));
+        if plain.channels != g.channels {
+            g.channels = plain.channels;
+            prop_assert!(matches!(encode_group(&g, None), Err(Error::Input(m)) if m.contains("multiples")));
+        }
+    }
+
+    #[test]
     fn predicted_groups_come_back(s in shape(), seed: u64) {
         let reference = group(&s);
         let g = predicted(&reference, &Shape { seed, ..s });

@@ -40,6 +40,7 @@ pub fn group_from(d: &Bound<PyDict>, reference: Option<&Group>) -> PyResult<Grou
         }
         header.scales.push(Scale { steps, offsets });
     }
+    header.shifts = shifts_from(d, &header)?;
     if let Some(t) = optional(d, "trajectories")? {
         let t: Bound<PyDict> = t.extract()?;
         motion_from(&t, &mut header, &mut group)?;
@@ -60,8 +61,14 @@ pub fn group_from(d: &Bound<PyDict>, reference: Option<&Group>) -> PyResult<Grou
     }
     let same = |r: &Group| {
         let h = &r.header;
-        (h.origin, h.grid_step, h.grid_bits, &h.scales)
-            == (header.origin, header.grid_step, header.grid_bits, &header.scales)
+        (h.origin, h.grid_step, h.grid_bits, &h.scales, &h.shifts)
+            == (
+                header.origin,
+                header.grid_step,
+                header.grid_bits,
+                &header.scales,
+                &header.shifts,
+            )
     };
     if header.reference > 0 && !reference.is_some_and(same) {
         return invalid("a predicted group: expected its reference, with the same grid, steps and offsets".into());
@@ -106,6 +113,22 @@ fn layers_from(d: &Bound<PyDict>, header: &mut Header, group: &mut Group) -> PyR
     }
     group.layers = header.layers.clone();
     Ok(())
+}
+
+/// `shifts`: for each layer those of positions and of each attribute.
+fn shifts_from(d: &Bound<PyDict>, header: &Header) -> PyResult<Vec<[u8; 6]>> {
+    if optional(d, "shifts")?.is_none() {
+        return Ok(Vec::new());
+    }
+    let (found, kinds): (Vec<Vec<u8>>, _) = (value(d, "shifts")?, 1 + header.attributes().len());
+    if found.len() != header.layers.len() || found.iter().any(|s| s.len() != kinds) {
+        return invalid(format!(
+            "shifts: expected {kinds} numbers for each of {} layers",
+            header.layers.len()
+        ));
+    }
+    let own = |s: &Vec<u8>| std::array::from_fn(|i| s.get(i).copied().unwrap_or(0));
+    Ok(found.iter().map(own).collect())
 }
 
 fn sh_degree(channels: &Bound<PyDict>) -> PyResult<u8> {
