@@ -362,7 +362,7 @@ def test_rate_of_one_gaussian_is_finite():
 
 def coded_bits(rate, model, quality):
     """Bits of each attribute's channels at the steps of `rate`."""
-    group = code_group(Group([model.gaussians()]), quality, keep_all=True)
+    group = code_group(Group([model.gaussians()]), quality, keep_all=True, layers=1)
     for name, x in rate.channels(model.params).items():
         integers = np.rint(x.numpy()[group.source].T).astype(np.int32)
         group.integers["channels"][name]["values"] = integers - np.median(integers, 1, keepdims=True).astype(np.int32)
