@@ -35,7 +35,10 @@ BUDGETS = {  # of single cases
 ALONE_MOST = 12  # frames trained alone
 ALLOWED_DB = 1.0
 STATIC_SHARE = 0.2
-ALLOWED: dict[str, tuple[float, str]] = {}  # case -> dB, and why it is more
+ALLOWED: dict[str, tuple[float, str]] = {  # case -> dB, and why it is more
+    "thin structure": (2.5, "rods of a pixel fall behind before the loss has doubled, which is when a group is cut"),
+    "no texture": (2.0, "nothing tells how a plain surface slides, so that its outline falls behind"),
+}
 
 
 def measure(names: list[str], out: Path) -> Iterator[dict]:

@@ -38,7 +38,7 @@ class TrainSettings:
     mask_lambda: float = 0.1
     cut_ratio: float = 2.0
     rigidity: float = 0.1
-    rate_lambda: float = 0.5
+    rate_lambda: float = 0.2
     quality: float = 50.0
     seed: int = 0
 
