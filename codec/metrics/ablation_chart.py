@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 WHOLE = "whole recipe"
-PANELS = {"psnr_coded": "PSNR of the decoded stream, dB", "kb_per_frame": "kB a frame", "flicker": "flicker"}
+PANELS = {"psnr_coded": "PSNR decoded, dB", "kb_per_frame": "kB a frame", "flicker": "flicker"}
 LESS, MORE = "#1f5fb4", "#c76f14"
 
 
@@ -24,7 +24,7 @@ def ablation_chart(result: dict):
             axes.axvline(0, color="#444444", linewidth=0.8)
             axes.invert_yaxis()
             axes.grid(axis="x", alpha=0.25)
-            axes.set(xlabel=f"change of {label} (whole recipe: {whole[key]:.2f})")
+            axes.set(xlabel=f"{label}, less {whole[key]:.2f} of the whole recipe")
             axes.tick_params(axis="y", length=0, labelleft=key == "psnr_coded")
         row[0].set_title(f"{capture}, {whole['frames']} frames, {whole['preset']}", loc="left", weight="bold")
     machine = result["machine"]

@@ -12,6 +12,7 @@ LOOK = {  # recipe -> name, colour
     "v3": ("V3's recipe", "#9a9a9a"),
     "v3-coded": ("V3's recipe and packing", "#555555"),
 }
+SPAN_X, SPAN_Y = 1.6, 0.25  # around the points: a factor, dB
 PANELS = {"seconds_per_frame": "training, seconds a frame", "kb_per_frame": "kB a frame"}
 
 
@@ -47,6 +48,10 @@ def _panel(axes, entries: Sequence[dict], key: str) -> None:
             axes.annotate(preset, at, (4, -9), textcoords="offset points", fontsize=7, color=color)
     axes.grid(alpha=0.25)
     axes.margins(0.14)
+    if entries:  # what lies close together looks so
+        x, y = ([e[k] for e in entries] for k in (key, "psnr_fg"))
+        axes.set_xlim(min(x) / SPAN_X, max(x) * SPAN_X)
+        axes.set_ylim(min(y) - SPAN_Y, max(y) + SPAN_Y)
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter("")
