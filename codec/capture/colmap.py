@@ -108,17 +108,13 @@ def _mask(folder: Path, image: Path) -> Path | None:
 
 
 def _camera(name: str, image: _Image, lens: _Lens | None) -> Camera:
+    from scipy.spatial.transform import Rotation
+
     if lens is None:
         raise CaptureError(f"the model has no camera {image.lens}")
     fx, fy, cx, cy, *distortion = lens.params
-    w, x, y, z = image.quat / max(np.linalg.norm(image.quat), 1e-12)
-    R = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turns = 0 < np.linalg.norm(image.quat) < np.inf  # others are refused as no rotation
+    R = Rotation.from_quat(np.roll(image.quat, -1)).as_matrix() if turns else np.zeros((3, 3))
     viewmat = rigid(R, image.translation)
     lens_terms = np.array((distortion + [0.0] * 4)[:4])
     return Camera(name, pinhole(fx, fy, cx, cy), viewmat, lens.width, lens.height, lens_terms)

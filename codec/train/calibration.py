@@ -100,22 +100,19 @@ class Extrinsics(_Learned):
         """`camera` (the view of the capture's camera `index`, or a crop of it) where it really stands."""
         if not self.values[index].any():
             return camera
-        R, t = _rotation(self.values[index, :3]), self.radius * self.values[index, 3:]
+        from scipy.spatial.transform import Rotation
+
+        R, t = Rotation.from_rotvec(self.values[index, :3]).as_matrix(), self.radius * self.values[index, 3:]
         moved = np.eye(4)
         moved[:3, :3], moved[:3, 3] = R, self.middle + t - R @ self.middle
         return replace(camera, viewmat=camera.viewmat @ moved)
 
-    def gradient(self, means: np.ndarray, quats: np.ndarray, by_means: np.ndarray, by_quats: np.ndarray) -> np.ndarray:
-        """[6], of the loss by the motion, from those by the Gaussians' own: to first order it moves them all."""
+    def learn(self, camera: int, params: dict, grads: dict, fade: float) -> None:
+        """As of `_Learned`, from the loss's gradients by the Gaussians: to first order the motion moves them all."""
+        if self._settled:
+            return
+        means, quats, by_means, by_quats = (x[n].numpy() for x in (params, grads) for n in ("means", "quats"))
         torque = np.cross(means - self.middle, by_means).sum(0)
         w, u = quats[:, :1], quats[:, 1:]  # half of (0, e) times (w, u) is (-e.u, w e + e x u) / 2
         torque += 0.5 * (w * by_quats[:, 1:] - by_quats[:, :1] * u + np.cross(u, by_quats[:, 1:])).sum(0)
-        return np.concatenate([torque, self.radius * by_means.sum(0)])
-
-
-def _rotation(v: np.ndarray) -> np.ndarray:
-    """[3] rotation vector -> [3, 3] (Rodrigues)."""
-    angle = np.linalg.norm(v)
-    x, y, z = v / max(angle, 1e-12)
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]], np.float64)
-    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+        super().learn(camera, np.concatenate([torque, self.radius * by_means.sum(0)]), fade)

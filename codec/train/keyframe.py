@@ -107,8 +107,7 @@ def train_keyframe(
         rate = radius * MEANS_RATE[0] * (MEANS_RATE[1] / MEANS_RATE[0]) ** fade
         if step >= APPEARANCE_FROM * steps:
             views.exposure.learn(target.index, result.grad_gain, 0.1**fade)
-            arrays = [x[n].numpy() for x in (model.params, result.grads) for n in ("means", "quats")]
-            views.extrinsics.learn(target.index, views.extrinsics.gradient(*arrays), 0.1**fade)
+            views.extrinsics.learn(target.index, model.params, result.grads, 0.1**fade)
         model.adam(result.grads, {"means": rate, **{n: r * 0.1**fade for n, r in RATES.items()}})
         if step == int(APPEARANCE_FROM * steps):
             model.set_degree(settings.sh_degree)
