@@ -111,6 +111,7 @@ def test_a_headset_sees_the_scene_with_two_eyes(on_gpu, gsv):
     level, radius = on_gpu.eval(f"[Array.from({PLAYER}.camera.level()), {PLAYER}.camera.radius]")
     on_gpu.eval(f"{part('[data-do=vr]')}.click()")
     on_gpu.wait(f"{PLAYER}.engine.gpu.head")
+    on_gpu.wait("!!window.eyes")  # the first frame of the session is drawn
     stream = open_stream(gsv)
     want = []
     for x in (-0.03, 0.03):
