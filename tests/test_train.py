@@ -303,6 +303,18 @@ def test_masks_say_where_nothing_is():
     assert shown[2:] == [0, 0]
 
 
+def test_light_that_comes_on_ends_a_group_and_not_the_subject():
+    dark = blob(200)
+    lit = dataclasses.replace(dark, sh0=dark.sh0 + 0.6)
+    capture = capture_of(GaussianSequence(25.0, [Group([g]) for g in (dark,) * 5 + (lit,) * 2]))
+    first, second = train_groups(capture, dataclasses.replace(TINY, gop=8))
+    assert (len(first), len(second)) == (5, 2)
+    assert second.parents is not None
+    np.testing.assert_array_equal(first.frames[0].sh0, first.frames[4].sh0)
+    still = psnr_of(first.frames[0], capture, 0)
+    assert min(psnr_of(g, capture, 5) for g in second.frames) > still - 2
+
+
 def test_laplace_bits_are_code_lengths():
     x = torch.arange(-200, 201).float()
     for b in (0.1, 0.5, 2.0, 20.0):

@@ -35,6 +35,10 @@ class Changes:
         changes.fitted = [changes._picture(i, frame) for i in views.train_cameras]
         return changes
 
+    def copy(self) -> Changes:
+        """The same, to look ahead with."""
+        return Changes(self.views, [picture.copy() for picture in self.fitted])
+
     def _picture(self, camera: int, frame: int) -> np.ndarray:
         """[h, w, 3] u8, small, over mid-grey."""
         import cv2

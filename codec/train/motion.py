@@ -37,6 +37,9 @@ PAYS, LOSS_FLOOR = 1.2, 0.001  # what is near
 SMALL = 0.5  # scale of the pictures in the first half of the steps
 LOSS_WINDOW = 20  # steps over which a loss is averaged: about every view once
 TURN_RATE, MOVE_RATE = 2e-2, 3e-3  # of the nodes: radians, radii
+# Where no velocity is known yet, a first round at small pictures: the nodes hold together, and the Gaussians' own rates
+# are slow, or else what has moved far takes the colours of what it lies over.
+STIFF, SLOW = 25.0, 0.1  # times the rigidity and the rates
 MASK_LAMBDA = 3.0  # the silhouette counts more than in a keyframe: it does not depend on light
 # The Gaussians' own: what light changes is quick, place and shape are slow, so that the nodes take the motion.
 RATES = {"quats": 6e-4, "log_scales": 6e-3, "logit_opacities": 2e-2, "sh0": 5e-2, "shN": 2.5e-3}
@@ -85,8 +88,7 @@ class Tracker:
         means = key.params["means"]
         moving = np.ones(len(key), bool)
         if len(frames) > 1:
-            peek = Changes(views, [picture.copy() for picture in changes.fitted])
-            seen = peek.behind(peek.advance(frames[1]), means.numpy(), visible)
+            seen = changes.behind(changes.copy().advance(frames[1]), means.numpy(), visible)
             moving = seen if seen.any() else moving
         radius = subject_radius(means[moving].numpy())
         sizes = torch.ones(len(key))
@@ -128,8 +130,10 @@ class Tracker:
     def _fit(self, frame: int, on_step) -> None:
         fit = _Fit(self, np.random.default_rng([self.settings.seed, frame, 1]))
         bound, loss = PAYS * self.loss + LOSS_FLOOR, np.inf
+        if not self.pose.move.any():
+            self._round(fit, frame, 1.0, on_step)
         for turn in range(ROUNDS):
-            before, loss = loss, self._round(fit, frame, SMALL if turn == 0 else 1.0, on_step)
+            before, loss = loss, self._round(fit, frame, 0.5 if turn == 0 else 0.0, on_step)
             if loss < bound or loss > 0.9 * before:
                 break
         self.own, self.pose = fit.result()
@@ -205,21 +209,30 @@ class Tracker:
         near = torch.from_numpy(cKDTree(there.numpy()).query(means.numpy())[1])
         return rest[near] + rotate(quat_conjugate(turned[near]), means - there[near])
 
-    def _round(self, fit: _Fit, frame: int, scale: float, on_step) -> float:
-        """`motion_steps` views, the first half of them at `scale` of their size; returns the image loss at the end."""
+    def _round(self, fit: _Fit, frame: int, coarse: float, on_step) -> float:
+        """`motion_steps` views, the first share of them, `coarse`, small; returns the image loss at the end."""
         losses, steps = [], self.settings.motion_steps
         for step in range(steps):
-            first = 2 * step < steps
-            target = self.views.draw(frame, scale if first else 1.0)
-            losses.append(fit.step(target, 0.1 ** (step / steps), not first))
+            full = step >= coarse * steps
+            target = self.views.draw(frame, 1.0 if full else SMALL)
+            losses.append(fit.step(target, 0.1 ** (step / steps), full, stiff=coarse == 1))
             if on_step:
                 on_step(step, losses[-1])
         return float(np.mean(losses[-LOSS_WINDOW:]))
 
+    def stirred(self, frame: int, before: torch.Tensor) -> float:
+        """Share of the Gaussians that `frame`, the next one, shows otherwise, beyond those of `before` ([N] bool)."""
+        new = self._behind(self.changes.copy().advance(frame), frame) & ~before.numpy()
+        return float(new.mean()) if len(new) else 0.0
+
     def _moving(self, frame: int) -> np.ndarray:
         """[N] bool: Gaussians that `frame` shows otherwise."""
-        masks, model = self.changes.advance(frame), self.model
-        self.masks = masks
+        self.masks = self.changes.advance(frame)
+        return self._behind(self.masks, frame)
+
+    def _behind(self, masks: list[np.ndarray], frame: int) -> np.ndarray:
+        """[N] bool: Gaussians behind the changed pixels of `frame` (`masks`)."""
+        model = self.model
         if not any(m.any() for m in masks):
             return np.zeros(len(model), bool)
         looks = look(model.params, self.views, frame, self.settings, self.workspace, SMALL)
@@ -267,15 +280,15 @@ class _Fit:
     def _pose(self) -> Pose:
         return replace(self.t.pose, turn=self.turn, move=self.move).ahead()
 
-    def step(self, target, fade: float, full: bool) -> float:
-        """One view; rates times `fade`; a `full` one counts for what pulls at the Gaussians."""
+    def step(self, target, fade: float, full: bool, stiff: bool) -> float:
+        """One view; rates times `fade`; a `full` one counts for what pulls at the Gaussians; `stiff`: see STIFF."""
         t, pose = self.t, self._pose()
         params, turned = t.carried(self.own, pose)
         result = compare(params, target, t.settings, self.rng, t.workspace)
         if full:
             self.pull.add(result)
         grads = result.grads
-        rigid = t.settings.rigidity * t.graph.rigidity(pose)
+        rigid = (STIFF if stiff else 1.0) * t.settings.rigidity * t.graph.rigidity(pose)
         for g in self.optimizer.param_groups:
             g["lr"] = g["base"] * fade
         self.optimizer.zero_grad()
@@ -286,6 +299,7 @@ class _Fit:
         self.optimizer.step()
         back = quat_multiply(quat_conjugate(turned.detach()), grads["quats"])
         rates = {"means": MEANS_RATE * t.radius, **RATES}
+        fade *= SLOW if stiff else 1.0
         own = {n: g * self.moving.view(-1, *[1] * (g.dim() - 1)) for n, g in {**grads, "quats": back}.items()}
         self.own.adam(own, {n: r * fade for n, r in rates.items()})
         return result.loss - t.settings.mask_lambda * result.mask

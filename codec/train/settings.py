@@ -30,7 +30,7 @@ class TrainSettings:
     gop: int = 20
     keyframe_steps: int = 1500
     motion_steps: int = 200
-    finetune_steps: int = 80
+    finetune_steps: int = 160
     gaussians_max: int = 17500
     initial_points: int = 8000
     sh_degree: int = 1
@@ -38,7 +38,7 @@ class TrainSettings:
     mask_lambda: float = 0.1
     cut_ratio: float = 2.0
     rigidity: float = 0.1
-    rate_lambda: float = 0.2
+    rate_lambda: float = 0.4
     quality: float = 50.0
     seed: int = 0
 

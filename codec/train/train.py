@@ -29,6 +29,8 @@ from gscodec.train.sweep import shell, sweep
 from gscodec.train.views import Views
 
 CUT_FLOOR = 0.004  # image loss that no frame is cut for: clean pictures fit far better than they need to
+STIRRED = 0.25  # share of the Gaussians that begin to change in one frame, for which a group ends
+SETTLED = 4  # frames that a group has at least before that
 SWEEP_LEAST = 0.1  # of the initial points that a plane sweep must find, to be a scene with texture
 
 
@@ -231,15 +233,14 @@ class _Run:
         """Trains one group; it ends before `frames` does where the Gaussians no longer serve."""
         track = _Track()
         self.views.restart()
-        if self.subject is not None:
-            self._follow(frames, track)
+        lost = self.subject is not None and self._follow(frames, track)
         parents = self.subject.parents if track.models else None
         if parents is None:  # nothing to follow, or lost at once
             self.subject = self._keyframe(frames)
             track.add(self.subject.tracker)
-            self._follow(frames[1:], track)
+            lost = self._follow(frames[1:], track)
         subject, done = self.subject, frames[: len(track.models)]
-        if len(done) < len(frames):
+        if lost:
             self.subject = None
         if len(done) == 1 and parents is None:
             subject.canonical = track.models[0]
@@ -263,16 +264,20 @@ class _Run:
         loss = train_keyframe(model, self.views, frames[0], s, steps=s.keyframe_steps, radius=radius, on_step=on_step)
         return Subject(Tracker.start(model, self.views, s, loss, frames), loss, radius)
 
-    def _follow(self, frames: range, track: _Track) -> None:
-        """Adds the frames to `track` until the subject is lost."""
+    def _follow(self, frames: range, track: _Track) -> bool:
+        """Adds the frames to `track`; True: until the subject was lost. It also ends where much that has stood still
+        changes at once: with few temporal frequencies, light that comes on would show in all frames of the group."""
         subject = self.subject
         for frame in frames:
+            if len(track.models) >= SETTLED and subject.tracker.stirred(frame, track.moved()) > STIRRED:
+                return False
             loss = subject.tracker.advance(frame, self._report(f"track {frame}"))
             if loss is not None and loss > self.settings.cut_ratio * subject.loss + CUT_FLOOR:
-                break
+                return True
             if loss is not None:
                 subject.tracker.bear(frame, self._report(f"births {frame}"))
             track.add(subject.tracker)
+        return False
 
     def _finetuned(self, subject: Subject, frames: range, track: _Track) -> GroupModel:
         steps = steps_for(self.settings.quality, subject.radius)
