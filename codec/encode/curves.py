@@ -98,7 +98,11 @@ def back(coded: np.ndarray, curves: list[Curve] | None) -> np.ndarray:
     return np.stack([c.values(v) for v, c in zip(coded.T, curves, strict=True)], 1) if curves else coded
 
 
+def rises(coded: np.ndarray, curves: list[Curve]) -> np.ndarray:
+    """[N, C], how much larger steps of values are than those that are coded."""
+    return np.stack([c.rise(v) for v, c in zip(coded.T, curves, strict=True)], 1)
+
+
 def sensitivities(weights: dict[str, np.ndarray], values: dict[str, np.ndarray], curves: dict) -> dict[str, np.ndarray]:
     """`weights` of coded values; `values`: attribute -> [N, C], coded."""
-    rises = {n: np.stack([c.rise(v) for v, c in zip(values[n].T, own, strict=True)], 1) for n, own in curves.items()}
-    return weights | {n: weights[n] * rise**2 for n, rise in rises.items()}
+    return weights | {n: weights[n] * rises(values[n], own) ** 2 for n, own in curves.items()}

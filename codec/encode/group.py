@@ -7,8 +7,9 @@ what motion leaves over. Every later stage works on the values that the decoder 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
 from gscodec.encode.importance import Importance, coarsest, measure, steps_for_error
 from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes
+from gscodec.encode.refine import refine
 from gscodec.gaussians import Gaussians, Group
 from gscodec.gaussians import Nodes as GivenNodes
 
@@ -28,7 +30,7 @@ GRID_BITS_MAX = 21
 SHIFTED = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
 LEVEL_RANGE = (3, 97)  # percentiles of log sensitivity between which layers are even
 LEAST_LEVEL = 1e-4  # of the mean sensitivity
-STILL_LAYERS, STILL_LEAST = 3, 1000  # layers of a single frame of so many Gaussians
+STILL_LAYERS, STILL_LEAST = 3, 1000  # layers of a single frame of so many Gaussians, which can be refined too
 SHIFT_MOST = 8  # doublings of a layer's step
 PRUNE = 0.3  # a Gaussian goes if the picture without it errs by less than this share of the error per coded Gaussian
 
@@ -233,7 +235,13 @@ class Coded:
 
 
 def code_group(
-    group: Group, quality: float, *, keep_all: bool = False, layers: int | None = None, cameras: list[Camera] = ()
+    group: Group,
+    quality: float,
+    *,
+    keep_all: bool = False,
+    layers: int | None = None,
+    refine_steps: int = 0,
+    cameras: list[Camera] = (),
 ) -> Coded:
     """An independent group in integers.
 
@@ -242,6 +250,7 @@ def code_group(
         quality: 0 to 100.
         keep_all: code every Gaussian, also the invisible ones.
         layers: number of layers of falling importance; None: STILL_LAYERS for many Gaussians in a single frame, else 1.
+        refine_steps: views by which the integers of a single frame are refined.
         cameras: from which the subject was captured, if it was.
     """
     s, layers = stack_group(group), layers or _layers(group)
@@ -278,6 +287,10 @@ def code_group(
     channels = {n: quantize_channels(v, steps[n], weights[n], parts, shifts[n], price) for n, v in values.items()}
     for n, own in curves.items():
         channels[n]["curves"] = [c.row() for c in own]
+    if refine_steps and frames == 1 and len(positions) >= STILL_LEAST:
+        own = {n: v[layer] for n, v in shifts.items()}
+        looking = partial(refine, s.frame(0), grid.to_world(positions), steps=refine_steps, cameras=cameras)
+        channels = _refined(looking, values, channels, own)
     channels["quats"] = inside_unit_ball(channels["quats"], shifts["quats"][layer])
     out = {
         "frames": frames,
@@ -295,6 +308,24 @@ def code_group(
         motion = nodes and carry(nodes, positions, x, frames)
         out |= motion_integers(s, channels, even, measured, price, x, nodes, motion)
     return Coded(out, source, turn[source], axes[source], grid, even, nominal.node_translation)
+
+
+def _refined(refine: Callable[..., dict], values: dict, channels: dict, shifts: dict) -> dict:
+    """`channels` of a single frame with refined integers; `values`: what they were quantized from, `shifts`: [N]."""
+    unit = {n: 2.0 ** shifts[n][:, None].astype(np.float32) for n in channels}
+    step = {n: np.array(c["steps"], np.float32) * unit[n] for n, c in channels.items()}
+    offset = {n: np.array(c["offsets"], np.float32) for n, c in channels.items()}
+    curves = {n: curves_of(c) for n, c in channels.items()}
+
+    def decode(q):
+        coded = {n: offset[n] + step[n] * v for n, v in q.items()}
+        slopes = {n: step[n] * curved.rises(coded[n], curves[n]) if curves[n] else step[n] for n in coded}
+        return {n: curved.back(v, curves[n]) for n, v in coded.items()}, slopes
+
+    latents = {n: (values[n] - offset[n]) / step[n] for n in channels}
+    q = {n: c["values"].T / unit[n] for n, c in channels.items()}
+    q = refine(latents, q, decode)
+    return {n: c | {"values": (q[n] << shifts[n][:, None]).T.astype(np.int32)} for n, c in channels.items()}
 
 
 def _layers(group: Group) -> int:

@@ -1,0 +1,83 @@
+"""Refinement of a single frame: integers move to where the picture is nearest to the source, given all other integers.
+
+Rounding each channel on its own leaves errors that a neighbour could make up for. Views that no step has seen before
+are drawn of source and decoded frame; the gradient of their squared difference moves what lies under the integers, and
+passes straight through the rounding (Bengio et al. 2013). Positions stay: they give the order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from gscodec.bitstream.color import TO_RGB
+from gscodec.camera import Camera
+from gscodec.encode.importance import derivatives, sensitivity_cameras
+from gscodec.gaussians import Gaussians
+from gscodec.render.workspace import PARAMETERS, Workspace, call
+
+RATE = 0.01  # quantization steps a step, at first
+BETAS, EPS = (0.9, 0.99), 1e-30
+INSIDE = 0.3  # of a quantization step: as far from an integer that is not the nearest starts what is under it
+
+
+def refine(
+    source: Gaussians,
+    means: np.ndarray,
+    latents: dict[str, np.ndarray],
+    integers: dict[str, np.ndarray],
+    decode: Callable[[dict], tuple[dict, dict]],
+    *,
+    steps: int,
+    cameras: list[Camera] = (),
+) -> dict[str, np.ndarray]:
+    """Better integers: attribute -> [N, C] i32.
+
+    Args:
+        source: N Gaussians, as they are to look. means: [N, 3], decoded.
+        latents: attribute -> [N, C], what was quantized, in quantization steps of each Gaussian.
+        integers: attribute -> [N, C], what it was quantized to.
+        decode: integers -> values, and how much they change with an integer; attribute -> [N, C] each.
+        steps: views that are looked at. cameras: those of the capture.
+    """
+    background, workspace = (0.5, 0.5, 0.5), Workspace()
+    x = {}
+    for n, q in integers.items():
+        near = np.rint(latents[n]) == q
+        x[n] = np.where(near, latents[n], np.clip(latents[n], q - INSIDE, q + INSIDE)).astype(np.float32)
+    first, second = ({n: np.zeros_like(v) for n, v in x.items()} for _ in range(2))
+    views, original = sensitivity_cameras(source.means, cameras, steps), _arrays(source)
+    for step, i in enumerate(np.random.default_rng(0).permutation(len(views)), 1):
+        camera = views[i]
+        target, _ = workspace.forward(original, camera, background)
+        values, slopes = decode({n: np.rint(v) for n, v in x.items()})
+        frame = _frame(means, values)
+        arrays = _arrays(frame)
+        image, _ = workspace.forward(arrays, camera, background, training=True)
+        grads, statistics = workspace.gradients(arrays)
+        for a in grads + statistics:
+            a.fill(0)
+        difference, shape = np.ascontiguousarray(image - target), image.shape[:2]
+        call(workspace.native.backward, arrays, difference, np.zeros(shape, np.float32), (grads, statistics))
+        rate = RATE * (1 - (step - 1) / len(views))
+        derivative = derivatives(frame, dict(zip(PARAMETERS, grads, strict=True)))
+        for n, v in x.items():
+            d = derivative[n] * slopes[n]
+            first[n] += (1 - BETAS[0]) * (d - first[n])
+            second[n] += (1 - BETAS[1]) * (d * d - second[n])
+            size = np.sqrt(second[n] / (1 - BETAS[1] ** step)) + EPS
+            v -= rate * first[n] / (1 - BETAS[0] ** step) / size
+    return {n: np.rint(v).astype(np.int32) for n, v in x.items()}
+
+
+def _frame(means: np.ndarray, values: dict[str, np.ndarray]) -> Gaussians:
+    v, count = values["quats"], len(means)
+    quats = np.concatenate([np.sqrt(np.maximum(1e-6, 1 - (v * v).sum(1, keepdims=True))), v], 1)
+    shN = values.get("shN", np.zeros((count, 0))).reshape(count, -1, 3) @ TO_RGB.T
+    colors = values["sh0"] @ TO_RGB.T
+    return Gaussians(means, quats, values["log_scales"], values["logit_opacities"][:, 0], colors, shN)
+
+
+def _arrays(g: Gaussians) -> tuple[np.ndarray, ...]:
+    return tuple(np.ascontiguousarray(getattr(g, name), np.float32) for name in PARAMETERS)
