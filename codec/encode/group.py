@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import product
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
 from gscodec.encode.importance import Importance, coarsest, measure, steps_for_error
 from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes
-from gscodec.encode.refine import refine
+from gscodec.encode.refine import QUALITY_LEAST, refine
 from gscodec.gaussians import Gaussians, Group
 from gscodec.gaussians import Nodes as GivenNodes
 
@@ -250,7 +251,7 @@ def code_group(
         quality: 0 to 100.
         keep_all: code every Gaussian, also the invisible ones.
         layers: number of layers of falling importance; None: STILL_LAYERS for many Gaussians in a single frame, else 1.
-        refine_steps: views by which the integers of a single frame are refined.
+        refine_steps: views by which a single frame of many Gaussians is refined, from QUALITY_LEAST on.
         cameras: from which the subject was captured, if it was.
     """
     s, layers = stack_group(group), layers or _layers(group)
@@ -287,10 +288,10 @@ def code_group(
     channels = {n: quantize_channels(v, steps[n], weights[n], parts, shifts[n], price) for n, v in values.items()}
     for n, own in curves.items():
         channels[n]["curves"] = [c.row() for c in own]
-    if refine_steps and frames == 1 and len(positions) >= STILL_LEAST:
+    if refine_steps and frames == 1 and len(positions) >= STILL_LEAST and quality >= QUALITY_LEAST:
         own = {n: v[layer] for n, v in shifts.items()}
         looking = partial(refine, s.frame(0), grid.to_world(positions), steps=refine_steps, cameras=cameras)
-        channels = _refined(looking, values, channels, own)
+        channels = _refined(looking, values, channels, own, weights, parts, price)
     channels["quats"] = inside_unit_ball(channels["quats"], shifts["quats"][layer])
     out = {
         "frames": frames,
@@ -310,8 +311,11 @@ def code_group(
     return Coded(out, source, turn[source], axes[source], grid, even, nominal.node_translation)
 
 
-def _refined(refine: Callable[..., dict], values: dict, channels: dict, shifts: dict) -> dict:
-    """`channels` of a single frame with refined integers; `values`: what they were quantized from, `shifts`: [N]."""
+def _refined(
+    refine: Callable[..., dict], values: dict, channels: dict, shifts: dict, weights: dict, layers: list, price: float
+) -> dict:
+    """`channels` of a single frame with refined integers; `values`: what they were quantized from, `shifts`: [N]; the
+    others as in `quantize_channels`."""
     unit = {n: 2.0 ** shifts[n][:, None].astype(np.float32) for n in channels}
     step = {n: np.array(c["steps"], np.float32) * unit[n] for n, c in channels.items()}
     offset = {n: np.array(c["offsets"], np.float32) for n, c in channels.items()}
@@ -324,7 +328,12 @@ def _refined(refine: Callable[..., dict], values: dict, channels: dict, shifts: 
 
     latents = {n: (values[n] - offset[n]) / step[n] for n in channels}
     q = {n: c["values"].T / unit[n] for n, c in channels.items()}
-    q = refine(latents, q, decode)
+    margins = {n: [np.zeros(v.shape, np.float32) for _ in range(2)] for n, v in q.items()}
+    for n, v in q.items():
+        for (own, near), c in product(layers, range(v.shape[1])):
+            found = rdo.margins(v[own, c], weights[n][own, c] * step[n][own, c] ** 2, near, price)
+            margins[n][0][own, c], margins[n][1][own, c] = found
+    q = refine(latents, q, margins, decode)
     return {n: c | {"values": (q[n] << shifts[n][:, None]).T.astype(np.int32)} for n, c in channels.items()}
 
 
