@@ -19,7 +19,7 @@ from gscodec.bench.baselines import BASELINES, Baseline
 from gscodec.bench.machine import commit, update_entries
 from gscodec.bench.sequences import SINGLE, open_case
 from gscodec.decode import open_stream
-from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
+from gscodec.encode.encode import REFINE, EncodeSettings, encode_groups, stream_config
 from gscodec.errors import UsageError
 from gscodec.gaussians import Gaussians, GaussianSequence, Group
 from gscodec.metrics import bd_rate, evaluate_splats, rising
@@ -49,9 +49,10 @@ def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[
     groups = [replace(group, frames=list(group.frames)) for group in sequence.groups]
     picked = list(range(0, sequence.frame_count, EVERY))
     settings = {f"quality {q}": {"quality": q} for q in QUALITIES} if codec == OURS else BASELINES[codec].settings
+    alone = {"refine": REFINE} if sequence_name in SINGLE and codec == OURS else {}
     for name, setting in settings.items():
         if codec == OURS:
-            size, frames, encode_s, decode_s, decoded = _ours(sequence, groups, setting)
+            size, frames, encode_s, decode_s, decoded = _ours(sequence, groups, setting | alone)
         else:
             size, frames, encode_s, decode_s, decoded = _peer(BASELINES[codec], groups, picked, setting)
         quality = evaluate_splats(decoded, sequence, picked)["codec_psnr"]

@@ -75,6 +75,10 @@ def encode(
         int | None,
         typer.Option(help="Layers of importance; the first ones alone are a coarser picture.", show_default="auto"),
     ] = None,
+    refine: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Views to refine splats coded alone by.", show_default="100 for a frame"),
+    ] = None,
     ray: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Train on this Ray cluster; its machines see SEQ too.")
     ] = None,
@@ -86,7 +90,7 @@ def encode(
     from gscodec.progress import Bar
 
     with Bar() as bar:
-        settings = EncodeSettings(quality, _bits(bitrate), keep_all, random_access, layers)
+        settings = EncodeSettings(quality, _bits(bitrate), keep_all, random_access, layers, refine)
         result = encode_input(seq, out, settings, preset=preset, frames=frames, gop=gop, cluster=ray, bar=bar)
     if report:
         report.write_text(json.dumps(result.to_json(), indent=1))

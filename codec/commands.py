@@ -9,14 +9,14 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from gscodec.camera import Camera
-from gscodec.encode.encode import EncodeReport, EncodeSettings, encode_groups, stream_config
+from gscodec.encode.encode import REFINE, EncodeReport, EncodeSettings, encode_groups, stream_config
 from gscodec.errors import UsageError, require
 from gscodec.frames import frame_range
 from gscodec.gaussians import GaussianSequence, Group
@@ -62,6 +62,8 @@ def _encode_splats(source, out, settings, frames, gop, bar) -> EncodeReport:
     require("scipy", "encoding")
     sequence = _restrict(_open_splats(source, gop, bar), frames)
     total = sequence.frame_count
+    if settings.refine is None and total == 1:
+        settings = replace(settings, refine=REFINE)
     cameras = sequence.cameras
     first = sequence.frame(0)
     longest = max(len(g) for g in sequence.groups)

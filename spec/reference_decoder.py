@@ -225,6 +225,14 @@ def blend_nodes(group, x0, t):
     return x, np.where(length < 1e-12, q[j[:, 0]], total / np.maximum(length, 1e-12))
 
 
+def bent(v, low, width, slopes):
+    """Clause 13.1: [N] along the curve of its channel."""
+    rise = 2.0 ** (np.array(slopes) / 16)
+    before = np.concatenate([[0], rise.cumsum()])
+    j = np.clip(np.floor((v - low) / width), 0, 7).astype(int)
+    return low + width * before[j] + rise[j] * (v - low - j * width)
+
+
 def unit(v):
     """Clause 13.4: [N, 3] -> wxyz [N, 4]."""
     return np.concatenate([np.sqrt(np.maximum(0, 1 - (v * v).sum(-1, keepdims=True))), v], -1)
@@ -248,7 +256,10 @@ def evaluate(group, t):
 
     def canonical(a):  # [N, C]
         steps, offsets = h.channels[a]
-        return np.array(offsets) + np.array(steps) * group.channels[a].T + group.correction.get(a, 0.0)
+        values = np.array(offsets) + np.array(steps) * group.channels[a].T
+        if a in h.curves:
+            values = np.stack([bent(v, *curve) for v, curve in zip(values.T, h.curves[a], strict=True)], 1)
+        return values + group.correction.get(a, 0.0)
 
     def delta(a):  # [N, C]
         if a not in h.trajectories:

@@ -8,7 +8,8 @@ from reference_container import LEVELS, PAIRS, LimitError, Reader, require
 # ---- 3. Group payload -----------------------------------------------------------------------------------------------
 
 GROUP_HEADER, POSITIONS, CHANNELS, LIFETIMES, NODE_POSITIONS, NODE_TRAJECTORIES, TRAJECTORIES = range(7)
-STEP_CLASSES, DEATHS, LAYER_CORRECTION = range(7, 10)
+DEATHS, LAYER_CORRECTION = 8, 9
+UNIT_TYPES = (*range(7), DEATHS, LAYER_CORRECTION)
 MUST_DEPEND_ON = {
     CHANNELS: (POSITIONS,),
     LIFETIMES: (POSITIONS, DEATHS),
@@ -60,7 +61,7 @@ def read_units(payload, layers=256):
         require(increasing, f"unit {index}: dependencies {dependencies} are not increasing indices below {index}")
         require(not units or units[-1].layer <= layer, f"unit {index}: layer {layer} after a higher one")
         unit = Unit(unit_type, layer, attribute, dependencies, body)
-        second = unit_type <= LAYER_CORRECTION and any(unit.key() == u.key() for u in units)
+        second = unit_type in UNIT_TYPES and any(unit.key() == u.key() for u in units)
         require(not second, f"unit {index}: second unit of (type, layer, attribute) {unit.key()}")
         if index == 0 and unit_type == GROUP_HEADER:
             sizes = [size, *read_opening(Reader(body, 0, len(body), "group_header"))[3]]
@@ -81,8 +82,7 @@ def check_units(units, header, layers):
         optional |= {(LIFETIMES, k, 0), (LAYER_CORRECTION, k, LOG_SCALES), (LAYER_CORRECTION, k, LOGIT_OPACITIES)}
     found = {}
     for index, unit in enumerate(units):
-        require(unit.unit_type != STEP_CLASSES, f"unit {index}: unsupported tool step_classes")
-        if unit.unit_type > LAYER_CORRECTION:
+        if unit.unit_type not in UNIT_TYPES:
             continue  # unknown: skipped
         announced = unit.key() in required | optional
         require(announced, f"unit {index}: (type, layer, attribute) {unit.key()} is not announced by the header")
@@ -118,6 +118,7 @@ class Header:
     channels: dict  # attribute -> (steps, offsets)
     trajectories: dict  # attribute -> (K_a, step)
     shifts: list  # of each layer, attribute -> low bits that are not coded; MEANS: of positions
+    curves: dict  # attribute -> (low, width, slopes) of each channel; without curves empty
     node_count: int = 0
     neighbors: int = 0
     node_coefficients: int = 0
@@ -129,9 +130,8 @@ def read_opening(r):
     """Clause 4: frames, flags, reference (0: independent) and the sizes of the units behind the header, if it tells."""
     frames, flags = r.u16(), r.u8()
     require(frames >= 1, "group_header: frames is 0")
-    wanted = "bits 4 to 7 must be 0, and bit 3 in a predicted group"
-    require(flags < (8 if flags & 1 else 16), f"group_header: flags are {flags:#x}, {wanted}")
-    require(not flags & 2, "group_header: unsupported tool step_classes")
+    wanted = "bits 4 to 7 must be 0, and bits 1 and 3 in a predicted group"
+    require(not flags & (0xFA if flags & 1 else 0xF0), f"group_header: flags are {flags:#x}, {wanted}")
     reference = r.u16() if flags & 1 else 0
     require(reference or not flags & 1, "group_header: reference is 0, expected >= 1")
     return frames, flags, reference, [r.u32() for _ in range(r.u8() if flags & 4 else 0)]
@@ -200,6 +200,12 @@ def read_shifts(r, layer_count, grid_bits, attributes):
     return shifts
 
 
+def read_curves(r):
+    """Clause 4: attribute -> (low, width, slopes) of each channel."""
+    curve = lambda: (r.f32("low of a curve"), r.f32("width of a curve", positive=True), list(r.take(8)))  # noqa: E731
+    return {LOG_SCALES: [curve() for _ in range(3)], LOGIT_OPACITIES: [curve()]}
+
+
 def expected_map_width_log2(count):
     """Clause 7.2."""
     return (count.bit_length() - 1) >> 1 if count else 0
@@ -213,13 +219,14 @@ def read_group_header(payload, reference=None):
         require(reference is not None and not reference.reference, "group_header: no independent group to refer to")
         layers, channels = read_layers(r, reference), reference.channels
         grid = reference.origin, reference.grid_step, reference.grid_bits, reference.sh_degree
-        shifts = reference.shifts
+        shifts, curves = reference.shifts, reference.curves
     else:
         grid = read_grid(r)
         layers = read_layers(r, None)
         channels = read_channels(r, grid[3])
         unshifted = [dict.fromkeys((MEANS, *channels), 0)] * len(layers)
         shifts = read_shifts(r, len(layers), grid[2], channels) if flags & 8 else unshifted
+        curves = read_curves(r) if flags & 2 else {}
     sh_degree = grid[3]
     trajectories, last = {}, 0
     for _ in range(r.u8()):
@@ -229,7 +236,7 @@ def read_group_header(payload, reference=None):
         require(1 <= coefficients <= frames, f"group_header: {coefficients} coefficients, expected 1 to {frames}")
         trajectories[attribute] = coefficients, r.f32("trajectory step", positive=True)
         last = attribute
-    header = Header(frames, back, *grid, layers, channels, trajectories, shifts, r.u32())
+    header = Header(frames, back, *grid, layers, channels, trajectories, shifts, curves, r.u32())
     if header.node_count:
         header.neighbors, header.node_coefficients = r.u8(), r.u16()
         require(1 <= header.neighbors <= 8, f"group_header: neighbors is {header.neighbors}, expected 1 to 8")

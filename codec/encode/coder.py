@@ -54,13 +54,21 @@ class GroupCoder:
     """Codes groups in their order. A shallow copy is a coder of its own, for trying.
 
     Args:
-        keep_all, layers, cameras: as in `code_group`.
+        keep_all, layers, refine_steps, cameras: as in `code_group`.
         random_access: frames from one independent group to the next at most; 0 or 1: every group is independent.
     """
 
-    def __init__(self, *, keep_all: bool, layers: int | None, random_access: int, cameras: list[Camera] = ()):
+    def __init__(
+        self,
+        *,
+        keep_all: bool,
+        layers: int | None,
+        random_access: int,
+        refine_steps: int = 0,
+        cameras: list[Camera] = (),
+    ):
         self._options = {"keep_all": keep_all, "cameras": cameras}
-        self._layers = layers
+        self._independent_options = {"layers": layers, "refine_steps": refine_steps}
         self._random_access, self._reference = random_access, None
 
     def code(self, group: Group, quality: float) -> CodedGroup:
@@ -78,7 +86,7 @@ class GroupCoder:
         return CodedGroup(payload, units, len(integers["positions"]), False)
 
     def _independent(self, group: Group, quality: float) -> CodedGroup:
-        coded = code_group(group, quality, layers=self._layers, **self._options)
+        coded = code_group(group, quality, **self._independent_options, **self._options)
         payload, units = _native.encode_group(coded.integers)
         if self._random_access > len(group):
             index = np.arange(len(group.frames[0]))

@@ -22,6 +22,7 @@ from gscodec.errors import UsageError
 from gscodec.gaussians import Group
 
 LAYERS_MAX = 16  # spec 4
+REFINE = 100  # views
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,8 @@ class EncodeSettings:
             where their parents are known and it is cheaper. 0 or 1: every group is independent.
         layers: layers of importance in each group, each with its own steps; any first few decode alone. None: what is
             smallest.
+        refine: views by which frames of many Gaussians that are coded alone are refined, from quality 50 on; 0: they
+            are not. None: REFINE for splats of one frame, 0 for all else.
     """
 
     quality: float = 50.0
@@ -43,6 +46,7 @@ class EncodeSettings:
     keep_all: bool = False
     random_access: int = 60
     layers: int | None = None
+    refine: int | None = None
 
     def __post_init__(self):
         if not 0 <= self.quality <= 100:
@@ -53,6 +57,8 @@ class EncodeSettings:
             raise UsageError(f"--random-access {self.random_access} is out of range, expected 0 frames or more")
         if self.layers is not None and not 1 <= self.layers <= LAYERS_MAX:
             raise UsageError(f"--layers {self.layers} is out of range, expected 1 to {LAYERS_MAX}")
+        if self.refine is not None and self.refine < 0:
+            raise UsageError(f"--refine {self.refine} is out of range, expected 0 views or more")
 
 
 @dataclass
@@ -135,6 +141,7 @@ def encode_groups(
     coder = GroupCoder(
         keep_all=settings.keep_all,
         layers=settings.layers,
+        refine_steps=settings.refine or 0,
         random_access=settings.random_access,
         cameras=[c for c in cameras if c.split == "train"],
     )

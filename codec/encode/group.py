@@ -7,8 +7,10 @@ what motion leaves over. Every later stage works on the values that the decoder 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import product
 
 import numpy as np
 
@@ -16,10 +18,12 @@ from gscodec import _native
 from gscodec.bitstream.color import decorrelate
 from gscodec.bitstream.quantization import Steps, error_for, steps_for, subject_radius, trajectory_step
 from gscodec.camera import Camera
+from gscodec.encode import curves as curved
 from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
 from gscodec.encode.importance import Importance, coarsest, measure, steps_for_error
 from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes
+from gscodec.encode.refine import QUALITY_LEAST, refine
 from gscodec.gaussians import Gaussians, Group
 from gscodec.gaussians import Nodes as GivenNodes
 
@@ -27,7 +31,7 @@ GRID_BITS_MAX = 21
 SHIFTED = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
 LEVEL_RANGE = (3, 97)  # percentiles of log sensitivity between which layers are even
 LEAST_LEVEL = 1e-4  # of the mean sensitivity
-STILL_LAYERS, STILL_LEAST = 3, 1000  # layers of a single frame of so many Gaussians
+STILL_LAYERS, STILL_LEAST = 3, 1000  # layers of a single frame of so many Gaussians, which can be refined too
 SHIFT_MOST = 8  # doublings of a layer's step
 PRUNE = 0.3  # a Gaussian goes if the picture without it errs by less than this share of the error per coded Gaussian
 
@@ -105,7 +109,8 @@ def align_axes(s: Stack, middle: int, turn: np.ndarray, order: np.ndarray) -> St
 def quantize_channels(
     values: np.ndarray, steps: np.ndarray, weights: np.ndarray, layers: list[tuple], shifts: np.ndarray, price: float
 ) -> dict:
-    """[N, C] floats -> channels of `encode_group`; offsets are the medians, so that small integers are common.
+    """[N, C] floats, along their curves -> channels of `encode_group`; offsets are the medians, so that small integers
+    are common.
 
     Args:
         layers: of each its Gaussians (slice) and their neighbours (`rdo.neighbours`).
@@ -124,7 +129,13 @@ def quantize_channels(
 def dequantize_channels(channels: dict) -> np.ndarray:
     """[N, C] f64, what the decoder makes of `quantize_channels`."""
     steps, offsets = (np.array(channels[k], np.float32) for k in ("steps", "offsets"))
-    return (offsets + steps * channels["values"].T.astype(np.float32)).astype(np.float64)
+    coded = (offsets + steps * channels["values"].T.astype(np.float32)).astype(np.float64)
+    return curved.back(coded, curves_of(channels))
+
+
+def curves_of(channels: dict) -> list[curved.Curve]:
+    """Of each channel of an attribute; empty if it has none."""
+    return [curved.Curve.of(row) for row in channels.get("curves", ())]
 
 
 @dataclass(frozen=True)
@@ -225,7 +236,13 @@ class Coded:
 
 
 def code_group(
-    group: Group, quality: float, *, keep_all: bool = False, layers: int | None = None, cameras: list[Camera] = ()
+    group: Group,
+    quality: float,
+    *,
+    keep_all: bool = False,
+    layers: int | None = None,
+    refine_steps: int = 0,
+    cameras: list[Camera] = (),
 ) -> Coded:
     """An independent group in integers.
 
@@ -234,6 +251,7 @@ def code_group(
         quality: 0 to 100.
         keep_all: code every Gaussian, also the invisible ones.
         layers: number of layers of falling importance; None: STILL_LAYERS for many Gaussians in a single frame, else 1.
+        refine_steps: views by which a single frame of many Gaussians is refined, from QUALITY_LEAST on.
         cameras: from which the subject was captured, if it was.
     """
     s, layers = stack_group(group), layers or _layers(group)
@@ -244,10 +262,11 @@ def code_group(
     source = np.arange(len(turn)) if keep_all else np.flatnonzero(measured.removal >= PRUNE * error / max(len(turn), 1))
     nominal = steps_for(quality, subject_radius(s.means[middle]))
     even = _steps(s.take(source), measured.take(source), error, nominal)
-    layer = layer_of(measured.take(source), layers)
+    curves, heard = _curves(s.take(source), measured.take(source))
+    layer = layer_of(heard, layers)
     room = {n: np.log2(coarsest(n, subject_radius(s.means[middle])) / v.mean()) for n, v in even.items()}
-    shifts = layer_shifts(measured.take(source), layer, layers, room)
-    steps = _steps(s.take(source), measured.take(source), error, nominal, {n: v[layer] for n, v in shifts.items()})
+    shifts = layer_shifts(heard, layer, layers, room)
+    steps = _steps(s.take(source), heard, error, nominal, {n: v[layer] for n, v in shifts.items()}, curves)
     given = group.nodes if frames > 1 else None
     rest = s.means[middle] if given is None else given.rest
     grid = Grid.around(rest[source], float(steps["means"][0]), room=0 if given is None else 1)
@@ -264,10 +283,15 @@ def code_group(
     parts = [
         (slice(b - n, b), rdo.neighbours(positions[b - n : b])) for n, b in zip(counts, counts.cumsum(), strict=True)
     ]
-    values = canonical_appearance(s) | {"quats": quats[:, 1:]}
-    channels = {
-        n: quantize_channels(v, steps[n], measured.weights[n], parts, shifts[n], price) for n, v in values.items()
-    }
+    values = along_curves(canonical_appearance(s), curves) | {"quats": quats[:, 1:]}
+    weights = curved.sensitivities(measured.weights, values, curves)
+    channels = {n: quantize_channels(v, steps[n], weights[n], parts, shifts[n], price) for n, v in values.items()}
+    for n, own in curves.items():
+        channels[n]["curves"] = [c.row() for c in own]
+    if refine_steps and frames == 1 and len(positions) >= STILL_LEAST and quality >= QUALITY_LEAST:
+        own = {n: v[layer] for n, v in shifts.items()}
+        looking = partial(refine, s.frame(0), grid.to_world(positions), steps=refine_steps, cameras=cameras)
+        channels = _refined(looking, values, channels, own, weights, parts, price)
     channels["quats"] = inside_unit_ball(channels["quats"], shifts["quats"][layer])
     out = {
         "frames": frames,
@@ -285,6 +309,32 @@ def code_group(
         motion = nodes and carry(nodes, positions, x, frames)
         out |= motion_integers(s, channels, even, measured, price, x, nodes, motion)
     return Coded(out, source, turn[source], axes[source], grid, even, nominal.node_translation)
+
+
+def _refined(
+    refine: Callable[..., dict], values: dict, channels: dict, shifts: dict, weights: dict, layers: list, price: float
+) -> dict:
+    """`channels` of a single frame with refined integers; `values`: what they were quantized from, `shifts`: [N]; the
+    others as in `quantize_channels`."""
+    unit = {n: 2.0 ** shifts[n][:, None].astype(np.float32) for n in channels}
+    step = {n: np.array(c["steps"], np.float32) * unit[n] for n, c in channels.items()}
+    offset = {n: np.array(c["offsets"], np.float32) for n, c in channels.items()}
+    curves = {n: curves_of(c) for n, c in channels.items()}
+
+    def decode(q):
+        coded = {n: offset[n] + step[n] * v for n, v in q.items()}
+        slopes = {n: step[n] * curved.rises(coded[n], curves[n]) if curves[n] else step[n] for n in coded}
+        return {n: curved.back(v, curves[n]) for n, v in coded.items()}, slopes
+
+    latents = {n: (values[n] - offset[n]) / step[n] for n in channels}
+    q = {n: c["values"].T / unit[n] for n, c in channels.items()}
+    margins = {n: [np.zeros(v.shape, np.float32) for _ in range(2)] for n, v in q.items()}
+    for n, v in q.items():
+        for (own, near), c in product(layers, range(v.shape[1])):
+            found = rdo.margins(v[own, c], weights[n][own, c] * step[n][own, c] ** 2, near, price)
+            margins[n][0][own, c], margins[n][1][own, c] = found
+    q = refine(latents, q, margins, decode)
+    return {n: c | {"values": (q[n] << shifts[n][:, None]).T.astype(np.int32)} for n, c in channels.items()}
 
 
 def _layers(group: Group) -> int:
@@ -326,6 +376,19 @@ def layer_shifts(measured: Importance, layer: np.ndarray, layers: int, room: dic
     return shifts
 
 
+def _curves(s: Stack, measured: Importance) -> tuple[dict[str, list[curved.Curve]], Importance]:
+    """Curves of attributes, and the importance of what is coded along them."""
+    values = canonical_appearance(s)
+    curves = curved.fit_all(values, measured.weights)
+    weights = curved.sensitivities(measured.weights, along_curves(values, curves), curves)
+    return curves, replace(measured, weights=weights)
+
+
+def along_curves(values: dict[str, np.ndarray], curves: dict[str, list[curved.Curve]]) -> dict[str, np.ndarray]:
+    """`values` (attribute -> [N, C]) as they are coded."""
+    return {n: curved.along(v, curves.get(n)) for n, v in values.items()}
+
+
 def canonical_appearance(s: Stack) -> dict[str, np.ndarray]:
     """[N, C] f64 of each attribute that only adds up over time: the mean over the frames."""
     return {n: v.mean(0, dtype=np.float64) for n, v in s.appearance.items()}
@@ -336,18 +399,24 @@ def measure_stack(s: Stack, cameras: list[Camera] = ()) -> Importance:
     frames, count = s.means.shape[:2]
     if not count:
         sizes = {"means": 3, "quats": 3} | {n: v.shape[2] for n, v in s.appearance.items()}
-        return Importance({n: np.zeros((0, c)) for n, c in sizes.items()}, np.zeros(0))
+        return Importance({n: np.zeros((0, c)) for n, c in sizes.items()}, np.zeros((0, 3)), np.zeros(0))
     return measure([s.frame(t) for t in sorted({0, frames // 2, frames - 1})], cameras)
 
 
 def _steps(
-    s: Stack, measured: Importance, error: float, nominal: Steps, shifts: dict[str, np.ndarray] | None = None
+    s: Stack,
+    measured: Importance,
+    error: float,
+    nominal: Steps,
+    shifts: dict[str, np.ndarray] | None = None,
+    curves: dict | None = None,
 ) -> dict[str, np.ndarray]:
-    """[C] f32 step of each channel of each attribute; those of a Gaussian are 2^shifts ([N] each) times that."""
+    """[C] f32 step of each channel of each attribute; those of a Gaussian are 2^shifts ([N] each) times that.
+    `measured` is that of values along the `curves`."""
     if not len(measured.removal):
         return {n: np.full(w.shape[1], getattr(nominal, n), np.float32) for n, w in measured.weights.items()}
     middle = s.only(len(s.means) // 2)
-    values = {n: v[0] for n, v in middle.appearance.items()}
+    values = along_curves({n: v[0] for n, v in middle.appearance.items()}, curves or {})
     values |= {"means": middle.means[0], "quats": middle.quats[0, :, 1:]}
     return steps_for_error(measured.weights, values, error, subject_radius(middle.means[0]), shifts)
 
@@ -381,7 +450,8 @@ def motion_integers(s: Stack, channels, steps, measured: Importance, price: floa
     out = {"trajectories": {}}
     for name, values in _residual(s, channels, x, motion).items():
         step = trajectory_step(1 / np.sqrt((1 / steps[name].astype(np.float64) ** 2).mean()), len(s.means))
-        coefficients = rdo.trajectory(values, measured.weights[name], step, price)
+        weights = measured.turns if name == "quats" else measured.weights[name]
+        coefficients = rdo.trajectory(values, weights, step, price)
         if coefficients.any():
             out["trajectories"][name] = {"coefficients": coefficients, "step": step}
     if nodes is not None:

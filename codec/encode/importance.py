@@ -17,7 +17,8 @@ from gscodec.camera import Camera, cameras_around
 from gscodec.gaussians import Gaussians
 from gscodec.render.workspace import PARAMETERS, Workspace, call
 
-VIEWS, SIZE = 24, 512
+VIEWS, STILL_VIEWS, SIZE = 24, 48, 512  # STILL_VIEWS of a single frame
+REAL_LEAST = 0.05  # canonical quaternions have 0.5 and more
 # Beyond these steps the derivative says too little; means are in radii of the subject.
 COARSEST = {"means": 0.02, "log_scales": 1.0, "quats": 0.25, "logit_opacities": 2.0, "sh0": 1.0, "shN": 1.0}
 
@@ -28,30 +29,33 @@ class Importance:
 
     Attributes:
         weights: attribute -> [N, C] f64, W of each channel.
+        turns: [N, 3] f64, W of the vector part of a quaternion that the Gaussian's is multiplied by from the left.
         removal: [N] f64, mean squared error of the picture without this Gaussian.
     """
 
     weights: dict[str, np.ndarray]
+    turns: np.ndarray
     removal: np.ndarray
 
     def take(self, index: np.ndarray) -> Importance:
         """The Gaussians at `index`."""
-        return Importance({n: w[index] for n, w in self.weights.items()}, self.removal[index])
+        return Importance({n: w[index] for n, w in self.weights.items()}, self.turns[index], self.removal[index])
 
 
-def sensitivity_cameras(means: np.ndarray, given: list[Camera] = ()) -> list[Camera]:
-    """Cameras on a Fibonacci sphere around the 1-99 % box of `means`, every other one at half the distance; up to half
-    of them are those of the capture, if they are `given`: they may stand within the scene."""
-    taken = [given[i] for i in np.linspace(0, len(given) - 1, min(len(given), VIEWS // 2)).round().astype(int)]
+def sensitivity_cameras(means: np.ndarray, given: list[Camera] = (), count: int = VIEWS) -> list[Camera]:
+    """`count` cameras on a Fibonacci sphere around the 1-99 % box of `means`, every other one at half the distance;
+    up to half of them are those of the capture, if they are `given`: they may stand within the scene."""
+    taken = [given[i] for i in np.linspace(0, len(given) - 1, min(len(given), count // 2)).round().astype(int)]
     fitted = [c.resized(SIZE, max(1, round(SIZE * c.height / c.width))) for c in taken]
-    return fitted + cameras_around(means, VIEWS - len(taken), name="sensitivity", turn=1.3)
+    return fitted + cameras_around(means, count - len(taken), name="sensitivity", turn=1.3)
 
 
 def measure(frames: list[Gaussians], cameras: list[Camera] = ()) -> Importance:
     """Sensitivity over `frames` (the same N >= 1 Gaussians), which share the views. `cameras`: those of the capture."""
     signs = np.random.default_rng(0)
     workspace = Workspace()
-    cameras = sensitivity_cameras(np.concatenate([g.means for g in frames]), cameras)
+    count = VIEWS if len(frames) > 1 else STILL_VIEWS
+    cameras = sensitivity_cameras(np.concatenate([g.means for g in frames]), cameras, count)
     total, removal = {}, np.zeros(len(frames[0]))
     for i, camera in enumerate(cameras):
         g = frames[i % len(frames)]
@@ -64,22 +68,26 @@ def measure(frames: list[Gaussians], cameras: list[Camera] = ()) -> Importance:
             a.fill(0)
         call(workspace.native.backward, arrays, probe, np.zeros(shape, np.float32), (grads, statistics))
         share = 1 / (len(cameras) * probe.size)
-        for name, d in _derivatives(g, dict(zip(PARAMETERS, grads, strict=True))).items():
+        for name, d in derivatives(g, dict(zip(PARAMETERS, grads, strict=True))).items():
             total[name] = total.get(name, 0) + share * d * d
             if name == "logit_opacities":
                 transparency = np.maximum(1 / (1 + np.exp(g.logit_opacities)), 1e-6)
                 removal += share * (d[:, 0] / transparency) ** 2
-    return Importance({n: w.astype(np.float64) for n, w in total.items()}, removal)
+    total = {n: w.astype(np.float64) for n, w in total.items()}
+    return Importance(total, total.pop("turns"), removal)
 
 
-def _derivatives(g: Gaussians, grads: dict) -> dict[str, np.ndarray]:
-    """[N, C] derivatives by the channels that are coded; by a turn about the Gaussian's own axes for quats."""
+def derivatives(g: Gaussians, grads: dict) -> dict[str, np.ndarray]:
+    """[N, C] derivatives by the channels that are coded, of quats by the vector part alone; and by "turns"."""
+    real, vector = g.quats[:, :1], g.quats[:, 1:]
     w, x, y, z = g.quats.T
-    turns = np.stack([[-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])  # q i, q j, q k: [3, 4, N]
+    real = np.copysign(np.maximum(abs(real), REAL_LEAST), real)
+    turns = np.stack([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])  # i q, j q, k q: [3, 4, N]
     derivatives = {
         "means": grads["means"],
         "log_scales": grads["log_scales"],
-        "quats": np.einsum("kcn,nc->nk", turns, grads["quats"]),
+        "quats": grads["quats"][:, 1:] - grads["quats"][:, :1] * vector / real,
+        "turns": np.einsum("kcn,nc->nk", turns, grads["quats"]),
         "logit_opacities": grads["logit_opacities"][:, None],
         "sh0": grads["sh0"] @ TO_RGB.astype(np.float32),
         "shN": (grads["shN"] @ TO_RGB.astype(np.float32)).reshape(len(g), -1),

@@ -13,6 +13,7 @@ import numpy as np
 from gscodec import _native
 from gscodec.bitstream.quantization import error_for
 from gscodec.camera import Camera
+from gscodec.encode import curves as curved
 from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
 from gscodec.encode.group import (
@@ -22,6 +23,7 @@ from gscodec.encode.group import (
     Stack,
     align_axes,
     canonical_appearance,
+    curves_of,
     inside_unit_ball,
     layer_of,
     measure_stack,
@@ -169,6 +171,7 @@ def _with_births(c: dict, known: np.ndarray, values: np.ndarray, shifts: np.ndar
     are 2^shifts ([B]) times those of the attribute."""
     steps, offsets = np.array(c["steps"], np.float32), np.array(c["offsets"], np.float32)
     unit = 2.0 ** shifts[:, None]
+    values = curved.along(values, curves_of(c))
     own = c | {"values": (np.rint((values - offsets) / (steps * unit)) * unit).astype(np.int32).T}
     own = inside_unit_ball(own, shifts) if name == "quats" else own
     return c | {"values": np.concatenate([c["values"][:, known], own["values"]], 1)}

@@ -92,6 +92,20 @@ def keyframe(x: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float,
     return q
 
 
+def margins(q: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float) -> tuple[np.ndarray, np.ndarray]:
+    """[N] how much farther than half a step above, and below, `q` ([N], of `keyframe`) still is the better integer,
+    in steps: what the next one costs more. Other arguments are those of `keyframe`."""
+    if not len(q):
+        return q, q
+    worth = (weights + FLOOR * weights.mean()) / price
+    context = np.clip(np.rint(q[near] @ (NEAR_WEIGHT / NEAR_WEIGHT.sum())), -RANGE, RANGE).astype(int) + RANGE
+    bits = _code_lengths(context - RANGE, q)
+    level = np.clip(q, -RANGE, RANGE).astype(int) + RANGE
+    more = (bits[context, np.clip(level + d, 0, 2 * RANGE)] - bits[context, level] for d in (1, -1))
+    up, down = (np.clip(m / (2 * worth), -0.4, 9) for m in more)
+    return up, down
+
+
 def _code_lengths(context: np.ndarray, q: np.ndarray) -> np.ndarray:
     """[2 RANGE + 1, 2 RANGE + 1] bits of an integer (column) in a context (row), from their statistics."""
     side = 2 * RANGE + 1

@@ -162,6 +162,14 @@ def coarser(group, shifts):
     return group | {"positions": positions, "channels": channels, "shifts": shifts.tolist()}
 
 
+def curved(group):
+    """A group dict whose channels of log_scales and logit_opacities have curves: gentle, steep, flat, around 0."""
+    rows = [[-0.3, 0.02, *range(0, 40, 5)], [0.0, 1e-3, *range(255, 15, -32)], [-1.0, 0.5, *[0] * 8]]
+    curves = {"log_scales": rows, "logit_opacities": [[-0.4, 0.125, 48, 16, 0, 0, 3, 0, 16, 64]]}
+    channels = {name: c | {"curves": curves.get(name)} for name, c in group["channels"].items()}
+    return group | {"channels": channels}
+
+
 def predicted(reference, group, *, back=1, deaths=lambda i: i % 5 == 0, births=9):
     """A predicted group dict: of `reference` those that do not die, and in each layer `births` Gaussians of `group`.
 
@@ -463,6 +471,7 @@ def unit_dict(unit_type, layer=0, attribute=0, dependencies=(), payload=b""):
 
 def add_unknown_units(units):
     units.append(unit_dict(200, attribute=17, dependencies=[1], payload=b"from later"))
+    units.append(unit_dict(7, attribute=2, dependencies=[1]))
     units.append(unit_dict(255, layer=3))
     units.append(unit_dict(255, layer=3))
     units.append(unit_dict(10, layer=3, payload=bytes(100)))
@@ -529,6 +538,7 @@ def pack_header(**changes):
     for attribute, pairs in h["channels"]:
         data += bytes([attribute]) + b"".join(struct.pack(">ff", *pair) for pair in pairs)
     data += bytes(h.get("shifts", b""))
+    data += b"".join(struct.pack(">ff8x", *curve) for curve in h.get("curves", ()))
     data += bytes([len(h["trajectories"])]) + b"".join(struct.pack(">BHf", *t) for t in h["trajectories"])
     data += struct.pack(">I", h["node_count"])
     if h["node_count"]:

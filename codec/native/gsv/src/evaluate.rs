@@ -5,6 +5,7 @@
 
 use crate::attributes::Attribute;
 use crate::blend::Blend;
+use crate::curve::{Curve, Pieces};
 use crate::group::Group;
 use crate::trajectories::Trajectories;
 use rayon::prelude::*;
@@ -315,7 +316,7 @@ fn add(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
     [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
 }
 
-/// offset + step * integer + shift, C per Gaussian; empty if the group lacks the attribute.
+/// offset + step * integer, along its curve if it has one, + shift: C per Gaussian; empty if the group lacks the attribute.
 ///
 /// `shift` makes up for the layers behind that are not there (spec 10.2).
 fn dequantized(group: &Group, a: Attribute, shift: f32) -> Vec<f32> {
@@ -324,6 +325,7 @@ fn dequantized(group: &Group, a: Attribute, shift: f32) -> Vec<f32> {
         return Vec::new();
     };
     let scales: Vec<(f32, f32)> = scale.steps.iter().copied().zip(scale.offsets.iter().copied()).collect();
+    let curves: Vec<Pieces> = group.header.curves_of(a).iter().map(Curve::pieces).collect();
     let mut out = vec![0.0; values.len()];
     let channels = scales.len().max(1);
     let rows = RUN * channels;
@@ -332,8 +334,10 @@ fn dequantized(group: &Group, a: Attribute, shift: f32) -> Vec<f32> {
         .for_each(|(out, values)| {
             for (out, row) in out.chunks_mut(channels).zip(values.chunks(channels)) {
                 for ((out, v), (step, offset)) in out.iter_mut().zip(row).zip(&scales) {
-                    *out = offset + step * *v as f32 + shift;
+                    *out = offset + step * *v as f32;
                 }
+                out.iter_mut().zip(&curves).for_each(|(v, curve)| *v = curve.value(*v));
+                out.iter_mut().for_each(|v| *v += shift);
             }
         });
     out

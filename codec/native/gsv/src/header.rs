@@ -5,15 +5,18 @@
 
 use crate::attributes::Attribute;
 use crate::blend::NEIGHBORS_MAX;
+use crate::curve::Curve;
 use crate::error::Result;
 use crate::fields::{Fields, Reader};
 use crate::levels::Level;
 use crate::map;
 
 const FLAG_PREDICTED: u8 = 1;
-const FLAG_STEP_CLASSES: u8 = 2;
+const FLAG_CURVES: u8 = 2;
 const FLAG_UNIT_SIZES: u8 = 4;
 const FLAG_LAYER_SHIFTS: u8 = 8;
+/// Channels with a curve: those of log_scales, and logit_opacities.
+pub const CURVES: usize = 4;
 /// Low bits that a layer may leave out.
 pub const SHIFT_MAX: u8 = 15;
 /// Layers of a group.
@@ -72,6 +75,8 @@ pub struct Header {
     pub scales: Vec<Scale>,
     /// Of each layer: how many low bits of positions, then of each attribute's integers, are 0 and not coded. Empty: none.
     pub shifts: Vec<[u8; 6]>,
+    /// Of the channels of log_scales, then of logit_opacities. None: their values are as they are coded.
+    pub curves: Option<[Curve; CURVES]>,
     pub trajectories: Vec<TrajectoryHeader>,
     /// `count` 0: none.
     pub nodes: NodeHeader,
@@ -127,6 +132,9 @@ impl Header {
             self.layers(f, None)?;
             self.scales(f)?;
             self.shifts(f)?;
+            if let Some(curves) = &mut self.curves {
+                curves.iter_mut().try_for_each(|c| c.fields(f))?;
+            }
         }
         self.trajectories(f)?;
         self.nodes(f)
@@ -142,12 +150,12 @@ impl Header {
         if self.reference == 0 && !self.shifts.is_empty() {
             flags |= FLAG_LAYER_SHIFTS;
         }
+        if self.reference == 0 && self.curves.is_some() {
+            flags |= FLAG_CURVES;
+        }
         f.u8(&mut flags)?;
-        f.must(flags & FLAG_STEP_CLASSES == 0, || {
-            "a group without step classes: not yet supported by this version".into()
-        })?;
         let known = match flags & FLAG_PREDICTED {
-            0 => FLAG_UNIT_SIZES | FLAG_LAYER_SHIFTS,
+            0 => FLAG_UNIT_SIZES | FLAG_LAYER_SHIFTS | FLAG_CURVES,
             _ => FLAG_UNIT_SIZES | FLAG_PREDICTED,
         };
         f.must(flags & !known == 0, || {
@@ -155,6 +163,9 @@ impl Header {
         })?;
         if flags & FLAG_LAYER_SHIFTS != 0 {
             self.shifts.resize(self.layers.len().max(1), Default::default());
+        }
+        if flags & FLAG_CURVES != 0 {
+            self.curves.get_or_insert_default();
         }
         if flags & FLAG_PREDICTED != 0 {
             f.u16(&mut self.reference)?;
@@ -258,6 +269,16 @@ impl Header {
     pub fn shift(&self, k: usize, attribute: Attribute) -> u32 {
         let own = self.shifts.get(k).and_then(|s| s.get(attribute as usize - 1));
         own.map_or(0, |s| u32::from(*s))
+    }
+
+    /// Of the channels of an attribute; empty if they have none.
+    pub fn curves_of(&self, attribute: Attribute) -> &[Curve] {
+        let all = self.curves.as_ref().map_or(&[][..], |c| &c[..]);
+        match attribute {
+            Attribute::LogScales => all.get(..3).unwrap_or(&[]),
+            Attribute::LogitOpacities => all.get(3..).unwrap_or(&[]),
+            _ => &[],
+        }
     }
 
     fn trajectories<F: Fields>(&mut self, f: &mut F) -> Result<()> {

@@ -9,6 +9,7 @@ pub mod blend;
 pub mod channels;
 pub mod container;
 mod crc;
+pub mod curve;
 mod deaths;
 pub mod decode;
 pub mod encode;

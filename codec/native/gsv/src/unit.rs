@@ -17,7 +17,6 @@ pub enum UnitType {
     NodePositions = 4,
     NodeTrajectories = 5,
     Trajectories = 6,
-    StepClasses = 7,
     Deaths = 8,
     LayerCorrection = 9,
 }
@@ -25,7 +24,7 @@ pub enum UnitType {
 use UnitType::*;
 
 impl UnitType {
-    const ALL: [UnitType; 10] = [
+    const ALL: [UnitType; 9] = [
         GroupHeader,
         Positions,
         Channels,
@@ -33,13 +32,12 @@ impl UnitType {
         NodePositions,
         NodeTrajectories,
         Trajectories,
-        StepClasses,
         Deaths,
         LayerCorrection,
     ];
 
     pub fn from_number(n: u8) -> Option<UnitType> {
-        Self::ALL.get(usize::from(n)).copied()
+        Self::ALL.into_iter().find(|u| *u as u8 == n)
     }
 
     pub fn name(self) -> &'static str {
@@ -51,7 +49,6 @@ impl UnitType {
             NodePositions => "node_positions",
             NodeTrajectories => "node_trajectories",
             Trajectories => "trajectories",
-            StepClasses => "step_classes",
             Deaths => "deaths",
             LayerCorrection => "layer_correction",
         }
@@ -241,9 +238,6 @@ fn check(unit: &Unit, before: &[Unit]) -> std::result::Result<(), String> {
         return Err("layers in increasing order".into());
     }
     let Some(kind) = unit.kind else { return Ok(()) };
-    if kind == StepClasses {
-        return Err("no step_classes unit: not yet supported by this version".into());
-    }
     let allowed = match kind {
         Channels => 2..=6,
         Trajectories => 1..=6,

@@ -159,9 +159,9 @@ fn damage_where_there_are_no_gaussians() {
 #[test]
 fn broken_rules_stay_errors() {
     let mut payload = encode_group(&small(), None).unwrap();
-    unit::write(&mut payload, [7, 0, 2], &[1], b"").unwrap();
+    unit::write(&mut payload, [8, 0, 0], &[], b"").unwrap();
     let message = decode_damaged(&payload, &how()).unwrap_err().to_string();
-    assert!(message.contains("not yet supported"), "{message}");
+    assert!(message.contains("announces"), "{message}");
 }
 
 /// What a unit holds, as it is in a group.

@@ -2,6 +2,7 @@
 
 use super::values::{bytes_of, raise};
 use gsv::attributes::sh_coefficients;
+use gsv::curve::Curve;
 use gsv::decode::{Decoding, decode_damaged, decode_group};
 use gsv::evaluate::{Evaluator, FrameMut};
 use gsv::group::{BIRTH, Group};
@@ -248,6 +249,12 @@ fn parents_into<'py>(py: Python<'py>, parents: &[u32]) -> Bound<'py, PyArray1<i3
     parents.iter().map(known).collect::<Vec<_>>().into_pyarray(py)
 }
 
+/// low, width, slopes.
+fn curve_row(c: &Curve) -> Vec<f32> {
+    let slopes = c.slopes.iter().map(|s| f32::from(*s));
+    [c.low, c.width].into_iter().chain(slopes).collect()
+}
+
 fn integers<'py>(py: Python<'py>, e: &Evaluator) -> PyResult<Bound<'py, PyDict>> {
     let (g, h) = (e.group(), &e.group().header);
     let d = PyDict::new(py);
@@ -264,6 +271,8 @@ fn integers<'py>(py: Python<'py>, e: &Evaluator) -> PyResult<Bound<'py, PyDict>>
         one.set_item("values", planes.into_pyarray(py))?;
         one.set_item("steps", scale.steps.clone())?;
         one.set_item("offsets", scale.offsets.clone())?;
+        let curves = h.curves_of(*a).iter().map(curve_row).collect::<Vec<_>>();
+        one.set_item("curves", curves)?;
         channels.set_item(a.name(), one)?;
     }
     d.set_item("channels", channels)?;

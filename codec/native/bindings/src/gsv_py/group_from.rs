@@ -2,6 +2,7 @@
 
 use super::values::{array, invalid, item, optional, points, value};
 use gsv::attributes::{Attribute, sh_coefficients};
+use gsv::curve::{Curve, PIECES};
 use gsv::group::{BIRTH, Group};
 use gsv::header::{Header, LayerHeader, NodeHeader, Scale, TrajectoryHeader};
 use gsv::trajectories::Trajectories;
@@ -41,6 +42,7 @@ pub fn group_from(d: &Bound<PyDict>, reference: Option<&Group>) -> PyResult<Grou
         header.scales.push(Scale { steps, offsets });
     }
     header.shifts = shifts_from(d, &header)?;
+    header.curves = curves_from(&channels)?;
     if let Some(t) = optional(d, "trajectories")? {
         let t: Bound<PyDict> = t.extract()?;
         motion_from(&t, &mut header, &mut group)?;
@@ -61,13 +63,14 @@ pub fn group_from(d: &Bound<PyDict>, reference: Option<&Group>) -> PyResult<Grou
     }
     let same = |r: &Group| {
         let h = &r.header;
-        (h.origin, h.grid_step, h.grid_bits, &h.scales, &h.shifts)
+        (h.origin, h.grid_step, h.grid_bits, &h.scales, &h.shifts, &h.curves)
             == (
                 header.origin,
                 header.grid_step,
                 header.grid_bits,
                 &header.scales,
                 &header.shifts,
+                &header.curves,
             )
     };
     if header.reference > 0 && !reference.is_some_and(same) {
@@ -129,6 +132,31 @@ fn shifts_from(d: &Bound<PyDict>, header: &Header) -> PyResult<Vec<[u8; 6]>> {
     }
     let own = |s: &Vec<u8>| std::array::from_fn(|i| s.get(i).copied().unwrap_or(0));
     Ok(found.iter().map(own).collect())
+}
+
+/// `curves` of log_scales and logit_opacities: for each channel low, width, and the slopes.
+fn curves_from(channels: &Bound<PyDict>) -> PyResult<Option<[Curve; 4]>> {
+    let mut found = Vec::new();
+    for a in [Attribute::LogScales, Attribute::LogitOpacities] {
+        let c: Bound<PyDict> = value(channels, a.name())?;
+        if optional(&c, "curves")?.is_some() {
+            let rows: Vec<[f32; 2 + PIECES]> = value(&c, "curves")?;
+            found.extend(rows.into_iter().map(|[low, width, slopes @ ..]| Curve {
+                low,
+                width,
+                slopes: slopes.map(|s| s as u8),
+            }));
+        }
+    }
+    match found.len() {
+        0 => Ok(None),
+        n => match found.try_into() {
+            Ok(curves) => Ok(Some(curves)),
+            Err(_) => invalid(format!(
+                "curves: expected 3 of log_scales and 1 of logit_opacities, or none, got {n}"
+            )),
+        },
+    }
 }
 
 fn sh_degree(channels: &Bound<PyDict>) -> PyResult<u8> {

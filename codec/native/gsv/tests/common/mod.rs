@@ -2,6 +2,7 @@
 #![allow(dead_code)] // each test takes what it needs
 
 use gsv::attributes::Attribute;
+use gsv::curve::Curve;
 use gsv::decode::Decoding;
 use gsv::group::{BIRTH, Group};
 use gsv::header::{Header, LayerHeader, NodeHeader, Scale, TrajectoryHeader};
@@ -120,6 +121,7 @@ pub fn group(s: &Shape) -> Group {
         grid_bits: s.bits,
         sh_degree: s.sh_degree,
         layers: s.counts.iter().map(|n| layer(*n, *n)).collect(),
+        curves: (s.seed % 2 == 1).then(|| std::array::from_fn(|c| curve(c as f32))),
         ..Header::default()
     };
     let count: usize = s.counts.iter().sum();
@@ -140,6 +142,14 @@ pub fn group(s: &Shape) -> Group {
     motion(&mut g, &mut header, s, &mut r);
     g.header = header;
     g
+}
+
+fn curve(low: f32) -> Curve {
+    Curve {
+        low,
+        width: 0.5,
+        slopes: [0, 255, 7, 16, 0, 3, 80, 1],
+    }
 }
 
 fn layer(count: usize, births: usize) -> LayerHeader {
