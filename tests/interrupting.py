@@ -19,7 +19,9 @@ from gscodec import _native, part_file, progress
 from gscodec.bench.procedural import Scene
 from gscodec.bench.stress_scenes import walking
 from gscodec.cli import main
-from gscodec.encode import encode, importance, writer
+from gscodec.encode import encode, writer
+from gscodec.render import sensitivity
+from gscodec.render import sensitivity
 from gscodec.splats import sequence_writer
 from gscodec.train import settings, train
 
@@ -55,7 +57,7 @@ def gscodec(*args, at=None, by=signal.SIGKILL) -> int:
 
 def _run(args: list[str], at: tuple[str, int] | None, by: int) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background jobs ignore
-    settings.PRESETS["fast"], importance.SIZE = TINY, 128
+    settings.PRESETS["fast"], sensitivity.SIZE = TINY, 128
     if at:
         _arm(*at, lambda: os.kill(os.getpid(), by))
     sys.argv = ["gscodec", *args]

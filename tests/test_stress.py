@@ -6,7 +6,7 @@ import pytest
 
 from gscodec.bench.stress import compare
 from gscodec.bench.stress_scenes import SCENES, cut, walking
-from gscodec.encode import importance
+from gscodec.render import sensitivity
 
 TINY = {"keyframe_steps": 100, "motion_steps": 20, "finetune_steps": 8, "gaussians_max": 300, "initial_points": 200}
 SMALL = {"train": 5, "test": 1, "size": 48, "frames": 3}
@@ -29,7 +29,7 @@ def late(t: int) -> list:
     ids=["one frame", "late", "all empty", "scene cut", "static"],
 )
 def test_stress(case, changes, monkeypatch):
-    monkeypatch.setattr(importance, "SIZE", 128)
+    monkeypatch.setattr(sensitivity, "SIZE", 128)
     scene = replace(SCENES[case], **(SMALL | changes))
     found = compare(case, scene, **TINY)
     assert sum(found["groups"]) == scene.frames

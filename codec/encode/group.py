@@ -21,7 +21,7 @@ from gscodec.camera import Camera
 from gscodec.encode import curves as curved
 from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
-from gscodec.encode.importance import Importance, coarsest, measure, steps_for_error
+from gscodec.render.sensitivity import Importance, coarsest, measure, steps_for_error
 from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes
 from gscodec.encode.refine import QUALITY_LEAST, refine
 from gscodec.gaussians import Gaussians, Group

@@ -13,7 +13,7 @@ import numpy as np
 
 from gscodec.bitstream.color import TO_RGB
 from gscodec.camera import Camera
-from gscodec.encode.importance import derivatives, sensitivity_cameras
+from gscodec.render.sensitivity import derivatives, sensitivity_cameras
 from gscodec.gaussians import Gaussians
 from gscodec.render.workspace import PARAMETERS, Workspace, call
 

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from gscodec.bitstream.quantization import steps_for, subject_radius
+from gscodec.bitstream.quantization import Steps, steps_for, subject_radius
 from gscodec.errors import CaptureError
 from gscodec.gaussians import Group
 from gscodec.part_file import read_arrays, write_arrays
+from gscodec.render.sensitivity import measured_steps
 from gscodec.train.carve import carve, random_box
 from gscodec.train.finetune import GroupModel, finetune
 from gscodec.train.graph import Pose
@@ -118,6 +119,7 @@ class Subject:
         radius: of all Gaussians in the keyframe, world units.
         canonical: what all groups since the keyframe refer to; None before the first one is fine-tuned.
         parents: [N], where each Gaussian is in the group before.
+        steps: of the stream, for all groups since the keyframe; None before the first one is fine-tuned.
     """
 
     tracker: Tracker
@@ -125,6 +127,7 @@ class Subject:
     radius: float
     canonical: Model | None = None
     parents: np.ndarray | None = None
+    steps: Steps | None = None
 
     def bury(self, canonical: Model) -> None:
         """Goes on with `canonical`, all Gaussians of a group, but for the dead."""
@@ -139,6 +142,7 @@ class Subject:
         gains, poses = self.tracker.views.exposure, self.tracker.views.extrinsics
         cameras = {"exposure": gains.values, "extrinsics": poses.values, "middle": poses.middle}
         whole = {"loss_radius": np.array([self.loss, self.radius]), "parents": self.parents}
+        whole["steps"] = np.array([] if self.steps is None else astuple(self.steps))
         return {**whole, **cameras, **canonical, **self.tracker.state()}
 
     @staticmethod
@@ -148,7 +152,9 @@ class Subject:
         loss, radius = state["loss_radius"].tolist()
         views.exposure.values, views.extrinsics.values = state["exposure"], state["extrinsics"]
         views.extrinsics.about(state["middle"], radius)
-        return Subject(Tracker.restored(state, views, settings), loss, radius, Model(canonical), state["parents"])
+        steps = Steps(*state["steps"].tolist()) if len(state["steps"]) else None
+        tracker = Tracker.restored(state, views, settings)
+        return Subject(tracker, loss, radius, Model(canonical), state["parents"], steps)
 
 
 def train_groups(
@@ -280,8 +286,13 @@ class _Run:
         return False
 
     def _finetuned(self, subject: Subject, frames: range, track: _Track) -> GroupModel:
-        steps = steps_for(self.settings.quality, subject.radius)
-        model = GroupModel(subject.tracker.graph, subject.canonical, track.models, track.poses, steps, track.moved())
+        quality = self.settings.quality
+        if subject.steps is None:
+            middle, cameras = track.models[len(frames) // 2].gaussians(), self.views.train_cameras
+            taken = [self.capture.cameras[i] for i in cameras]
+            subject.steps = measured_steps(middle, quality, steps_for(quality, subject.radius), taken)
+        graph, steps = subject.tracker.graph, subject.steps
+        model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved())
         on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
         finetune(model, self.views, frames, self.settings, radius=subject.tracker.radius, on_step=on_step)
         return model

@@ -8,11 +8,12 @@ subject; those by which `gscodec eval` judges are others.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gscodec.bitstream.color import TO_RGB
+from gscodec.bitstream.color import STEP_WEIGHTS, TO_RGB, decorrelate
+from gscodec.bitstream.quantization import Steps, error_for, subject_radius
 from gscodec.camera import Camera, cameras_around
 from gscodec.gaussians import Gaussians
 from gscodec.render.workspace import PARAMETERS, Workspace, call
@@ -116,6 +117,23 @@ def steps_for_error(
         share = (low + high) / 2
         low, high = (share, high) if np.minimum(share, energy).sum() < error else (low, share)
     return {n: np.minimum(np.sqrt(12 * high / s), coarsest(n, radius)).astype(np.float32) for n, s in sums.items()}
+
+
+def measured_steps(g: Gaussians, quality: float, nominal: Steps, cameras: list[Camera] = ()) -> Steps:
+    """About the steps that the encoder will find for a group that looks like `g`, in the form of `steps_for`: one for
+    all channels of an attribute, at the same rate. `cameras`: those of the capture; `nominal`: where nothing is seen.
+    """
+    if not len(g):
+        return nominal
+    measured = measure([g] * 2, cameras)
+    weights, degrees = measured.weights | {"quats": measured.turns}, g.shN.shape[1]
+    values = {"means": g.means, "log_scales": g.log_scales, "quats": g.quats[:, 1:], "sh0": decorrelate(g.sh0)}
+    values |= {"logit_opacities": g.logit_opacities[:, None], "shN": decorrelate(g.shN).reshape(len(g), -1)}
+    steps = steps_for_error(weights, {n: values[n] for n in weights}, error_for(quality), subject_radius(g.means))
+    steps["sh0"] /= STEP_WEIGHTS
+    if degrees:
+        steps["shN"] /= np.tile(STEP_WEIGHTS, degrees)
+    return replace(nominal, **{n: float(np.exp(np.log(s).mean())) for n, s in steps.items()})
 
 
 def coarsest(attribute: str, radius: float) -> float:
