@@ -144,13 +144,14 @@ impl GroupDecoder<'_> {
             return Ok(Vec::new());
         };
         let unit = &self.units[i];
-        let mut c = Decoder::new(unit.payload);
         let shift = match kind {
             UnitType::Positions => self.header.shift(usize::from(layer), Attribute::Means),
             _ => 0,
         };
-        let codes = positions::code(&mut c, &[], count, u32::from(self.header.grid_bits) - shift);
-        finish(c, true, i, unit)?;
+        let bits = u32::from(self.header.grid_bits) - shift;
+        let end = unit.payload_offset + unit.payload.len();
+        let codes = positions::decode(unit.payload, count, bits);
+        let codes = codes.map_err(|expected| Error::bitstream(end, unit.label(i), expected))?;
         let points = codes.into_iter().map(morton::decode);
         Ok(points.map(|p| p.map(|v| v << shift)).collect())
     }
