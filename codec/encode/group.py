@@ -20,6 +20,7 @@ from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
 from gscodec.encode.importance import Importance, coarsest, measure, steps_for_error
 from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes
+from gscodec.encode.parallel import each_frame
 from gscodec.gaussians import Gaussians, Group
 from gscodec.gaussians import Nodes as GivenNodes
 
@@ -84,9 +85,9 @@ class Stack:
 
 def stack_group(group: Group) -> Stack:
     """Loads all frames of `group` (f32)."""
-    frames = [group.frames[t] for t in range(len(group))]
+    frames = each_frame(lambda t: group.frames[t], len(group))
     names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
-    arrays = [np.stack([getattr(f, n) for f in frames]) for n in names]
+    arrays = each_frame(lambda k: np.stack([getattr(f, names[k]) for f in frames]), len(names))
     raw = Stack(*arrays, group.lifetimes)
     return Stack(*(raw.held(a) for a in arrays), group.lifetimes)
 
