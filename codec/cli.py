@@ -7,6 +7,7 @@ and exit code 1 (2 for a wrong call); anything else is a bug and shows its trace
 from __future__ import annotations
 
 import json
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterable
@@ -420,6 +421,7 @@ def _say(message, category, filename, lineno, file=None, line=None) -> None:
 def main() -> None:
     """Entry point of the `gscodec` command."""
     warnings.showwarning = _say
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is there: its threads would wait beside ours, busily
     try:
         sys.exit(app(standalone_mode=False))  # what a command returns, None, or the code of a typer.Exit
     except (typer.Abort, KeyboardInterrupt):

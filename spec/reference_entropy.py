@@ -1,5 +1,6 @@
 """Clause 6 of gsv.md for the reference decoder: bits to bins to values."""
 
+from bisect import bisect_right
 from collections import defaultdict
 
 from reference_container import clip, require
@@ -21,19 +22,31 @@ class RangeDecoder:
 
     def decode(self, p):
         bound = (self.range * p) >> 16
-        if self.code < bound:
-            bin, self.range = 1, bound
-        else:
-            bin, self.range, self.code = 0, self.range - bound, self.code - bound
-        while self.range < 1 << 24:
-            self.range, self.code = self.range << 8, (self.code << 8) | self.byte()
+        bin = int(self.code < bound)
+        self.take(*((0, bound) if bin else (bound, self.range - bound)))
         return bin
+
+    def take(self, start, length):
+        self.code, self.range = self.code - start, length
+        while self.range < 1 << 24:
+            self.range, self.code = self.range << 8, (self.code << 8 | self.byte()) & 0xFFFFFFFF
 
     def bits(self, n):
         v = 0
-        for _ in range(n):
-            v = 2 * v + self.decode(32768)
+        while n > 0:
+            m = min(n, 16)
+            unit = self.range >> m
+            few = min(self.code // unit, (1 << m) - 1)
+            self.take(unit * few, unit)
+            v, n = v << m | few, n - m
         return v
+
+    def symbol(self, F):
+        unit = self.range >> 16
+        s = bisect_right(F, min(self.code // unit, 65535))
+        start = F[s - 1] if s else 0
+        self.take(unit * start, unit * (F[s] - start))
+        return s
 
     def finish(self):
         left = len(self.payload) - self.position
@@ -102,24 +115,34 @@ MAX_VALUE = 1 << 24
 SPREAD_BUCKET = [0, 1, 2, 3, 3, 4, 4, *[5] * 3, *[6] * 5, *[7] * 10, *[8] * 16, 9]
 
 
+def expected(near):
+    """Clause 6.5: -> spread, centre, level, sign."""
+    s = sum(weight * v for weight, v in zip((4, 3, 2, 2), near, strict=False))
+    g = sum((4, 3, 2, 2)[: len(near)])
+    p = (2 * s + g) // (2 * g) if g else 0
+    spread = SPREAD_BUCKET[min(sum(abs(v - p) for v in near), 41)]
+    m = abs(p) if abs(p) <= 6 else min(7 + (abs(p) - 7) // 4, 11)
+    return spread, p - clip(p, -7, 7), 11 + (-m if p < 0 else m), clip(p, -1, 1) + 1
+
+
+def checked(value, what):
+    require(abs(value) <= MAX_VALUE, f"{what}: value {value} is outside -2^24 .. 2^24")
+    return value
+
+
 class ValueModel(Model):
     """Clause 6.5."""
 
     def value(self, class_, near, prev1, prev2):
-        s = sum(weight * v for weight, v in zip((4, 3, 2, 2), near, strict=False))
-        g = sum((4, 3, 2, 2)[: len(near)])
-        p = (2 * s + g) // (2 * g) if g else 0
-        spread = SPREAD_BUCKET[min(sum(abs(v - p) for v in near), 41)]
-        centre = p - clip(p, -7, 7)
-        m = abs(p) if abs(p) <= 6 else min(7 + (abs(p) - 7) // 4, 11)
-        a0 = ((class_ * 23 + 11 + (-m if p < 0 else m)) * 10 + spread) * 64
-        b0 = (((class_ * 15 + clip(prev1, -7, 7) + 7) * 15 + clip(prev2, -7, 7) + 7) * 3 + clip(p, -1, 1) + 1) * 64
+        spread, centre, level, sign = expected(near)
+        a0 = ((class_ * 23 + level) * 10 + spread) * 64
+        b0 = (((class_ * 15 + clip(prev1, -7, 7) + 7) * 15 + clip(prev2, -7, 7) + 7) * 3 + sign) * 64
 
         def bin(j):
             return self.mixed(a0 + j, b0 + j, class_ * 64 + j)
 
         if not bin(0):
-            return self.checked(centre)
+            return checked(centre, self.decoder.what)
         negative = bin(1)
         j, v = (18 if negative else 2), 0
         while v < 16 and bin(j + v):
@@ -130,8 +153,47 @@ class ValueModel(Model):
                 e += 1
                 require(e <= 25, f"{self.decoder.what}: escape of more than 25 bits")
             v = 16 + (1 << e | self.decoder.bits(e)) - 1
-        return self.checked(centre - v - 1 if negative else centre + v + 1)
+        return checked(centre - v - 1 if negative else centre + v + 1, self.decoder.what)
 
-    def checked(self, value):
-        require(abs(value) <= MAX_VALUE, f"{self.decoder.what}: value {value} is outside -2^24 .. 2^24")
-        return value
+
+class Distribution:
+    """Clause 6.6."""
+
+    def __init__(self):
+        self.E, self.n = [2048 * (i + 1) - 1 for i in range(32)], 0
+
+    def probability(self, s):
+        return self.E[s] - (self.E[s - 1] if s else 0)
+
+    def learn(self, s):
+        rate = 131072 // (2 * self.n + 3)
+        below, above = self.E[:s], [65535 - e for e in self.E[s:]]
+        self.E = [x - (x * rate >> 16) for x in below] + [65535 - (x - (x * rate >> 16)) for x in above]
+        self.n = min(self.n + 1, 126)
+
+
+class SymbolModel:
+    """Clause 6.6: tables of distributions and pairs of weights, made when first used."""
+
+    def __init__(self, decoder):
+        self.decoder = decoder
+        self.tables = [defaultdict(Distribution) for _ in range(3)]
+        self.weights = defaultdict(lambda: [21845 * 128] * 2)
+
+    def mixed_symbol(self, class_, *contexts):
+        e = [table[d] for table, d in zip(self.tables, contexts, strict=True)]
+        v = self.weights[64 * class_ + 16 * AGE[e[0].n] + 4 * AGE[e[1].n] + AGE[e[2].n]]
+        w = [v[0] >> 7, v[1] >> 7]
+        w.append(65536 - sum(w))
+        mean = [
+            (a * w[0] >> 16) + (b * w[1] >> 16) + (c * w[2] >> 16) for a, b, c in zip(*(d.E for d in e), strict=True)
+        ]
+        s = self.decoder.symbol([m - (m >> 9) + 4 * (i + 1) for i, m in enumerate(mean[:31])] + [65536])
+        f = [w * ((d.probability(s) >> 1) + 1) for w, d in zip(w, e, strict=True)]
+        unit = (sum(f) >> 16) + 1
+        for k in (0, 1):
+            share = f[k] // unit
+            v[k] += share - (share >> 5) + 682 - (v[k] + 127 >> 7)
+        for d in e:
+            d.learn(s)
+        return s

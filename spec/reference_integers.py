@@ -2,7 +2,7 @@
 
 import numpy as np
 from reference_container import Reader, require
-from reference_entropy import Model, RangeDecoder, ValueModel
+from reference_entropy import Model, RangeDecoder, SymbolModel, ValueModel, checked, expected
 from reference_units import SHN
 
 # ---- 7. Order and maps ----------------------------------------------------------------------------------------------
@@ -30,6 +30,20 @@ def find_neighbors(positions):
 
 def decode_positions(payload, count, grid_bits, what):
     """Clause 8: -> list of (x, y, z) in Morton order."""
+    if count < 1 << 14:
+        codes = decode_tree(payload, count, grid_bits, what)
+    else:
+        reader = Reader(payload, 0, len(payload), what)
+        first = reader.take(reader.u32())
+        second = reader.take(reader.end - reader.position)
+        codes = decode_tree(first, count // 2, grid_bits, what) + decode_tree(
+            second, count - count // 2, grid_bits, what
+        )
+    return [morton_inverse(code) for code in sorted(codes)]
+
+
+def decode_tree(payload, count, grid_bits, what):
+    """Clause 8: -> Morton codes."""
     model = Model(RangeDecoder(payload, what))
     output, level = [], [(0, count)] if count else []
     for rest in range(grid_bits, 0, -1):
@@ -40,7 +54,7 @@ def decode_positions(payload, count, grid_bits, what):
             lower = (x - 1, y, z), (x, y - 1, z), (x, y, z - 1)
             upper = [counts.get(q, 0) for q in ((x + 1, y, z), (x, y + 1, z), (x, y, z + 1))]
             occupied = sum(q in counts for q in lower) + sum(u > 0 for u in upper)
-            if n == 1 and occupied == 0:
+            if n == 1 and occupied <= 2:
                 output.append(code << 3 * rest | model.decoder.bits(3 * rest))
                 continue
             split = Splitter(model, occupied, rest)
@@ -51,7 +65,7 @@ def decode_positions(payload, count, grid_bits, what):
     for code, n in level:
         output += [code] * n
     model.decoder.finish()
-    return [morton_inverse(code) for code in sorted(output)]
+    return output
 
 
 class Splitter:
@@ -112,10 +126,14 @@ def context(s, t, low, up):
 
 # ---- 9. Channels ----------------------------------------------------------------------------------------------------
 
+LEAST = [1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 13, 17, 25, 41, 73]
+EXTRA = [0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 2, 3, 4, 5]
+
 
 def decode_channels(payload, attribute, channels, near, what):
     """Clause 9: -> q[c][i]."""
-    model = ValueModel(RangeDecoder(payload, what))
+    decoder = RangeDecoder(payload, what)
+    model = SymbolModel(decoder)
     q = [[] for _ in range(channels)]
     s = 3 if attribute == SHN else 2
     for j in near:
@@ -123,13 +141,37 @@ def decode_channels(payload, attribute, channels, near, what):
         for c in range(channels):
             k = c // 3
             class_ = 3 * (0 if k < 3 else 1 if k < 8 else 2) + c % 3 if attribute == SHN else c
-            row.append(
-                model.value(class_, [q[c][n] for n in j], row[c - 1] if c >= 1 else 0, row[c - s] if c >= s else 0)
-            )
+            around = [q[c][n] for n in j]
+            prev1, prev2 = row[c - 1] if c >= 1 else 0, row[c - s] if c >= s else 0
+            spread, centre, level, sign = expected(around)
+            n = fold(around[0] - centre if around else 0)
+            d0 = (class_ * 23 + level) * 10 + spread
+            d1 = ((class_ * 15 + fold(prev1)) * 15 + fold(prev2)) * 3 + sign
+            d2 = ((class_ * 15 + n) * 15 + fold(prev1)) * 3 + (0 if spread < 4 else 1 if spread < 7 else 2)
+            row.append(checked(centre + residual(decoder, model.mixed_symbol(class_, d0, d1, d2)), what))
         for c in range(channels):
             q[c].append(row[c])
-    model.decoder.finish()
+    decoder.finish()
     return q
+
+
+def fold(x):
+    f = next((f for f, most in enumerate((0, 1, 2, 4, 8, 14, 24)) if abs(x) <= most), 7)
+    return 7 - f if x < 0 else 7 + f
+
+
+def residual(decoder, symbol):
+    require(symbol < 31, f"{decoder.what}: symbol 31")
+    if symbol == 0:
+        return 0
+    r = (symbol - 1) // 2
+    if r < 14:
+        v = LEAST[r] + decoder.bits(EXTRA[r])
+    else:
+        e = decoder.bits(5)
+        require(e <= 25, f"{decoder.what}: escape of more than 25 bits")
+        v = LEAST[r] + (1 << e | decoder.bits(e)) - 1
+    return v if symbol % 2 else -v
 
 
 # ---- 10. Lifetimes --------------------------------------------------------------------------------------------------
@@ -207,8 +249,14 @@ def decode_trajectories(payload, coefficients, channels, near, class_of, spend, 
     """Clauses 11 and 12: -> for each i a list, as long as it has coefficients, of [C] values; spend(C) before each."""
     decoder = RangeDecoder(payload, what)
     lengths, values = Model(decoder), ValueModel(decoder)
-    q, zeros = [], [0] * channels
-    for j in near:
+    q, zeros, any_of = [], [0] * channels, [0, 0]  # whether blocks have any, after two that are not there
+    for i, j in enumerate(near):
+        if i % 16 == 0:
+            last, other = any_of[-1], any_of[-2]
+            any_of.append(lengths.mixed(512 + 2 * last + other, 512 + last, 32))
+        if not any_of[-1]:
+            q.append([])
+            continue
         l = [len(q[n]) for n in j] + [0] * (4 - len(j))
         a, b = 4 * min(l[0], 3) + min(l[1], 3), min(2 * l[0] + l[1] + l[2] + l[3], 15)
         length = 0

@@ -21,11 +21,12 @@ from gscodec.camera import Camera
 from gscodec.encode import curves as curved
 from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
-from gscodec.render.sensitivity import Importance, coarsest, measure, steps_for_error
 from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes
+from gscodec.encode.parallel import each_frame
 from gscodec.encode.refine import QUALITY_LEAST, refine
 from gscodec.gaussians import Gaussians, Group
 from gscodec.gaussians import Nodes as GivenNodes
+from gscodec.render.sensitivity import Importance, coarsest, measure, steps_for_error
 
 GRID_BITS_MAX = 21
 SHIFTED = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
@@ -88,9 +89,9 @@ class Stack:
 
 def stack_group(group: Group) -> Stack:
     """Loads all frames of `group` (f32)."""
-    frames = [group.frames[t] for t in range(len(group))]
+    frames = each_frame(lambda t: group.frames[t], len(group))
     names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
-    arrays = [np.stack([getattr(f, n) for f in frames]) for n in names]
+    arrays = each_frame(lambda k: np.stack([getattr(f, names[k]) for f in frames]), len(names))
     raw = Stack(*arrays, group.lifetimes)
     return Stack(*(raw.held(a) for a in arrays), group.lifetimes)
 

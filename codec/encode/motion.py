@@ -16,6 +16,7 @@ import numpy as np
 from gscodec import _native
 from gscodec.bitstream.quantization import trajectory_step
 from gscodec.bitstream.transform import dct_basis
+from gscodec.encode.parallel import each_frame
 from gscodec.gaussians import Nodes as GivenNodes
 from gscodec.sampling import farthest_points
 
@@ -121,8 +122,8 @@ class Blend:
         return q / np.sqrt((q * q).sum(1, keepdims=True))
 
 
-def _fit_frame(blend: Blend, transposed, mass, x, nodes, y, near) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation vectors and translations [M, 3] that carry x [N, 3] to y [N, 3]."""
+def _fit_frame(transposed, mass, x, nodes, y) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations [M, 3, 3] and translations [M, 3] that carry x [N, 3] to y [N, 3]."""
     m = len(nodes)
     cx = transposed @ x / mass[:, None]
     cy = transposed @ y / mass[:, None]
@@ -133,7 +134,7 @@ def _fit_frame(blend: Blend, transposed, mass, x, nodes, y, near) -> tuple[np.nd
     sign[:, 2] = np.sign(np.linalg.det(U @ Vt))
     R = np.einsum("mji,mj,mkj->mik", Vt, sign, U)
     R[S[:, 1] < 1e-6 * np.maximum(S[:, 0], 1e-30)] = np.eye(3)  # a line or a point tells no rotation
-    return matrix_to_rotvec(R, near), cy - np.einsum("mij,mj->mi", R, cx - nodes) - nodes
+    return R, cy - np.einsum("mij,mj->mi", R, cx - nodes) - nodes
 
 
 def fit_nodes(grid_positions: np.ndarray, x: np.ndarray, means: np.ndarray, seeds: np.ndarray, step: float, to_world):
@@ -158,15 +159,15 @@ def fit_nodes(grid_positions: np.ndarray, x: np.ndarray, means: np.ndarray, seed
     mass = np.asarray(transposed.sum(1)).ravel() + 1e-9
     frames, m = len(means), len(nodes)
     rotation_step = _rotation_step(step, np.linalg.norm(x - nodes[blend.index[:, 0]], axis=1))
-    rotations, translations = np.zeros((2, frames, m, 3))
-    near = np.zeros((m, 3))
-    for t in range(frames):
-        rotations[t], translations[t] = _fit_frame(blend, transposed, mass, x, nodes, means[t], near)
-        near = rotations[t]
+    fits = each_frame(lambda t: _fit_frame(transposed, mass, x, nodes, means[t]), frames)
+    translations = np.stack([shift for _, shift in fits])
+    rotations, near = np.zeros((frames, m, 3)), np.zeros((m, 3))
+    for t, (R, _) in enumerate(fits):
+        near = rotations[t] = matrix_to_rotvec(R, near)
     basis = dct_basis(frames)
     q_rotations = quantize_trajectory(rotations, basis, rotation_step)
     rotations = np.tensordot(basis.T, q_rotations * rotation_step, 1)
-    rotated = np.stack([blend.rotate(x, nodes, rotvec_to_matrix(r)) for r in rotations])
+    rotated = np.stack(each_frame(lambda t: blend.rotate(x, nodes, rotvec_to_matrix(rotations[t])), frames))
     # Translations make up for the quantized rotations: one solution for all frames and axes.
     flat = lambda a: np.moveaxis(a, 0, 1).reshape(a.shape[1], -1)  # noqa: E731
     left = flat(means - rotated) - blend.matrix @ flat(translations)
@@ -215,11 +216,15 @@ def carry(nodes: Nodes, grid_positions: np.ndarray, x: np.ndarray, frames: int) 
     blend = Blend(grid_positions, nodes.positions, np.float32)
     x = x.astype(np.float32)
     carried, turned = np.empty((frames, len(x), 3), np.float32), np.empty((frames, len(x), 4), np.float32)
-    for t, (r, shift) in enumerate(zip(*nodes.motion(frames), strict=True)):
+    rotations, shifts = nodes.motion(frames)
+
+    def move(t: int):
         # The shift belongs to the offset: both are blended alike.
-        R = rotvec_to_matrix(r)
-        carried[t] = blend.rotate(x, nodes.places, R) + blend.matrix @ shift.astype(np.float32)
-        turned[t] = blend.turn(rotvec_to_quat(r))
+        R = rotvec_to_matrix(rotations[t])
+        carried[t] = blend.rotate(x, nodes.places, R) + blend.matrix @ shifts[t].astype(np.float32)
+        turned[t] = blend.turn(rotvec_to_quat(rotations[t]))
+
+    each_frame(move, frames)
     return NodeMotion(carried, turned)
 
 

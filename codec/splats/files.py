@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from gscodec.errors import CaptureError, UsageError
 from gscodec.gaussians import Gaussians
 from gscodec.splats.compressed_ply import gaussians_of_compressed, is_compressed, write_compressed_ply
 from gscodec.splats.drc import read_drc, write_drc
-from gscodec.splats.ply import gaussians_of, sh_count, write_ply
+from gscodec.splats.ply import FIELDS, gaussians_of, sh_count, stack, write_ply
 from gscodec.splats.ply_table import read_header, read_table
 from gscodec.splats.sog import SH_BANDS, read_sog, read_sog_meta, write_sog
 
@@ -39,6 +41,20 @@ def read_splat(path: str | Path) -> Gaussians:
         return read_sog(path)
     table = read_table(path)
     return gaussians_of_compressed(table, path) if is_compressed(table) else gaussians_of(table, path)
+
+
+def read_means(path: Path) -> np.ndarray:
+    """[N, 3] f32, the positions of one frame; of a .ply nothing else is read, where there is nothing to complain about.
+
+    Raises:
+        As `read_splat`.
+    """
+    rows = read_table(path).get("vertex") if path.suffix.lower() == ".ply" else None
+    if rows is not None and {"x", "y", "z"} <= set(rows.dtype.names or ()):
+        means = stack(rows, FIELDS["means"])
+        if np.isfinite(means).all():
+            return means
+    return read_splat(path).means
 
 
 def splat_size(path: Path) -> tuple[int, int]:

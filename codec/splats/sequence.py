@@ -22,7 +22,7 @@ from gscodec.camera import Camera
 from gscodec.capture.detect import LOOKED_FOR, find_capture
 from gscodec.errors import CaptureError, UsageError
 from gscodec.gaussians import Gaussians, GaussianSequence, Group, Nodes
-from gscodec.splats.files import EXPECTED, is_splat, read_splat, splat_size
+from gscodec.splats.files import EXPECTED, is_splat, read_means, read_splat, splat_size
 from gscodec.splats.tracking import relate
 
 FPS = 30.0  # of folders that do not say
@@ -61,11 +61,15 @@ class Frames(Sequence):
             return FrameRange(self, range(len(self))[t])
         t = range(len(self))[t]
         with self._lock:
-            if t not in self._kept:
-                self._kept[t] = self._read(t)
-                while len(self._kept) > KEEP:
-                    self._kept.popitem(last=False)
-            return self._kept[t]
+            kept = self._kept.get(t)
+        if kept is not None:
+            return kept
+        read = self._read(t)
+        with self._lock:
+            self._kept[t] = read
+            while len(self._kept) > KEEP:
+                self._kept.popitem(last=False)
+        return read
 
     def _read(self, t: int) -> Gaussians:
         g = read_splat(self._paths[t])
@@ -170,8 +174,8 @@ def _tracks(
     for t in range(1, len(paths)):
         related: np.ndarray | bool = False
         if sizes[t] == sizes[t - 1]:
-            before = read_splat(paths[t - 1]).means if before is None else before
-            after = read_splat(paths[t]).means
+            before = read_means(paths[t - 1]) if before is None else before
+            after = read_means(paths[t])
             related = relate(before, after)
             if related is not False and (t - 1 in orders or related is not True):
                 # `after` is in file order: bring it into the order of the track

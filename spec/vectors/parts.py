@@ -118,6 +118,14 @@ def duplicates():
     return group
 
 
+def two_trees():
+    """The least number of Gaussians whose positions are two trees; all else is 0."""
+    group = make_group(2**14, 1, bits=4)
+    for channel in group["channels"].values():
+        channel["values"][:] = 0
+    return group
+
+
 def tied_nodes():
     """Nodes at equal distances and on top of each other: the order of clause 13.2 decides."""
     group = make_group(60, 5, bits=2, nodes=30, neighbors=3)
@@ -496,6 +504,14 @@ def remove_unit(unit_type, attribute=0):
 
 def change_unit(unit_type, attribute=0, /, **fields):
     return lambda: units_file(lambda units: find_unit(units, unit_type, attribute).update(fields))
+
+
+def change_first_tree(size):
+    """Positions of two trees that tell another size of the first one."""
+    units = split_units(encode(two_trees()))
+    positions = find_unit(units, 1)
+    positions["payload"] = size + positions["payload"][4:]
+    return make_file([(join_units(units), 1)])
 
 
 def change_payload(unit_type, attribute, edit):

@@ -1,9 +1,13 @@
-//! Channels (spec 9): the canonical integers of one attribute <-> bins.
+//! Channels (spec 9): the canonical integers of one attribute <-> symbols, given what the neighbours hold.
+//!
+//! A value is coded around 0 while the neighbours' mean is small, so that contexts learn how far to trust it (most
+//! channels are noise around a mean of their own), and around the mean where that is large.
 
 use crate::attributes::Attribute;
 use crate::neighbors::{NEAR, Near};
-use crate::range_coder::Bins;
-use crate::values::ValueModel;
+use crate::range_coder::{Bins, SYMBOLS};
+use crate::symbols::SymbolModel;
+use crate::values::{Expected, MAX_VALUE};
 
 /// Codes `values`, which holds the C channels of Gaussian i at `C * i..`. False if a forbidden value was read.
 pub fn code<C: Bins>(c: &mut C, attribute: Attribute, channels: usize, near: &[Near], values: &mut [i32]) -> bool {
@@ -15,7 +19,7 @@ pub fn code<C: Bins>(c: &mut C, attribute: Attribute, channels: usize, near: &[N
     let class: Vec<usize> = (0..channels)
         .map(|ch| if classes == 9 { sh_class(ch) } else { ch })
         .collect();
-    let mut model = ValueModel::new(classes);
+    let mut model = SymbolModel::new([230, 675, 675].map(|n| n * classes), classes);
     for (i, near) in near.iter().enumerate() {
         let (done, rest) = values.split_at_mut(i * channels);
         let Some(own) = rest.get_mut(..channels) else {
@@ -29,9 +33,13 @@ pub fn code<C: Bins>(c: &mut C, attribute: Attribute, channels: usize, near: &[N
                 present += 1;
             }
             let back = |n: usize| ch.checked_sub(n).map_or(0, |k| own[k]);
-            own[ch] = model.value(c, class, own[ch], &around[..present], [back(1), back(second)]);
+            let prev = [back(1), back(second)];
+            match value(c, &mut model, class, own[ch], &around[..present], prev) {
+                Some(v) => own[ch] = v,
+                None => return false,
+            }
         }
-        if model.broken || !c.alive() {
+        if !c.alive() {
             return false;
         }
     }
@@ -46,4 +54,118 @@ fn sh_class(channel: usize) -> usize {
         _ => 2,
     };
     3 * band + channel % 3
+}
+
+/// Codes `x`; `near` are the neighbours' values, nearest first, `prev` two values of the same Gaussian. None: forbidden.
+#[inline]
+fn value<C: Bins>(
+    c: &mut C,
+    model: &mut SymbolModel,
+    class: usize,
+    x: i32,
+    near: &[i32],
+    prev: [i32; 2],
+) -> Option<i32> {
+    let e = match near.first_chunk::<NEAR>() {
+        Some(all) => Expected::new(all), // the usual case, a length that the compiler knows
+        None => Expected::new(near),
+    };
+    let [p1, p2] = prev.map(fold);
+    let n = fold(near.first().map_or(0, |v| v - e.centre));
+    let contexts = [
+        (class * 23 + e.level()) * 10 + e.spread,
+        ((class * 15 + p1) * 15 + p2) * 3 + e.sign(),
+        ((class * 15 + n) * 15 + p1) * 3 + [0, 0, 0, 0, 1, 1, 1, 2, 2, 2][e.spread],
+    ];
+    let value = e.centre + residual(c, model, x - e.centre, contexts, class)?;
+    (value.abs() <= MAX_VALUE).then_some(value)
+}
+
+/// 0 to 14: which of 15 ranges `v` is in, the wider the farther off.
+#[inline]
+fn fold(v: i32) -> usize {
+    const FAR: i32 = 25;
+    const RANGES: [u8; 51] = {
+        let mut ranges = [0; 51];
+        let mut i = 0;
+        while i < 51 {
+            let v = i as i32 - FAR;
+            let away = match v.abs() {
+                0..=2 => v.abs(),
+                3..=4 => 3,
+                5..=8 => 4,
+                9..=14 => 5,
+                15..=24 => 6,
+                _ => 7,
+            };
+            ranges[i] = (7 + away * v.signum()) as u8;
+            i += 1;
+        }
+        ranges
+    };
+    usize::from(RANGES[(v.clamp(-FAR, FAR) + FAR) as usize])
+}
+
+/// Of each symbol: the value of least magnitude, and the bits behind it. 0, then each range of magnitudes with both signs; the
+/// last range is open, the last symbol forbidden.
+const VALUES: [(i32, u32); SYMBOLS] = {
+    const RANGES: [(i32, u32); 15] = [
+        (1, 0),
+        (2, 0),
+        (3, 0),
+        (4, 0),
+        (5, 0),
+        (6, 0),
+        (7, 0),
+        (8, 0),
+        (9, 1),
+        (11, 1),
+        (13, 2),
+        (17, 3),
+        (25, 4),
+        (41, 5),
+        (73, OPEN),
+    ];
+    let mut values = [(0, 0); SYMBOLS];
+    let mut i = 0;
+    while i < 15 {
+        let (least, bits) = RANGES[i];
+        values[2 * i + 1] = (least, bits);
+        values[2 * i + 2] = (-least, bits);
+        i += 1;
+    }
+    values[SYMBOLS - 1] = (0, FORBIDDEN);
+    values
+};
+const OPEN: u32 = 32;
+const FORBIDDEN: u32 = 33;
+const ESCAPE_MAX: u32 = 25;
+
+/// The symbol of `v`.
+fn symbol_of(v: i32) -> usize {
+    let holds = |(least, _): &(i32, u32)| least.signum() == v.signum() && least.abs() <= v.abs();
+    VALUES[..SYMBOLS - 1].iter().rposition(holds).unwrap_or(0)
+}
+
+#[inline]
+fn residual<C: Bins>(c: &mut C, model: &mut SymbolModel, v: i32, contexts: [usize; 3], w: usize) -> Option<i32> {
+    let symbol = if C::DECODES { 0 } else { symbol_of(v) };
+    let (least, bits) = VALUES[model.symbol(c, symbol, contexts, w) % SYMBOLS];
+    if bits == 0 {
+        return Some(least);
+    }
+    if bits == FORBIDDEN {
+        return None;
+    }
+    let beyond = v.abs().wrapping_sub(least.abs()) as u32; // encoder
+    let beyond = if bits == OPEN {
+        let e = c.few_bits(beyond.wrapping_add(1).max(1).ilog2(), 5);
+        if e > ESCAPE_MAX {
+            return None;
+        }
+        (1 << e) - 1 + c.bits(u64::from(beyond.wrapping_add(1)) & ((1 << e) - 1), e) as i32
+    } else {
+        c.few_bits(beyond & ((1 << bits) - 1), bits) as i32
+    };
+    Some(least + beyond * least.signum())
 }

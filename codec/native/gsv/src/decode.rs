@@ -1,6 +1,6 @@
 //! Payload -> group in integers (spec 3 to 12). The mirror of encode.rs.
 //!
-//! Points first, since all contexts come from them, and beside them the nodes; then every other unit, in parallel. Memory is taken only for what
+//! Points first, since all contexts come from them; then every other unit, in parallel, and the nodes beside them. Memory is taken only for what
 //! the header announces and the level allows, and trajectories grow against what is left of the level's symbols.
 //! Damage (spec 3) is an error, or what is not affected is decoded and the rest stands still or takes its offsets.
 
@@ -99,18 +99,15 @@ fn decode(units: &[Unit], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
     let known_layers = decoder.reference.map_or(header.layers.len(), |r| r.layers.len()); // a prefix refers to a prefix
     let count = known_layers.min(how.layers);
     let points = |k: usize| decoder.points_of_layer(k);
-    let (layers, nodes) = rayon::join(
-        || (0..count).into_par_iter().map(points).collect::<Result<Vec<_>>>(),
-        || decoder.nodes(),
-    );
-    let (layers, (node_positions, node_trajectories)) = (layers?, nodes?);
+    let layers = (0..count).into_par_iter().map(points).collect::<Result<Vec<_>>>()?;
     let mut sound: Vec<(usize, &Unit)> = units.iter().enumerate().filter(|(_, u)| u.damage.is_none()).collect();
     sound.sort_by_key(|(_, u)| std::cmp::Reverse(u.payload.len())); // long ones first, so that threads end together
-    let parts = sound
-        .into_iter()
-        .par_bridge()
-        .map(|(i, u)| decoder.part(i, u, &layers).map(|p| p.map(|p| (i, p))))
-        .collect::<Result<Vec<_>>>()?;
+    let part = |(i, u): (usize, &Unit)| decoder.part(i, u, &layers).map(|p| p.map(|p| (i, p)));
+    let (parts, nodes) = rayon::join(
+        || sound.into_iter().par_bridge().map(part).collect::<Result<Vec<_>>>(),
+        || decoder.nodes(),
+    );
+    let ((node_positions, node_trajectories), parts) = (nodes?, parts?);
     let mut slots: Vec<Slot> = (0..count).map(|_| Slot::new(&header)).collect();
     for (i, part) in parts.into_iter().flatten() {
         if let Some(slot) = slots.get_mut(usize::from(units[i].layer)) {
@@ -144,13 +141,14 @@ impl GroupDecoder<'_> {
             return Ok(Vec::new());
         };
         let unit = &self.units[i];
-        let mut c = Decoder::new(unit.payload);
         let shift = match kind {
             UnitType::Positions => self.header.shift(usize::from(layer), Attribute::Means),
             _ => 0,
         };
-        let codes = positions::code(&mut c, &[], count, u32::from(self.header.grid_bits) - shift);
-        finish(c, true, i, unit)?;
+        let bits = u32::from(self.header.grid_bits) - shift;
+        let end = unit.payload_offset + unit.payload.len();
+        let codes = positions::decode(unit.payload, count, bits);
+        let codes = codes.map_err(|expected| Error::bitstream(end, unit.label(i), expected))?;
         let points = codes.into_iter().map(morton::decode);
         Ok(points.map(|p| p.map(|v| v << shift)).collect())
     }

@@ -174,9 +174,9 @@ fn coded<'a>(f: impl Fn(&mut Encoder) + Sync + 'a) -> Code<'a> {
 
 /// `points` without their lowest `shift` bits.
 fn points(points: &[[u32; 3]], bits: u32, shift: u32) -> Code<'_> {
-    coded(move |c| {
+    Box::new(move || {
         let codes: Vec<u64> = points.iter().map(|p| morton::encode(p.map(|v| v >> shift))).collect();
-        positions::code(c, &codes, codes.len() as u32, bits - shift);
+        positions::encode(&codes, bits - shift)
     })
 }
 

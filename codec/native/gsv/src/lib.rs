@@ -28,6 +28,7 @@ pub mod neighbors;
 mod node_search;
 pub mod positions;
 pub mod range_coder;
+pub mod symbols;
 pub mod trajectories;
 pub mod unit;
 mod values;

@@ -2,11 +2,14 @@
 //!
 //! An octree, breadth first, whose nodes know how many points they hold: emptiness, single points and duplicates are all
 //! one question, how many are in the lower half. Contexts ask where the face neighbours have their points. A point
-//! without neighbours leaves the tree, since nothing is known about its remaining bits.
+//! with few neighbours leaves the tree, since next to nothing is known about its remaining bits. Many points are two
+//! trees, so that two threads decode them.
 
 use crate::model::Model;
-use crate::range_coder::Bins;
+use crate::range_coder::{Bins, Decoder, Encoder};
 
+const LONELY: usize = 2; // face neighbours of a point that leaves the tree, at most
+const SPLIT_FROM: u32 = 1 << 14; // points that are two trees
 const NONE: u32 = u32::MAX;
 const BUCKETS: usize = 16; // of the number of points to split
 const TREE: usize = 32; // adaptive bins of one split; later ones are bypass bins
@@ -59,8 +62,49 @@ impl Children {
     }
 }
 
-/// Codes `count` points of `bits` bits an axis. `points`: their sorted Morton codes (encoder). Returns these.
-pub fn code<C: Bins>(c: &mut C, points: &[u64], count: u32, bits: u32) -> Vec<u64> {
+/// The payload of points of `bits` bits an axis, given by their sorted Morton codes.
+pub fn encode(points: &[u64], bits: u32) -> Vec<u8> {
+    let tree = |points: &[u64]| {
+        let mut c = Encoder::default();
+        code(&mut c, points, points.len() as u32, bits);
+        c.finish()
+    };
+    let Some(half) = halves_of(points.len() as u32) else {
+        return tree(points);
+    };
+    let (first, second) = points.split_at(half as usize);
+    let (first, second) = rayon::join(|| tree(first), || tree(second));
+    [&(first.len() as u32).to_be_bytes()[..], &first, &second].concat()
+}
+
+/// Sorted Morton codes of the `count` points of a payload, or what is wrong with it.
+pub fn decode(payload: &[u8], count: u32, bits: u32) -> Result<Vec<u64>, &'static str> {
+    let tree = |payload: &[u8], count: u32| {
+        let mut c = Decoder::new(payload);
+        let points = code(&mut c, &[], count, bits);
+        c.finish().map(|()| points)
+    };
+    let Some(half) = halves_of(count) else {
+        return tree(payload, count);
+    };
+    let parts = payload
+        .split_first_chunk()
+        .and_then(|(size, rest)| rest.split_at_checked(u32::from_be_bytes(*size) as usize));
+    let (first, second) = parts.ok_or("more payload: the size of its first half")?;
+    let (first, second) = rayon::join(|| tree(first, half), || tree(second, count - half));
+    let mut points = first?;
+    points.extend(second?);
+    points.sort_unstable(); // as a rule they are
+    Ok(points)
+}
+
+/// Points of the first of two trees; None: there is one.
+fn halves_of(count: u32) -> Option<u32> {
+    (count >= SPLIT_FROM).then_some(count / 2)
+}
+
+/// Codes `count` points of `bits` bits an axis as one tree. `points`: their sorted Morton codes (encoder). Returns these.
+fn code<C: Bins>(c: &mut C, points: &[u64], count: u32, bits: u32) -> Vec<u64> {
     let mut out = Vec::with_capacity(count as usize);
     let mut coder = Coder {
         c,
@@ -97,7 +141,7 @@ impl<C: Bins> Coder<'_, C> {
                 break;
             }
             let (first, mut mask, mut mine) = (next.len() as u32, 0, 0);
-            if node.count == 1 && node.occupied() == 0 {
+            if node.count == 1 && node.occupied() <= LONELY {
                 let point = points.get(node.start as usize).copied().unwrap_or(0);
                 out.push(node.code << (3 * rest) | self.c.bits(point & ((1 << (3 * rest)) - 1), 3 * rest));
             } else if node.count == 1 {

@@ -1,8 +1,8 @@
-//! Binary range coder (spec 6.1): bins and their probabilities -> bytes, and back.
+//! Range coder (spec 6.1): bins, bits, symbols and their probabilities -> bytes, and back.
 //!
 //! `Bins` is what the models see. Encoder and decoder both implement it, so that every syntax element is described
-//! once: the encoder's `bin` writes its argument and returns it, the decoder's ignores its argument and returns what
-//! it read. Carries are resolved with a pending byte and a run length, as in LZMA; the first byte, always 0, is left out.
+//! once: the encoder's methods write their argument and return it, the decoder's ignore their argument and return what
+//! they read. Carries are resolved with a pending byte and a run length, as in LZMA; the first byte, always 0, is left out.
 
 /// One direction of the entropy coder.
 pub trait Bins {
@@ -13,12 +13,36 @@ pub trait Bins {
     /// False once the payload has been overrun beyond what an encoder may leave off: the caller may stop.
     fn alive(&self) -> bool;
 
-    /// `n` bins of probability one half, most significant first.
+    /// One of `SYMBOLS`; `ends` are the ends of their intervals within 65536, that of the last one modulo 65536.
+    fn symbol(&mut self, symbol: usize, ends: &Ends) -> usize;
+    /// `n` bits of probability one half, at most `BITS_MAX`.
+    fn few_bits(&mut self, value: u32, n: u32) -> u32;
+
+    /// `n` bits of probability one half, most significant first.
     fn bits(&mut self, value: u64, n: u32) -> u64 {
-        (0..n)
-            .rev()
-            .fold(0, |v, i| v << 1 | u64::from(self.bin(value >> i & 1 != 0, 1 << 15)))
+        let (mut v, mut rest) = (0, n);
+        while rest > 0 {
+            let few = rest.min(BITS_MAX);
+            rest -= few;
+            v = v << few | u64::from(self.few_bits((value >> rest) as u32 & ((1 << few) - 1), few));
+        }
+        v
     }
+}
+
+/// Symbols of an alphabet.
+pub const SYMBOLS: usize = 32;
+/// Cumulative probabilities times 65536.
+pub type Ends = [u16; SYMBOLS];
+/// Bits that the range has room for at once.
+const BITS_MAX: u32 = 16;
+
+/// Start and length of the interval of a symbol.
+#[inline]
+fn interval(symbol: usize, ends: &Ends) -> (u32, u32) {
+    let end = ends[symbol % SYMBOLS];
+    let start = if symbol == 0 { 0 } else { ends[(symbol - 1) % SYMBOLS] };
+    (u32::from(start), u32::from(end.wrapping_sub(start)))
 }
 
 const TOP: u32 = 1 << 24;
@@ -63,6 +87,17 @@ impl Encoder {
         self.low = (self.low & 0x00FF_FFFF) << 8;
     }
 
+    /// Takes the part of the range from `start` on, `length` long.
+    #[inline]
+    fn take(&mut self, start: u32, length: u32) {
+        self.low += u64::from(start);
+        self.range = length;
+        while self.range < TOP {
+            self.range <<= 8;
+            self.shift();
+        }
+    }
+
     /// The payload: the value with the most trailing zero bits in the final interval, at most four zero bytes left off.
     pub fn finish(mut self) -> Vec<u8> {
         for bits in (0..=31u32).rev() {
@@ -87,16 +122,25 @@ impl Bins for Encoder {
     fn bin(&mut self, bin: bool, p: u32) -> bool {
         let bound = ((u64::from(self.range) * u64::from(p)) >> 16) as u32;
         if bin {
-            self.range = bound;
+            self.take(0, bound);
         } else {
-            self.low += u64::from(bound);
-            self.range -= bound;
-        }
-        while self.range < TOP {
-            self.range <<= 8;
-            self.shift();
+            self.take(bound, self.range - bound);
         }
         bin
+    }
+
+    #[inline]
+    fn symbol(&mut self, symbol: usize, ends: &Ends) -> usize {
+        let (unit, (start, length)) = (self.range >> 16, interval(symbol, ends));
+        self.take(unit * start, unit * length);
+        symbol
+    }
+
+    #[inline]
+    fn few_bits(&mut self, value: u32, n: u32) -> u32 {
+        let unit = self.range >> n;
+        self.take(unit * value, unit);
+        value
     }
 
     fn alive(&self) -> bool {
@@ -120,15 +164,35 @@ impl<'a> Decoder<'a> {
             range: u32::MAX,
             code: 0,
         };
-        (0..4).for_each(|_| d.code = d.code << 8 | d.byte());
+        d.code = d.coming();
+        d.position = 4;
         d
     }
 
+    /// The bytes to come, the first one on top; zeros beyond the end.
     #[inline]
-    fn byte(&mut self) -> u32 {
-        let b = self.payload.get(self.position).copied().unwrap_or(0);
-        self.position += 1;
-        u32::from(b)
+    fn coming(&self) -> u32 {
+        match self.payload.get(self.position..).and_then(|rest| rest.first_chunk()) {
+            Some(four) => u32::from_be_bytes(*four),
+            None => self.last(),
+        }
+    }
+
+    #[cold]
+    fn last(&self) -> u32 {
+        let byte = |i: usize| self.payload.get(self.position + i).copied().unwrap_or(0);
+        u32::from_be_bytes(std::array::from_fn(byte))
+    }
+
+    /// Goes on with the part of the range from `start` on, `length` long. Without a branch: how much of the payload that
+    /// takes cannot be foreseen.
+    #[inline]
+    fn take(&mut self, start: u32, length: u32) {
+        let shift = length.leading_zeros() & 24;
+        let come = (u64::from(self.coming()) << shift >> 32) as u32;
+        self.range = length << shift;
+        self.code = self.code.wrapping_sub(start) << shift | come;
+        self.position += shift as usize / 8;
     }
 
     /// Checks that the payload was used up exactly (spec 6.1); otherwise what is wrong with it.
@@ -151,14 +215,29 @@ impl Bins for Decoder<'_> {
     fn bin(&mut self, _: bool, p: u32) -> bool {
         let bound = ((u64::from(self.range) * u64::from(p)) >> 16) as u32;
         let bin = self.code < bound;
-        let (range, code) = (self.range - bound, self.code.wrapping_sub(bound));
-        self.range = std::hint::select_unpredictable(bin, bound, range);
-        self.code = std::hint::select_unpredictable(bin, self.code, code);
-        while self.range < TOP {
-            self.range <<= 8;
-            self.code = self.code << 8 | self.byte();
-        }
+        let start = std::hint::select_unpredictable(bin, 0, bound);
+        let length = std::hint::select_unpredictable(bin, bound, self.range - bound);
+        self.take(start, length);
         bin
+    }
+
+    #[inline]
+    fn symbol(&mut self, _: usize, ends: &Ends) -> usize {
+        let unit = self.range >> 16;
+        let at = (self.code / unit.max(1)).min(65535) as u16;
+        let before: u16 = ends[..SYMBOLS - 1].iter().map(|end| u16::from(*end <= at)).sum();
+        let symbol = usize::from(before);
+        let (start, length) = interval(symbol, ends);
+        self.take(unit * start, unit * length);
+        symbol
+    }
+
+    #[inline]
+    fn few_bits(&mut self, _: u32, n: u32) -> u32 {
+        let unit = self.range >> n;
+        let value = (self.code / unit.max(1)).min((1 << n) - 1);
+        self.take(unit * value, unit);
+        value
     }
 
     #[inline]

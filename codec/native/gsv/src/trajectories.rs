@@ -8,6 +8,7 @@ use crate::range_coder::Bins;
 use crate::values::ValueModel;
 
 const LENGTHS: usize = 32; // lengths with a model of their own
+const BLOCK: usize = 16; // indices that one bin says to have no coefficients at all
 
 /// Coefficients of N Gaussians or nodes, `channels` values each, lowest frequency first.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -131,17 +132,30 @@ pub fn code<C: Bins>(
     let channels = source.channels;
     let mut coder = Coder {
         kind,
-        lengths: Model::new(16 * LENGTHS, 16 * LENGTHS, LENGTHS),
+        lengths: Model::new(16 * LENGTHS + 4, 16 * LENGTHS + 2, LENGTHS + 1),
         values: ValueModel::new(if kind == Kind::Nodes { 24 } else { 12 }),
     };
     let mut out = Trajectories::new(channels);
-    for (i, near) in near.iter().enumerate() {
-        let length = coder.length(c, near, &out, source.get(i).len() / channels.max(1), k_max);
-        if (out.values.len() + length * channels) as u64 > budget {
-            return Err(Stop::Symbols);
+    let mut before = [false; 2]; // whether blocks have any, the last one first
+    for (block, near) in near.chunks(BLOCK).enumerate() {
+        let own = block * BLOCK..block * BLOCK + near.len();
+        let any = coder.any(c, own.clone().any(|i| !source.get(i).is_empty()), before);
+        before = [any, before[0]];
+        for (i, near) in own.zip(near) {
+            if !any {
+                out.push(&[]);
+                continue;
+            }
+            let length = coder.length(c, near, &out, source.get(i).len() / channels.max(1), k_max);
+            if (out.values.len() + length * channels) as u64 > budget {
+                return Err(Stop::Symbols);
+            }
+            coder.coefficients(c, near, &mut out, source.get(i), length);
+            if coder.values.broken {
+                return Err(Stop::Broken);
+            }
         }
-        coder.coefficients(c, near, &mut out, source.get(i), length);
-        if coder.values.broken || !c.alive() {
+        if !c.alive() {
             return Err(Stop::Broken);
         }
     }
@@ -155,6 +169,14 @@ struct Coder {
 }
 
 impl Coder {
+    /// Whether any of a block has coefficients.
+    fn any<C: Bins>(&mut self, c: &mut C, want: bool, before: [bool; 2]) -> bool {
+        let [last, other] = before.map(usize::from);
+        let first = 16 * LENGTHS; // contexts of its own
+        self.lengths
+            .bin(c, want, first + 2 * last + other, first + last, LENGTHS)
+    }
+
     fn length<C: Bins>(&mut self, c: &mut C, near: &Near, out: &Trajectories, want: usize, k_max: usize) -> usize {
         let l = near.map(|j| out.get(j as usize).len() / out.channels.max(1));
         let a = 4 * l[0].min(3) + l[1].min(3);

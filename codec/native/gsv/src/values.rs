@@ -27,15 +27,80 @@ pub struct ValueModel {
 }
 
 fn spread_bucket(s: i32) -> usize {
-    match s {
-        0..=2 => s as usize,
-        3..=4 => 3,
-        5..=6 => 4,
-        7..=9 => 5,
-        10..=14 => 6,
-        15..=24 => 7,
-        25..=40 => 8,
-        _ => 9,
+    const FAR: i32 = 41;
+    const BUCKETS: [u8; 42] = {
+        let mut buckets = [0; 42];
+        let mut s = 0;
+        while s <= FAR {
+            buckets[s as usize] = match s {
+                0..=2 => s as u8,
+                3..=4 => 3,
+                5..=6 => 4,
+                7..=9 => 5,
+                10..=14 => 6,
+                15..=24 => 7,
+                25..=40 => 8,
+                _ => 9,
+            };
+            s += 1;
+        }
+        buckets
+    };
+    usize::from(BUCKETS[s.clamp(0, FAR) as usize])
+}
+
+/// What the neighbours say of a value.
+pub struct Expected {
+    mean: i32,
+    /// What the value is coded relative to.
+    pub centre: i32,
+    /// 0 to 9, how far the neighbours are apart.
+    pub spread: usize,
+}
+
+impl Expected {
+    /// `near`: the neighbours' values, nearest first.
+    #[inline]
+    pub fn new(near: &[i32]) -> Expected {
+        let (s, g) = near
+            .iter()
+            .zip(NEAR_WEIGHT)
+            .fold((0, 0), |(s, g), (v, w)| (s + w * v, g + w));
+        let mean = match g {
+            0 => 0,
+            11 => (2 * s + 11).div_euclid(22), // the usual case, a division by a constant
+            _ => (2 * s + g).div_euclid(2 * g),
+        };
+        Expected {
+            mean,
+            centre: mean - mean.clamp(-7, 7),
+            spread: spread_bucket(near.iter().map(|v| (v - mean).abs()).sum()),
+        }
+    }
+
+    /// 0 to 22: the mean, coarser where it is large.
+    #[inline]
+    pub fn level(&self) -> usize {
+        const FAR: i32 = 23;
+        const LEVELS: [u8; 47] = {
+            let mut levels = [0; 47];
+            let mut i = 0;
+            while i < 47 {
+                let mean = i as i32 - FAR;
+                let away = mean.abs();
+                let m = if away <= 6 { away } else { 7 + (away - 7) / 4 };
+                levels[i] = (11 + m * mean.signum()) as u8;
+                i += 1;
+            }
+            levels
+        };
+        usize::from(LEVELS[(self.mean.clamp(-FAR, FAR) + FAR) as usize])
+    }
+
+    /// Of the mean: 0, 1 or 2.
+    #[inline]
+    pub fn sign(&self) -> usize {
+        (self.mean.clamp(-1, 1) + 1) as usize
     }
 }
 
@@ -50,25 +115,11 @@ impl ValueModel {
     /// Codes `x`; `near` are the neighbours' values, nearest first, `prev` two values of the same Gaussian.
     #[inline]
     pub fn value<C: Bins>(&mut self, c: &mut C, class: usize, x: i32, near: &[i32], prev: [i32; 2]) -> i32 {
-        let (s, g) = near
-            .iter()
-            .zip(NEAR_WEIGHT)
-            .fold((0, 0), |(s, g), (v, w)| (s + w * v, g + w));
-        let p = match g {
-            0 => 0,
-            11 => (2 * s + 11).div_euclid(22), // the usual case, a division by a constant
-            _ => (2 * s + g).div_euclid(2 * g),
-        };
-        let spread: i32 = near.iter().map(|v| (v - p).abs()).sum();
-        let centre = p - p.clamp(-7, 7);
-        let m = if p.abs() <= 6 {
-            p.abs()
-        } else {
-            (7 + (p.abs() - 7) / 4).min(11)
-        };
-        let a = (class * 23 + (11 + m * p.signum()) as usize) * 10 + spread_bucket(spread);
+        let e = Expected::new(near);
+        let a = (class * 23 + e.level()) * 10 + e.spread;
         let [p1, p2] = prev.map(|v| (v.clamp(-7, 7) + 7) as usize);
-        let b = ((class * 15 + p1) * 15 + p2) * 3 + (p.clamp(-1, 1) + 1) as usize;
+        let b = ((class * 15 + p1) * 15 + p2) * 3 + e.sign();
+        let centre = e.centre;
         let v = self.residual(c, x - centre, [a * SLOTS, b * SLOTS, class * SLOTS]);
         let value = centre + v;
         if value.abs() > MAX_VALUE {

@@ -115,7 +115,9 @@ impl DecodedGroup {
             ("sh0", vec![n, 3]),
             ("shN", vec![n, k, 3]),
         ];
-        let all = PyArray1::<f32>::zeros(py, n * (14 + 3 * k), false);
+        let numpy = py.import("numpy")?;
+        let all = numpy.call_method1("empty", (n * (14 + 3 * k), "f4"))?; // not zeroed: all of it is written
+        let all = all.cast_into::<PyArray1<f32>>()?;
         {
             let mut own = all.readwrite();
             let (means, rest) = own.as_slice_mut()?.split_at_mut(3 * n);

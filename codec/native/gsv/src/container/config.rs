@@ -57,9 +57,9 @@ impl Config {
     }
 
     fn fields<F: Fields>(&mut self, f: &mut F) -> Result<()> {
-        let mut version = 1;
+        let mut version = 2;
         f.u8(&mut version)?;
-        f.must(version == 1, || format!("configuration_version 1, found {version}"))?;
+        f.must(version == 2, || format!("configuration_version 2, found {version}"))?;
         f.u8(&mut self.level)?;
         f.u32(&mut self.frame_duration)?;
         f.must(self.frame_duration > 0, || "frame_duration > 0, found 0".into())?;

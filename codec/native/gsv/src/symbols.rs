@@ -1,0 +1,141 @@
+//! Symbols (spec 6.6): one of 32 in three contexts <-> the range coder, in integers only.
+//!
+//! Each context has a distribution that follows what is seen in it; a symbol is predicted by the mean of three, with weights that
+//! are learned as well. One decision for what bins take eight for, in 16-bit lanes side by side, which any processor has.
+
+use crate::range_coder::{Bins, Ends, SYMBOLS};
+use std::sync::LazyLock;
+
+/// Symbols seen after which a distribution stops slowing down.
+const SEEN_MAX: u8 = 126;
+/// Least probability of a symbol, times 65536.
+const LEAST: u16 = 4;
+/// Weights adapt by 1 / 128: kept 128 times as fine.
+const RATE_BITS: u32 = 7;
+
+/// A distribution: cumulative probabilities times 65536, 65535 for 1. A cache line.
+#[derive(Clone, Copy)]
+#[repr(align(64))]
+struct Distribution(Ends);
+
+/// All symbols alike.
+const NEW: Distribution = {
+    let mut ends = [0; SYMBOLS];
+    let mut i = 0;
+    while i < SYMBOLS {
+        ends[i] = (2048 * (i as u32 + 1) - 1) as u16;
+        i += 1;
+    }
+    Distribution(ends)
+};
+
+impl Distribution {
+    /// Half of the probability of `symbol`, times 65536; at least 1.
+    #[inline]
+    fn half(&self, symbol: usize) -> u32 {
+        let start = if symbol == 0 { 0 } else { self.0[(symbol - 1) % SYMBOLS] };
+        u32::from(self.0[symbol % SYMBOLS].saturating_sub(start) / 2) + 1
+    }
+
+    /// Moves towards `symbol` by `rate` / 65536.
+    #[inline]
+    fn learn(&mut self, symbol: usize, rate: u16) {
+        for (i, end) in (0i16..).zip(&mut self.0) {
+            let target = if i >= symbol as i16 { u16::MAX } else { 0 };
+            let off = *end ^ target; // from the target
+            *end = (off - high(off, rate)) ^ target;
+        }
+    }
+}
+
+/// The upper half of a product.
+#[inline]
+fn high(a: u16, b: u16) -> u16 {
+    ((u32::from(a) * u32::from(b)) >> 16) as u16
+}
+
+/// The distributions of one kind of context, and how many symbols each has seen.
+struct Table {
+    distributions: Vec<Distribution>,
+    seen: Vec<u8>,
+}
+
+impl Table {
+    fn new(contexts: usize) -> Table {
+        Table {
+            distributions: vec![NEW; contexts],
+            seen: vec![0; contexts],
+        }
+    }
+}
+
+/// 1 / (n + 1.5) in 1/65536, and how much a distribution that has seen n symbols can be trusted, 0 to 3.
+static SEEN: LazyLock<[(u16, u8); 256]> = LazyLock::new(|| {
+    std::array::from_fn(|n| {
+        let age = match n {
+            0..=3 => 0,
+            4..=15 => 1,
+            16..=63 => 2,
+            _ => 3,
+        };
+        ((131_072 / (2 * n + 3)) as u16, age)
+    })
+});
+
+/// Adaptive model of symbols.
+pub struct SymbolModel {
+    tables: [Table; 3],
+    weights: Vec<[u32; 2]>, // of the first two distributions, in 1/65536, times 2^RATE_BITS
+    seen: &'static [(u16, u8); 256],
+}
+
+impl SymbolModel {
+    /// So many contexts of each kind, and sets of weights.
+    pub fn new(contexts: [usize; 3], sets: usize) -> Self {
+        SymbolModel {
+            tables: contexts.map(Table::new),
+            weights: vec![[21845 << RATE_BITS; 2]; sets * 64],
+            seen: &SEEN,
+        }
+    }
+
+    /// Codes one symbol in three contexts, mixed with weight set `w`.
+    ///
+    /// Contexts are made of what the caller counted, never of raw input, so they are in range by construction.
+    #[inline]
+    pub fn symbol<C: Bins>(&mut self, c: &mut C, symbol: usize, contexts: [usize; 3], w: usize) -> usize {
+        let [a, b, d] = &mut self.tables;
+        let [ia, ib, id] = contexts;
+        let (sa, sb, sd) = (&mut a.seen[ia], &mut b.seen[ib], &mut d.seen[id]);
+        let [(ra, ga), (rb, gb), (rd, gd)] = [*sa, *sb, *sd].map(|n| self.seen[usize::from(n)]);
+        let weights = &mut self.weights[64 * w + usize::from(16 * ga + 4 * gb + gd)];
+        let [wa, wb] = weights.map(|v| v >> RATE_BITS);
+        let wd = 65536 - wa - wb;
+        let (a, b, d) = (
+            &mut a.distributions[ia],
+            &mut b.distributions[ib],
+            &mut d.distributions[id],
+        );
+        let mut ends = [0; SYMBOLS];
+        for (i, end) in ends.iter_mut().enumerate() {
+            let mean = high(a.0[i], wa as u16) + high(b.0[i], wb as u16) + high(d.0[i], wd as u16);
+            *end = mean - (mean >> 9) + LEAST * (i as u16 + 1);
+        }
+        ends[SYMBOLS - 1] = 0; // 65536
+        let symbol = c.symbol(symbol, &ends);
+        // Each weight follows the share of its distribution in what was expected, and a little of an even one.
+        let [fa, fb, fd] = [wa * a.half(symbol), wb * b.half(symbol), wd * d.half(symbol)];
+        let unit = ((fa + fb + fd) >> 16) + 1;
+        for (v, f) in weights.iter_mut().zip([fa, fb]) {
+            let share = f / unit;
+            *v = *v - v.div_ceil(1 << RATE_BITS) + share - (share >> 5) + 682;
+        }
+        a.learn(symbol, ra);
+        b.learn(symbol, rb);
+        d.learn(symbol, rd);
+        for n in [sa, sb, sd] {
+            *n = (*n + 1).min(SEEN_MAX);
+        }
+        symbol
+    }
+}
