@@ -421,7 +421,7 @@ def _say(message, category, filename, lineno, file=None, line=None) -> None:
 def main() -> None:
     """Entry point of the `gscodec` command."""
     warnings.showwarning = _say
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is there: its threads would wait beside ours, busily
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is there; the encoder has threads
     try:
         sys.exit(app(standalone_mode=False))  # what a command returns, None, or the code of a typer.Exit
     except (typer.Abort, KeyboardInterrupt):
