@@ -37,8 +37,8 @@ class EncodeSettings:
             where their parents are known and it is cheaper. 0 or 1: every group is independent.
         layers: layers of importance in each group, each with its own steps; any first few decode alone. None: what is
             smallest.
-        refine: views by which frames of many Gaussians that are coded alone are refined, from quality 50 on; 0: they
-            are not. None: REFINE for splats of one frame, 0 for all else.
+        refine: views by which frames of many Gaussians that are coded alone are refined; 0: they are not. None: REFINE
+            for splats of one frame, 0 for all else.
     """
 
     quality: float = 50.0

@@ -23,7 +23,7 @@ from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
 from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes
 from gscodec.encode.parallel import each_frame
-from gscodec.encode.refine import QUALITY_LEAST, refine
+from gscodec.encode.refine import refine
 from gscodec.gaussians import Gaussians, Group
 from gscodec.gaussians import Nodes as GivenNodes
 from gscodec.render.sensitivity import Importance, coarsest, measure, steps_for_error
@@ -252,7 +252,7 @@ def code_group(
         quality: 0 to 100.
         keep_all: code every Gaussian, also the invisible ones.
         layers: number of layers of falling importance; None: STILL_LAYERS for many Gaussians in a single frame, else 1.
-        refine_steps: views by which a single frame of many Gaussians is refined, from QUALITY_LEAST on.
+        refine_steps: views by which a single frame of many Gaussians is refined.
         cameras: from which the subject was captured, if it was.
     """
     s, layers = stack_group(group), layers or _layers(group)
@@ -289,7 +289,7 @@ def code_group(
     channels = {n: quantize_channels(v, steps[n], weights[n], parts, shifts[n], price) for n, v in values.items()}
     for n, own in curves.items():
         channels[n]["curves"] = [c.row() for c in own]
-    if refine_steps and frames == 1 and len(positions) >= STILL_LEAST and quality >= QUALITY_LEAST:
+    if refine_steps and frames == 1 and len(positions) >= STILL_LEAST:
         own = {n: v[layer] for n, v in shifts.items()}
         looking = partial(refine, s.frame(0), grid.to_world(positions), steps=refine_steps, cameras=cameras)
         channels = _refined(looking, values, channels, own, weights, parts, price)

@@ -17,7 +17,6 @@ from gscodec.render.sensitivity import derivatives, sensitivity_cameras
 from gscodec.gaussians import Gaussians
 from gscodec.render.workspace import PARAMETERS, Workspace, call
 
-QUALITY_LEAST = 50  # below, moving an integer costs more than it brings
 RATE = 0.01  # quantization steps a step, at first
 BETAS, EPS = (0.9, 0.99), 1e-30
 INSIDE = 0.02  # quantization steps: so far from where it would change, at least, starts what is under an integer
