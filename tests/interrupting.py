@@ -21,7 +21,6 @@ from gscodec.bench.stress_scenes import walking
 from gscodec.cli import main
 from gscodec.encode import encode, writer
 from gscodec.render import sensitivity
-from gscodec.render import sensitivity
 from gscodec.splats import sequence_writer
 from gscodec.train import settings, train
 

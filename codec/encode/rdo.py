@@ -1,8 +1,8 @@
 """Rate-distortion optimised quantization: integers that cost fewer bits where the picture hardly notices.
 
 All choices minimise error + price * bits, where the error is the picture's mean squared error by the measured
-sensitivities (render/sensitivity.py), and the price is the error that a bit saves where steps are right. Bits are estimates:
-code lengths given the neighbours' prediction for keyframes, a fixed table for trajectories.
+sensitivities (render/sensitivity.py), and the price is the error that a bit saves where steps are right. Bits are
+estimates: code lengths given the neighbours' prediction for keyframes, a fixed table for trajectories.
 """
 
 from __future__ import annotations

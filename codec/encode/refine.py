@@ -13,8 +13,8 @@ import numpy as np
 
 from gscodec.bitstream.color import TO_RGB
 from gscodec.camera import Camera
-from gscodec.render.sensitivity import derivatives, sensitivity_cameras
 from gscodec.gaussians import Gaussians
+from gscodec.render.sensitivity import derivatives, sensitivity_cameras
 from gscodec.render.workspace import PARAMETERS, Workspace, call
 
 RATE = 0.01  # quantization steps a step, at first
