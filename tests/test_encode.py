@@ -156,7 +156,7 @@ def test_a_trainers_nodes_carry_newcomers_from_where_these_rest():
     assert (with_nodes["positions"][:, 0].max() * with_nodes["grid_step"]) > 4, "at their place of rest"
     left = {n: t["coefficients"] for n, t in with_nodes["trajectories"].items()}
     assert all(len(c) == 1 for c in left.values()), "only what rounding has left of the canonical, nothing over time"
-    assert (left.get("means", np.zeros(1)) != 0).mean() < 0.01
+    assert (left.get("means", np.zeros(1)) != 0).mean() < 0.03
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

@@ -280,7 +280,8 @@ def code_group(
     order = order[layer[order].argsort(kind="stable")]
     positions, quats, source, layer = positions[order], quats[order], source[order], layer[order]
     s, measured = s.take(source), measured.take(source)
-    price, counts = rdo.bit_price(error, max(len(source), 1)), np.bincount(layer, minlength=layers)
+    price = rdo.bit_price(error, len(source), group.nodes is not None)
+    counts = np.bincount(layer, minlength=layers)
     parts = [
         (slice(b - n, b), rdo.neighbours(positions[b - n : b])) for n, b in zip(counts, counts.cumsum(), strict=True)
     ]

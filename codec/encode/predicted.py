@@ -110,7 +110,7 @@ def predict_group(
         "nodes": None,
         "lifetimes": None if s.lifetimes is None else s.lifetimes.astype(np.uint16),
     }
-    price = rdo.bit_price(error_for(quality), max(len(positions), 1))
+    price = rdo.bit_price(error_for(quality), len(positions), group.nodes is not None)
     return out | motion_integers(s, channels, steps, measured, price, grid.to_world(positions), nodes, motion)
 
 

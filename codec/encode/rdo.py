@@ -11,7 +11,8 @@ import numpy as np
 
 from gscodec.bitstream.transform import dct_basis
 
-BIT_PRICE = 0.03  # of a bit, in units of the picture's error per Gaussian: the slope on a trained capture
+BIT_PRICE = 0.03  # of a bit, in units of the picture's error per Gaussian
+TRAINED = 0.25  # times that where training has had a rate term: what was not worth its bits is gone already
 FLOOR = 0.2  # share of the mean sensitivity that all have: few views say little of one, and errors that agree add up
 ZERO_BITS, NONZERO_BITS, LENGTH_BITS = (
     0.5,
@@ -23,9 +24,10 @@ NEAR, WINDOW = 4, 32  # contexts: so many nearest among so many before (spec 7.3
 NEAR_WEIGHT = np.array([4, 3, 2, 2])
 
 
-def bit_price(error: float, count: int) -> float:
-    """Mean squared error that one bit is worth in a group of `count` Gaussians whose target is `error`."""
-    return BIT_PRICE * error / count
+def bit_price(error: float, count: int, trained: bool) -> float:
+    """Mean squared error that one bit is worth in a group of `count` Gaussians whose target is `error`; `trained`: by
+    gscodec, which hands over its nodes."""
+    return BIT_PRICE * (TRAINED if trained else 1.0) * error / max(count, 1)
 
 
 def trajectory(values: np.ndarray, weights: np.ndarray, step: float, price: float) -> np.ndarray:

@@ -295,7 +295,8 @@ def finetune(
     run = _Finetuner(group, views, frames, settings, radius)
     order: list[int] = []
     for step in range(steps):
-        order = order or run.rng.permutation(len(frames)).tolist()
+        # The first and the last frame come twice: they have neighbours on one side only.
+        order = order or run.rng.permutation([0, *range(len(frames)), len(frames) - 1]).tolist()
         loss = run.step(order.pop(), 0.05 ** (step / steps))
         if on_step:
             on_step(step, loss)

@@ -30,7 +30,7 @@ from gscodec.train.sweep import shell, sweep
 from gscodec.train.views import Views
 
 CUT_FLOOR = 0.004  # image loss that no frame is cut for: clean pictures fit far better than they need to
-STIRRED = 0.25  # share of the Gaussians that begin to change in one frame, for which a group ends
+STIRRED = 0.15  # share of the Gaussians that begin to change in one frame, for which a group ends
 SETTLED = 4  # frames that a group has at least before that
 SWEEP_LEAST = 0.1  # of the initial points that a plane sweep must find, to be a scene with texture
 
