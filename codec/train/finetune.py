@@ -39,7 +39,7 @@ MEANS_RATE = 4e-5  # of the canonical means, times the radius
 CANONICAL_SHARE = 0.3  # of the keyframe's rates
 CANONICAL_PRICE = 3.0  # of a canonical bit, in bits of residuals
 LOSS_SHARE = 0.05  # of one step in the mean of the losses
-RATE_EVERY = 4  # the rate term has every coefficient, an image few of them: once in so many steps, so much stronger
+RATE_EVERY = 8  # the rate term has every coefficient, an image few of them: once in so many steps, so much stronger
 
 
 def rounded(c: torch.Tensor) -> torch.Tensor:

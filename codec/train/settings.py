@@ -30,7 +30,7 @@ class TrainSettings:
     gop: int = 20
     keyframe_steps: int = 1500
     motion_steps: int = 200
-    finetune_steps: int = 160
+    finetune_steps: int = 120
     gaussians_max: int = 17500
     initial_points: int = 8000
     sh_degree: int = 1
