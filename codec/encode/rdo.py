@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from gscodec.bitstream.quantization import QUALITY_DEFAULT, error_for
 from gscodec.bitstream.transform import dct_basis
 
-BIT_PRICE = 0.03  # of a bit, in units of the picture's error per Gaussian
-TRAINED = 0.25  # times that where training has had a rate term: what was not worth its bits is gone already
+BIT_PRICE = 0.03  # of a bit, in units of the picture's error per Gaussian: the slope on a trained capture
 FLOOR = 0.2  # share of the mean sensitivity that all have: few views say little of one, and errors that agree add up
 ZERO_BITS, NONZERO_BITS, LENGTH_BITS = (
     0.5,
@@ -25,9 +25,13 @@ NEAR_WEIGHT = np.array([4, 3, 2, 2])
 
 
 def bit_price(error: float, count: int, trained: bool) -> float:
-    """Mean squared error that one bit is worth in a group of `count` Gaussians whose target is `error`; `trained`: by
-    gscodec, which hands over its nodes."""
-    return BIT_PRICE * (TRAINED if trained else 1.0) * error / max(count, 1)
+    """Mean squared error that one bit is worth in a group of `count` Gaussians whose target is `error`.
+
+    Where gscodec has `trained` the group, and hands over its nodes, a rate term has dropped what is not worth its bits
+    already: the finer the steps are, the less there is for a second look (lumberjack, quality 60: 4 % of the bytes).
+    """
+    already = min(1.0, error / error_for(QUALITY_DEFAULT)) if trained else 1.0
+    return BIT_PRICE * already * error / max(count, 1)
 
 
 def trajectory(values: np.ndarray, weights: np.ndarray, step: float, price: float) -> np.ndarray:
