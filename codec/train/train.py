@@ -169,9 +169,9 @@ def train_groups(
     """Trains `capture` from `first_frame` on and yields each group when it is done.
 
     A group continues the Gaussians of the one before (`Group.parents`) as long as they serve; where the image loss of a
-    tracked frame is `cut_ratio` times the keyframe's, the group ends and the next one starts anew; where much that stood
-    still begins to change at once, it ends, and the next one continues. Every segment of `random_access` frames starts
-    anew, too: segments depend on nothing but their own frames.
+    tracked frame is `cut_ratio` times the keyframe's, the group ends and the next one starts anew. Where much that
+    stood still begins to change at once, it ends, and the next one continues. Every segment of `random_access` frames
+    starts anew, too: segments depend on nothing but their own frames.
 
     Args:
         first_frame: where an earlier run stopped; a group starts there.
