@@ -121,7 +121,7 @@ pub fn group(s: &Shape) -> Group {
         grid_bits: s.bits,
         sh_degree: s.sh_degree,
         layers: s.counts.iter().map(|n| layer(*n, *n)).collect(),
-        curves: (s.seed % 2 == 1).then(|| std::array::from_fn(|c| curve(c as f32))),
+        curves: (s.counts.len() > 1).then(|| std::array::from_fn(|c| curve(c as f32))),
         ..Header::default()
     };
     let count: usize = s.counts.iter().sum();
