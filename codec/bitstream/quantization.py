@@ -2,8 +2,8 @@
 
 One number, `quality`, scales them all; the geometry steps follow the size of the subject, so that a capture in
 millimetres and one in metres get the same picture. Ratios between attributes: equal slopes of rendered error against
-bits, measured on the statue's middle frame (halving one step at a time). These are nominal, for training; the encoder
-measures what each scene needs for the same error (render/sensitivity.py).
+bits, measured on the statue's middle frame (halving one step at a time). These are nominal; encoder and
+training measure what each scene needs for the same error (render/sensitivity.py).
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from gscodec.encode.parallel import each_frame
 from gscodec.encode.refine import refine
 from gscodec.gaussians import Gaussians, Group
 from gscodec.gaussians import Nodes as GivenNodes
-from gscodec.render.sensitivity import Importance, coarsest, measure, steps_for_error
+from gscodec.render.sensitivity import STILL_VIEWS, VIEWS, Importance, coarsest, measure, steps_for_error
 
 GRID_BITS_MAX = 21
 SHIFTED = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
@@ -402,7 +402,8 @@ def measure_stack(s: Stack, cameras: list[Camera] = ()) -> Importance:
     if not count:
         sizes = {"means": 3, "quats": 3} | {n: v.shape[2] for n, v in s.appearance.items()}
         return Importance({n: np.zeros((0, c)) for n, c in sizes.items()}, np.zeros((0, 3)), np.zeros(0))
-    return measure([s.frame(t) for t in sorted({0, frames // 2, frames - 1})], cameras)
+    shown = [s.frame(t) for t in sorted({0, frames // 2, frames - 1})]
+    return measure(shown, cameras, VIEWS if frames > 1 else STILL_VIEWS)
 
 
 def _steps(

@@ -83,9 +83,9 @@ def keyframe(x: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float,
     q = np.rint(x)
     if not len(x):
         return q
-    worth = (weights + FLOOR * weights.mean()) / price
+    worth = _worth(weights, price)
     for _ in range(passes):
-        context = np.clip(np.rint(q[near] @ (NEAR_WEIGHT / NEAR_WEIGHT.sum())), -RANGE, RANGE).astype(int)
+        context = _contexts(q, near)
         bits = _code_lengths(context, q)
         best, cost = q, np.full(len(x), np.inf)
         toward = np.sign(context - np.rint(x))
@@ -103,13 +103,23 @@ def margins(q: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float) 
     in steps: what the next one costs more. Other arguments are those of `keyframe`."""
     if not len(q):
         return q, q
-    worth = (weights + FLOOR * weights.mean()) / price
-    context = np.clip(np.rint(q[near] @ (NEAR_WEIGHT / NEAR_WEIGHT.sum())), -RANGE, RANGE).astype(int) + RANGE
-    bits = _code_lengths(context - RANGE, q)
+    worth, context = _worth(weights, price), _contexts(q, near)
+    bits = _code_lengths(context, q)[context + RANGE]
     level = np.clip(q, -RANGE, RANGE).astype(int) + RANGE
-    more = (bits[context, np.clip(level + d, 0, 2 * RANGE)] - bits[context, level] for d in (1, -1))
+    each = np.arange(len(q))
+    more = (bits[each, np.clip(level + d, 0, 2 * RANGE)] - bits[each, level] for d in (1, -1))
     up, down = (np.clip(m / (2 * worth), -0.4, 9) for m in more)
     return up, down
+
+
+def _worth(weights: np.ndarray, price: float) -> np.ndarray:
+    """[N] bits that an error of one step is worth, squared."""
+    return (weights + FLOOR * weights.mean()) / price
+
+
+def _contexts(q: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """[N] int, what the neighbours of each say, from -RANGE to RANGE."""
+    return np.clip(np.rint(q[near] @ (NEAR_WEIGHT / NEAR_WEIGHT.sum())), -RANGE, RANGE).astype(int)
 
 
 def _code_lengths(context: np.ndarray, q: np.ndarray) -> np.ndarray:

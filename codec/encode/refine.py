@@ -14,8 +14,8 @@ import numpy as np
 from gscodec.bitstream.color import TO_RGB
 from gscodec.camera import Camera
 from gscodec.gaussians import Gaussians
-from gscodec.render.sensitivity import derivatives, sensitivity_cameras
-from gscodec.render.workspace import PARAMETERS, Workspace, call
+from gscodec.render.sensitivity import GREY, arrays_of, derivatives, sensitivity_cameras
+from gscodec.render.workspace import Workspace
 
 RATE = 0.01  # quantization steps a step, at first
 BETAS, EPS = (0.9, 0.99), 1e-30
@@ -43,8 +43,7 @@ def refine(
         decode: integers -> values, and how much they change with an integer; attribute -> [N, C] each.
         steps: views that are looked at. cameras: those of the capture.
     """
-    background, workspace = (0.5, 0.5, 0.5), Workspace()
-    x = {}
+    workspace, x = Workspace(), {}
     for n, q in integers.items():
         up, down = margins[n]
         x[n] = np.clip(latents[n], q - 0.5 - down + INSIDE, q + 0.5 + up - INSIDE).astype(np.float32)
@@ -55,12 +54,13 @@ def refine(
         return {n: q + above[n] - below[n] for n, q in integers.items()}
 
     first, second = ({n: np.zeros_like(v) for n, v in x.items()} for _ in range(2))
-    views, original = sensitivity_cameras(source.means, cameras, steps), _arrays(source)
+    views, original = sensitivity_cameras(source.means, cameras, steps), arrays_of(source)
     for step, i in enumerate(np.random.default_rng(0).permutation(len(views)), 1):
         camera = views[i]
-        target, _ = workspace.forward(original, camera, background)
+        target, _ = workspace.forward(original, camera, GREY)
         values, slopes = decode(rounded())
-        derivative = _derivatives(workspace, _frame(means, values), camera, background, target)
+        off = lambda image, target=target: np.ascontiguousarray(image - target)  # noqa: E731
+        derivative = derivatives(workspace, _frame(means, values), camera, off)
         rate = RATE * (1 - (step - 1) / len(views))
         for n, v in x.items():
             d = derivative[n] * slopes[n]
@@ -71,25 +71,9 @@ def refine(
     return {n: q.astype(np.int32) for n, q in rounded().items()}
 
 
-def _derivatives(workspace: Workspace, frame: Gaussians, camera: Camera, background, target: np.ndarray) -> dict:
-    """Of half the squared difference to `target`, by the channels that are coded."""
-    arrays = _arrays(frame)
-    image, _ = workspace.forward(arrays, camera, background, training=True)
-    grads, statistics = workspace.gradients(arrays)
-    for a in grads + statistics:
-        a.fill(0)
-    difference, alpha = np.ascontiguousarray(image - target), np.zeros(image.shape[:2], np.float32)
-    call(workspace.native.backward, arrays, difference, alpha, (grads, statistics))
-    return derivatives(frame, dict(zip(PARAMETERS, grads, strict=True)))
-
-
 def _frame(means: np.ndarray, values: dict[str, np.ndarray]) -> Gaussians:
     v, count = values["quats"], len(means)
     quats = np.concatenate([np.sqrt(np.maximum(1e-6, 1 - (v * v).sum(1, keepdims=True))), v], 1)
     shN = values.get("shN", np.zeros((count, 0))).reshape(count, -1, 3) @ TO_RGB.T
     colors = values["sh0"] @ TO_RGB.T
     return Gaussians(means, quats, values["log_scales"], values["logit_opacities"][:, 0], colors, shN)
-
-
-def _arrays(g: Gaussians) -> tuple[np.ndarray, ...]:
-    return tuple(np.ascontiguousarray(getattr(g, name), np.float32) for name in PARAMETERS)

@@ -8,6 +8,7 @@ subject; those by which `gscodec eval` judges are others.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +20,7 @@ from gscodec.gaussians import Gaussians
 from gscodec.render.workspace import PARAMETERS, Workspace, call
 
 VIEWS, STILL_VIEWS, SIZE = 24, 48, 512  # STILL_VIEWS of a single frame
+GREY = (0.5, 0.5, 0.5)
 REAL_LEAST = 0.05  # canonical quaternions have 0.5 and more
 # Beyond these steps the derivative says too little; means are in radii of the subject.
 COARSEST = {"means": 0.02, "log_scales": 1.0, "quats": 0.25, "logit_opacities": 2.0, "sh0": 1.0, "shN": 1.0}
@@ -51,25 +53,21 @@ def sensitivity_cameras(means: np.ndarray, given: list[Camera] = (), count: int 
     return fitted + cameras_around(means, count - len(taken), name="sensitivity", turn=1.3)
 
 
-def measure(frames: list[Gaussians], cameras: list[Camera] = ()) -> Importance:
-    """Sensitivity over `frames` (the same N >= 1 Gaussians), which share the views. `cameras`: those of the capture."""
+def measure(frames: list[Gaussians], cameras: list[Camera] = (), views: int = VIEWS) -> Importance:
+    """Sensitivity over `frames` (the same N >= 1 Gaussians), which share so many `views`.
+
+    Args:
+        cameras: those of the capture.
+    """
     signs = np.random.default_rng(0)
     workspace = Workspace()
-    count = VIEWS if len(frames) > 1 else STILL_VIEWS
-    cameras = sensitivity_cameras(np.concatenate([g.means for g in frames]), cameras, count)
+    cameras = sensitivity_cameras(np.concatenate([g.means for g in frames]), cameras, views)
     total, removal = {}, np.zeros(len(frames[0]))
     for i, camera in enumerate(cameras):
         g = frames[i % len(frames)]
-        arrays = tuple(np.ascontiguousarray(getattr(g, name), np.float32) for name in PARAMETERS)
-        workspace.forward(arrays, camera, (0.5, 0.5, 0.5), training=True)
-        shape = (camera.height, camera.width)
-        probe = (2.0 * signs.integers(0, 2, (*shape, 3)) - 1).astype(np.float32)
-        grads, statistics = workspace.gradients(arrays)
-        for a in grads + statistics:
-            a.fill(0)
-        call(workspace.native.backward, arrays, probe, np.zeros(shape, np.float32), (grads, statistics))
+        probe = (2.0 * signs.integers(0, 2, (camera.height, camera.width, 3)) - 1).astype(np.float32)
         share = 1 / (len(cameras) * probe.size)
-        for name, d in derivatives(g, dict(zip(PARAMETERS, grads, strict=True))).items():
+        for name, d in derivatives(workspace, g, camera, lambda _, probe=probe: probe).items():
             total[name] = total.get(name, 0) + share * d * d
             if name == "logit_opacities":
                 transparency = np.maximum(1 / (1 + np.exp(g.logit_opacities)), 1e-6)
@@ -78,8 +76,30 @@ def measure(frames: list[Gaussians], cameras: list[Camera] = ()) -> Importance:
     return Importance(total, total.pop("turns"), removal)
 
 
-def derivatives(g: Gaussians, grads: dict) -> dict[str, np.ndarray]:
-    """[N, C] derivatives by the channels that are coded, of quats by the vector part alone; and by "turns"."""
+def arrays_of(g: Gaussians) -> tuple[np.ndarray, ...]:
+    """What the workspace takes."""
+    return tuple(np.ascontiguousarray(getattr(g, name), np.float32) for name in PARAMETERS)
+
+
+def derivatives(
+    workspace: Workspace, g: Gaussians, camera: Camera, by_picture: Callable[[np.ndarray], np.ndarray]
+) -> dict[str, np.ndarray]:
+    """[N, C] derivatives by the channels that are coded, of quats by the vector part alone; and by "turns".
+
+    Args:
+        by_picture: the picture of `camera`, over mid-grey -> the derivative by its pixels, [H, W, 3] f32 both.
+    """
+    arrays = arrays_of(g)
+    image, _ = workspace.forward(arrays, camera, GREY, training=True)
+    pixels = by_picture(image)
+    grads, statistics = workspace.gradients(arrays)
+    for a in grads + statistics:
+        a.fill(0)
+    call(workspace.native.backward, arrays, pixels, np.zeros(pixels.shape[:2], np.float32), (grads, statistics))
+    return _by_channels(g, dict(zip(PARAMETERS, grads, strict=True)))
+
+
+def _by_channels(g: Gaussians, grads: dict) -> dict[str, np.ndarray]:
     real, vector = g.quats[:, :1], g.quats[:, 1:]
     w, x, y, z = g.quats.T
     real = np.copysign(np.maximum(abs(real), REAL_LEAST), real)
@@ -125,7 +145,7 @@ def measured_steps(g: Gaussians, quality: float, nominal: Steps, cameras: list[C
     """
     if not len(g):
         return nominal
-    measured = measure([g] * 2, cameras)
+    measured = measure([g], cameras)
     weights, degrees = measured.weights | {"quats": measured.turns}, g.shN.shape[1]
     values = {"means": g.means, "log_scales": g.log_scales, "quats": g.quats[:, 1:], "sh0": decorrelate(g.sh0)}
     values |= {"logit_opacities": g.logit_opacities[:, None], "shN": decorrelate(g.shN).reshape(len(g), -1)}
