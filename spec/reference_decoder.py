@@ -69,6 +69,7 @@ class Group:
     counts: list  # Gaussians of each decoded layer
     positions: np.ndarray  # [N, 3]
     channels: dict  # attribute -> [C, N]
+    quats0: np.ndarray  # [N, 4] wxyz, what channels of quats and log_scales say (clause 13.1)
     lifetimes: np.ndarray | None  # [N, 2]
     node_positions: np.ndarray | None  # [M, 3]
     node_trajectories: np.ndarray | None  # [K, 6, M]
@@ -77,7 +78,7 @@ class Group:
 
 
 def decode_layer(found, k, header, reference, spend):
-    """Clauses 8 to 10 and 12: one layer -> positions [N, 3], channels, lifetimes or None, trajectories."""
+    """Clauses 8 to 10 and 12: one layer -> positions [N, 3], channels, quats0, lifetimes or None, trajectories."""
     layer, shifts = header.layers[k], header.shifts[k]
     points, near_births = [], []
     if layer.births or not header.reference:
@@ -93,6 +94,7 @@ def decode_layer(found, k, header, reference, spend):
             channels[a] = q.astype(np.int32)
         else:
             channels[a] = np.zeros((len(steps), 0), np.int32)
+    quats0 = rotations(header, channels, near_births)
     if reference:
         first = sum(reference.counts[:k])
         alive = list(range(reference.counts[k]))
@@ -103,6 +105,7 @@ def decode_layer(found, k, header, reference, spend):
         alive = np.array(alive, int) + first
         positions = np.concatenate([reference.positions[alive], positions])
         channels = {a: np.concatenate([reference.channels[a][:, alive], q], 1) for a, q in channels.items()}
+        quats0 = np.concatenate([reference.quats0[alive], quats0])
     near = find_neighbors(positions.tolist())
     lifetimes, trajectories = None, {}
     if (LIFETIMES, k, 0) in found:
@@ -112,7 +115,7 @@ def decode_layer(found, k, header, reference, spend):
         C, what = channel_count(a, header.sh_degree), f"trajectories of {ATTRIBUTES[a]}"
         q = decode_trajectories(found[TRAJECTORIES, k, a], K, C, near, class_trajectories, spend, what)
         trajectories[a] = dense(q, K, C)
-    return positions, channels, lifetimes, trajectories
+    return positions, channels, quats0, lifetimes, trajectories
 
 
 def decode_group(payload, level, frames=None, reference=None, layers=256):
@@ -140,9 +143,9 @@ def decode_group(payload, level, frames=None, reference=None, layers=256):
         q = decode_trajectories(unit, K, 6, node_near, class_nodes, lambda _: None, "node_trajectories")
         node_trajectories = dense(q, K, 6)
     lifetimes = None
-    if any(part[2] is not None for part in parts):
+    if any(part[3] is not None for part in parts):
         whole = [np.tile(np.array([0, header.frames], np.int32), (n, 1)) for n in counts]
-        lifetimes = np.concatenate([w if part[2] is None else part[2] for w, part in zip(whole, parts, strict=True)])
+        lifetimes = np.concatenate([w if part[3] is None else part[3] for w, part in zip(whole, parts, strict=True)])
     correction = {}
     for k in range(len(counts)):
         for a in (LOG_SCALES, LOGIT_OPACITIES):
@@ -154,10 +157,11 @@ def decode_group(payload, level, frames=None, reference=None, layers=256):
         counts,
         np.concatenate([part[0] for part in parts]),
         {a: np.concatenate([part[1][a] for part in parts], 1) for a in header.channels},
+        np.concatenate([part[2] for part in parts]),
         lifetimes,
         node_positions,
         node_trajectories,
-        {a: np.concatenate([part[3][a] for part in parts], 2) for a in header.trajectories},
+        {a: np.concatenate([part[4][a] for part in parts], 2) for a in header.trajectories},
         correction,
     )
 
@@ -233,6 +237,34 @@ def bent(v, low, width, slopes):
     return low + width * before[j] + rise[j] * (v - low - j * width)
 
 
+def canonical(header, attribute, integers):
+    """Clause 13.1: integers [C, N] -> a0 [N, C], without the correction."""
+    steps, offsets = header.channels[attribute]
+    values = np.array(offsets) + np.array(steps) * integers.T
+    if attribute in header.curves:
+        values = np.stack([bent(v, *curve) for v, curve in zip(values.T, header.curves[attribute], strict=True)], 1)
+    return values
+
+
+def rotations(header, channels, near):
+    """Clause 13.1: quats0 [N, 4] of what a layer codes itself; `near`: the neighbours of each."""
+    steps, offsets = (np.array(v) for v in header.channels[QUATS])
+    octaves = -canonical(header, LOG_SCALES, channels[LOG_SCALES]) @ np.array(header.levers).T
+    widths = np.minimum(1, steps * 2.0 ** np.clip(octaves, -64, 64))
+    v = np.clip(offsets + widths * channels[QUATS].T, -1, 1)
+    turns = None
+    for c in (2, 1, 0):
+        one = np.zeros((len(v), 4))
+        one[:, 0], one[:, 1 + c] = np.sqrt(1 - v[:, c] ** 2), v[:, c]
+        turns = one if turns is None else quaternion_product(turns, one)
+    quats0 = np.zeros((len(v), 4))
+    for i in range(len(v)):
+        known = near[i] and near[i][0] >= 512 * (i // 512)
+        before = quats0[near[i][0]] if known else np.array([1.0, 0, 0, 0])
+        quats0[i] = quaternion_product(before, turns[i])
+    return quats0
+
+
 def unit(v):
     """Clause 13.4: [N, 3] -> wxyz [N, 4]."""
     return np.concatenate([np.sqrt(np.maximum(0, 1 - (v * v).sum(-1, keepdims=True))), v], -1)
@@ -254,12 +286,8 @@ def evaluate(group, t):
     count = len(group.positions)
     x0 = np.array(h.origin) + h.grid_step * group.positions
 
-    def canonical(a):  # [N, C]
-        steps, offsets = h.channels[a]
-        values = np.array(offsets) + np.array(steps) * group.channels[a].T
-        if a in h.curves:
-            values = np.stack([bent(v, *curve) for v, curve in zip(values.T, h.curves[a], strict=True)], 1)
-        return values + group.correction.get(a, 0.0)
+    def rest(a):  # [N, C]
+        return canonical(h, a, group.channels[a]) + group.correction.get(a, 0.0)
 
     def delta(a):  # [N, C]
         if a not in h.trajectories:
@@ -268,18 +296,18 @@ def evaluate(group, t):
         return step * np.einsum("kcn,k->nc", group.trajectories[a].astype(float), basis(K, h.frames, t))
 
     x, q = blend_nodes(group, x0, t) if h.node_count else (x0, np.tile([1.0, 0, 0, 0], (count, 1)))
-    quats = quaternion_product(quaternion_product(unit(delta(QUATS)), q), unit(canonical(QUATS)))
+    quats = quaternion_product(quaternion_product(unit(delta(QUATS)), q), group.quats0)
     frame = {
         "means": x + delta(MEANS),
         "quats": quats / np.linalg.norm(quats, axis=1, keepdims=True),
-        "log_scales": canonical(LOG_SCALES) + delta(LOG_SCALES),
-        "logit_opacities": (canonical(LOGIT_OPACITIES) + delta(LOGIT_OPACITIES))[:, 0],
-        "sh0": rgb(canonical(SH0) + delta(SH0)),
+        "log_scales": rest(LOG_SCALES) + delta(LOG_SCALES),
+        "logit_opacities": (rest(LOGIT_OPACITIES) + delta(LOGIT_OPACITIES))[:, 0],
+        "sh0": rgb(rest(SH0) + delta(SH0)),
         "shN": np.zeros((count, 0, 3)),
         "shown": np.ones(count, bool),
     }
     if h.sh_degree:
-        frame["shN"] = rgb((canonical(SHN) + delta(SHN)).reshape(count, -1, 3))
+        frame["shN"] = rgb((rest(SHN) + delta(SHN)).reshape(count, -1, 3))
     if group.lifetimes is not None:
         frame["shown"] = (group.lifetimes[:, 0] <= t) & (t < group.lifetimes[:, 1])
     return frame

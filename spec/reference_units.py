@@ -87,9 +87,11 @@ def check_units(units, header, layers):
         announced = unit.key() in required | optional
         require(announced, f"unit {index}: (type, layer, attribute) {unit.key()} is not announced by the header")
         on = [units[d].key() for d in unit.dependencies]
-        for needed in MUST_DEPEND_ON.get(unit.unit_type, ()):
-            key = needed, unit.layer, 0
-            require(key not in required or key in on, f"unit {index}: must depend on the unit of type {needed}")
+        needs = [(needed, unit.layer, 0) for needed in MUST_DEPEND_ON.get(unit.unit_type, ())]
+        if unit.unit_type == CHANNELS and unit.attribute == QUATS:
+            needs.append((CHANNELS, unit.layer, LOG_SCALES))
+        for key in needs:
+            require(key not in required or key in on, f"unit {index}: must depend on the unit of type {key[0]}")
         found[unit.key()] = unit.payload
     missing = sorted(required - found.keys())
     require(not missing, f"missing unit (type, layer, attribute) {missing}")
@@ -117,6 +119,7 @@ class Header:
     layers: list
     channels: dict  # attribute -> (steps, offsets)
     trajectories: dict  # attribute -> (K_a, step)
+    levers: list  # of each channel of quats, by each of log_scales
     shifts: list  # of each layer, attribute -> low bits that are not coded; MEANS: of positions
     curves: dict  # attribute -> (low, width, slopes) of each channel; without curves empty
     node_count: int = 0
@@ -190,6 +193,11 @@ def read_channels(r, sh_degree):
     return channels
 
 
+def read_levers(r):
+    """Clause 4: [3][3], octaves."""
+    return [[(byte - 256 if byte > 127 else byte) / 32 for byte in r.take(3)] for _ in range(3)]
+
+
 def read_shifts(r, layer_count, grid_bits, attributes):
     """Clause 4: of each layer attribute -> shift, MEANS: of positions."""
     shifts = [{a: r.u8() for a in (MEANS, *attributes)} for _ in range(layer_count)]
@@ -219,11 +227,12 @@ def read_group_header(payload, reference=None):
         require(reference is not None and not reference.reference, "group_header: no independent group to refer to")
         layers, channels = read_layers(r, reference), reference.channels
         grid = reference.origin, reference.grid_step, reference.grid_bits, reference.sh_degree
-        shifts, curves = reference.shifts, reference.curves
+        levers, shifts, curves = reference.levers, reference.shifts, reference.curves
     else:
         grid = read_grid(r)
         layers = read_layers(r, None)
         channels = read_channels(r, grid[3])
+        levers = read_levers(r)
         unshifted = [dict.fromkeys((MEANS, *channels), 0)] * len(layers)
         shifts = read_shifts(r, len(layers), grid[2], channels) if flags & 8 else unshifted
         curves = read_curves(r) if flags & 2 else {}
@@ -236,7 +245,7 @@ def read_group_header(payload, reference=None):
         require(1 <= coefficients <= frames, f"group_header: {coefficients} coefficients, expected 1 to {frames}")
         trajectories[attribute] = coefficients, r.f32("trajectory step", positive=True)
         last = attribute
-    header = Header(frames, back, *grid, layers, channels, trajectories, shifts, curves, r.u32())
+    header = Header(frames, back, *grid, layers, channels, trajectories, levers, shifts, curves, r.u32())
     if header.node_count:
         header.neighbors, header.node_coefficients = r.u8(), r.u16()
         require(1 <= header.neighbors <= 8, f"group_header: neighbors is {header.neighbors}, expected 1 to 8")

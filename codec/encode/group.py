@@ -24,6 +24,7 @@ from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multip
 from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes
 from gscodec.encode.parallel import each_frame
 from gscodec.encode.refine import refine
+from gscodec.encode.turns import code_turns, fit_levers, in_form, widths
 from gscodec.gaussians import Gaussians, Group
 from gscodec.gaussians import Nodes as GivenNodes
 from gscodec.render.sensitivity import STILL_VIEWS, VIEWS, Importance, coarsest, measure, steps_for_error
@@ -171,12 +172,12 @@ class Grid:
         return self.origin.astype(np.float64) + self.step * integers.astype(np.float64)
 
 
-def _residual(s: Stack, channels: dict, x: np.ndarray, motion: NodeMotion | None) -> dict[str, np.ndarray]:
+def _residual(
+    s: Stack, channels: dict, rotations: np.ndarray, x: np.ndarray, motion: NodeMotion | None
+) -> dict[str, np.ndarray]:
     """[T, N, C] f32 of each attribute: what canonical values and nodes leave over; held outside a lifetime, in which
     the nodes go on."""
-    v = dequantize_channels(channels["quats"])
-    canonical = np.concatenate([np.sqrt(np.maximum(0, 1 - (v**2).sum(1, keepdims=True))), v], 1)
-    dq = quat_multiply(s.quats, quat_conjugate(canonical[None].astype(np.float32)))
+    dq = quat_multiply(s.quats, quat_conjugate(rotations[None]))
     if motion is not None:
         dq = quat_multiply(dq, quat_conjugate(motion.turned))
     residual = {
@@ -188,6 +189,9 @@ def _residual(s: Stack, channels: dict, x: np.ndarray, motion: NodeMotion | None
     return {n: s.held(r) for n, r in residual.items()}
 
 
+_WHOLE = ("source", "turn", "order", "rotations")  # arrays of `Coded`
+
+
 @dataclass(frozen=True)
 class Coded:
     """A group in integers, with what is needed to predict another from it.
@@ -195,7 +199,9 @@ class Coded:
     Attributes:
         integers: the input of `_native.encode_group`.
         source: [N] int, index in the group of each Gaussian that is coded, in the order of the integers.
-        turn, order: [N, 4], [N, 3], the form of each (`canonical_axes`).
+        turn, order: [N, 4], [N, 3], the form of each (`canonical_axes`, `in_form`).
+        rotations: [N, 4] f32, canonical quaternions before rounding: trajectories are for what moves, not for what the
+            steps leave.
         steps: attribute -> [C] f32; node_step: of the nodes' translations, world units.
     """
 
@@ -203,13 +209,14 @@ class Coded:
     source: np.ndarray
     turn: np.ndarray
     order: np.ndarray
+    rotations: np.ndarray
     grid: Grid
     steps: dict[str, np.ndarray]
     node_step: float
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything that predicting needs, as arrays: what a later run goes on from."""
-        whole = {n: np.asarray(getattr(self, n)) for n in ("source", "turn", "order", "node_step")}
+        whole = {n: np.asarray(getattr(self, n)) for n in (*_WHOLE, "node_step")}
         grid = {f"grid.{n}": np.asarray(v) for n, v in vars(self.grid).items()}
         channels = {
             f"channels.{n}.{key}": np.asarray(v) for n, c in self.integers["channels"].items() for key, v in c.items()
@@ -232,7 +239,7 @@ class Coded:
                 channels.setdefault(attribute, {})[key] = v if key == "values" else v.tolist()
         lists = {"layers": state["layers"].tolist(), "positions": state["positions"], "channels": channels}
         lists["shifts"] = state["shifts"].tolist() or None
-        whole = (state[n] for n in ("source", "turn", "order"))
+        whole = (state[n] for n in _WHOLE)
         return Coded(grid.header() | lists, *whole, grid, steps, float(state["node_step"]))
 
 
@@ -262,12 +269,14 @@ def code_group(
     measured, error = measure_stack(s, cameras), error_for(quality)
     source = np.arange(len(turn)) if keep_all else np.flatnonzero(measured.removal >= PRUNE * error / max(len(turn), 1))
     nominal = steps_for(quality, subject_radius(s.means[middle]))
-    even = _steps(s.take(source), measured.take(source), error, nominal)
-    curves, heard = _curves(s.take(source), measured.take(source))
+    all_turns = replace(measured, weights=measured.weights | {"quats": measured.turns})
+    even = _steps(s.take(source), all_turns.take(source), error, nominal)
+    curves, levers, heard = _bent(s.take(source), middle, measured.take(source))
     layer = layer_of(heard, layers)
     room = {n: np.log2(coarsest(n, subject_radius(s.means[middle])) / v.mean()) for n, v in even.items()}
     shifts = layer_shifts(heard, layer, layers, room)
-    steps = _steps(s.take(source), heard, error, nominal, {n: v[layer] for n, v in shifts.items()}, curves)
+    own_shifts = {n: v[layer] for n, v in shifts.items()}
+    steps = _steps(s.take(source), heard, error, nominal, own_shifts, curves, levers)
     given = group.nodes if frames > 1 else None
     rest = s.means[middle] if given is None else given.rest
     grid = Grid.around(rest[source], float(steps["means"][0]), room=0 if given is None else 1)
@@ -285,16 +294,23 @@ def code_group(
     parts = [
         (slice(b - n, b), rdo.neighbours(positions[b - n : b])) for n, b in zip(counts, counts.cumsum(), strict=True)
     ]
-    values = along_curves(canonical_appearance(s), curves) | {"quats": quats[:, 1:]}
+    values = along_curves(canonical_appearance(s), curves)
     weights = curved.sensitivities(measured.weights, values, curves)
     channels = {n: quantize_channels(v, steps[n], weights[n], parts, shifts[n], price) for n, v in values.items()}
     for n, own in curves.items():
         channels[n]["curves"] = [c.row() for c in own]
+    own_shifts = {n: v[layer] for n, v in shifts.items()}
     if refine_steps and frames == 1 and len(positions) >= STILL_LEAST:
-        own = {n: v[layer] for n, v in shifts.items()}
-        looking = partial(refine, s.frame(0), grid.to_world(positions), steps=refine_steps, cameras=cameras)
-        channels = _refined(looking, values, channels, own, weights, parts, price)
-    channels["quats"] = inside_unit_ball(channels["quats"], shifts["quats"][layer])
+        shown = replace(s.frame(0), means=grid.to_world(positions))
+        looking = partial(refine, s.frame(0), shown, steps=refine_steps, cameras=cameras)
+        channels = _refined(looking, values, channels, own_shifts, weights, parts, price)
+    turning = {"steps": steps["quats"].tolist(), "offsets": [0.0] * 3, "levers": levers.tolist()}
+    sizes = dequantize_channels(channels["log_scales"])
+    turning["values"], forms = code_turns(
+        quats, sizes, positions, turning, parts, own_shifts["quats"], measured.weights["quats"], price
+    )
+    channels["quats"], s = turning, replace(s, quats=in_form(s.quats, forms))
+    rotations = in_form(quats, forms).astype(np.float32)
     out = {
         "frames": frames,
         **grid.header(),
@@ -309,8 +325,9 @@ def code_group(
     if frames > 1 and len(positions):
         x = grid.to_world(positions)
         motion = nodes and carry(nodes, positions, x, frames)
-        out |= motion_integers(s, channels, even, measured, price, x, nodes, motion)
-    return Coded(out, source, turn[source], axes[source], grid, even, nominal.node_translation)
+        out |= motion_integers(s, channels, rotations, even, measured, price, x, nodes, motion)
+    turn = in_form(turn[source], forms)
+    return Coded(out, source, turn, axes[source], rotations, grid, even, nominal.node_translation)
 
 
 def _refined(
@@ -378,12 +395,22 @@ def layer_shifts(measured: Importance, layer: np.ndarray, layers: int, room: dic
     return shifts
 
 
-def _curves(s: Stack, measured: Importance) -> tuple[dict[str, list[curved.Curve]], Importance]:
-    """Curves of attributes, and the importance of what is coded along them."""
+def _bent(
+    s: Stack, middle: int, measured: Importance
+) -> tuple[dict[str, list[curved.Curve]], np.ndarray, Importance]:
+    """Curves of attributes, levers of rotations, and the importance of what is coded along them."""
     values = canonical_appearance(s)
     curves = curved.fit_all(values, measured.weights)
     weights = curved.sensitivities(measured.weights, along_curves(values, curves), curves)
-    return curves, replace(measured, weights=weights)
+    levers = fit_levers(s.log_scales[middle], weights["quats"])
+    weights["quats"] = weights["quats"] * _relative(widths(s.log_scales[middle], levers))[0] ** 2
+    return curves, levers, replace(measured, weights=weights)
+
+
+def _relative(widths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[N, C] and [C]: widths relative to the geometric mean of each channel, and that."""
+    level = np.exp(np.log(widths).mean(0)) if len(widths) else np.ones(widths.shape[1])
+    return widths / level, level
 
 
 def along_curves(values: dict[str, np.ndarray], curves: dict[str, list[curved.Curve]]) -> dict[str, np.ndarray]:
@@ -413,15 +440,18 @@ def _steps(
     nominal: Steps,
     shifts: dict[str, np.ndarray] | None = None,
     curves: dict | None = None,
+    levers: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
-    """[C] f32 step of each channel of each attribute; those of a Gaussian are 2^shifts ([N] each) times that.
-    `measured` is that of values along the `curves`."""
+    """[C] f32 step of each channel of each attribute; those of a Gaussian are 2^shifts ([N] each) times that, of quats
+    times its `widths` by the levers. `measured` is that of `_bent`, where there are curves and levers."""
     if not len(measured.removal):
         return {n: np.full(w.shape[1], getattr(nominal, n), np.float32) for n, w in measured.weights.items()}
     middle = s.only(len(s.means) // 2)
     values = along_curves({n: v[0] for n, v in middle.appearance.items()}, curves or {})
-    values |= {"means": middle.means[0], "quats": middle.quats[0, :, 1:]}
-    return steps_for_error(measured.weights, values, error, subject_radius(middle.means[0]), shifts)
+    width, level = _relative(widths(middle.log_scales[0], np.zeros((3, 3)) if levers is None else levers))
+    values |= {"means": middle.means[0], "quats": middle.quats[0, :, 1:] / width}
+    steps = steps_for_error(measured.weights, values, error, subject_radius(middle.means[0]), shifts)
+    return steps | {"quats": steps["quats"] / level.astype(np.float32)}
 
 
 def _rest_pose(
@@ -447,11 +477,13 @@ def _rest_pose(
     return nodes, means, quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
 
 
-def motion_integers(s: Stack, channels, steps, measured: Importance, price: float, x, nodes, motion) -> dict:
-    """ "nodes" and "trajectories" of a group with canonical positions x [N, 3] and channels, which `nodes` carry as
-    `motion` says (both None: not at all)."""
+def motion_integers(
+    s: Stack, channels, rotations, steps, measured: Importance, price: float, x, nodes, motion
+) -> dict:
+    """ "nodes" and "trajectories" of a group with canonical positions x [N, 3], channels and rotations [N, 4], which
+    `nodes` carry as `motion` says (both None: not at all)."""
     out = {"trajectories": {}}
-    for name, values in _residual(s, channels, x, motion).items():
+    for name, values in _residual(s, channels, rotations, x, motion).items():
         step = trajectory_step(1 / np.sqrt((1 / steps[name].astype(np.float64) ** 2).mean()), len(s.means))
         weights = measured.turns if name == "quats" else measured.weights[name]
         coefficients = rdo.trajectory(values, weights, step, price)
@@ -466,13 +498,3 @@ def motion_integers(s: Stack, channels, steps, measured: Importance, price: floa
             "neighbors": min(NEIGHBORS, len(nodes.positions)),
         }
     return out
-
-
-def inside_unit_ball(channels: dict, shifts: np.ndarray) -> dict:
-    """Rounding may leave the unit ball; pull such vector parts back by one step (2^shift, [N]) per component, towards
-    zero."""
-    v = dequantize_channels(channels)
-    outside = (v**2).sum(1) > 1
-    values = channels["values"].copy()
-    values[:, outside] -= np.sign(v[outside].T).astype(np.int32) << shifts[outside]
-    return {**channels, "values": values}

@@ -8,6 +8,8 @@ where the reference would have had them, so that the same nodes move them.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gscodec import _native
@@ -24,7 +26,7 @@ from gscodec.encode.group import (
     align_axes,
     canonical_appearance,
     curves_of,
-    inside_unit_ball,
+    dequantize_channels,
     layer_of,
     measure_stack,
     motion_integers,
@@ -32,6 +34,7 @@ from gscodec.encode.group import (
     stack_group,
 )
 from gscodec.encode.motion import NodeMotion, Nodes, carry, choose_nodes, given_nodes
+from gscodec.encode.turns import code_turns, in_form
 from gscodec.gaussians import Group
 
 REBIRTH = 8.0  # times PRUNE: what the reference left out must matter so much more to come back
@@ -88,13 +91,18 @@ def predict_group(
     new_motion = nodes and carry(nodes, places, grid.to_world(places), len(s.means))
     new, quats = _canonical_births(new, middle, new_motion)
 
-    values = canonical_appearance(new) | {"quats": quats}
-    channels = {n: _with_births(c, known, values[n], shifts[n], n) for n, c in before["channels"].items()}
-    s = _join(old, new)
+    values = canonical_appearance(new)
+    channels = {n: _with_births(before["channels"][n], known, v, shifts[n]) for n, v in values.items()}
+    turning, born_layers = before["channels"]["quats"], [(np.flatnonzero(born_in == k), None) for k in set(born_in)]
+    sizes = dequantize_channels(channels["log_scales"])[len(known) :]
+    turns, forms = code_turns(quats, sizes, places, turning, born_layers, shifts["quats"])
+    channels["quats"] = turning | {"values": np.concatenate([turning["values"][:, known], turns], 1)}
+    rotations = np.concatenate([reference.rotations[known], in_form(quats, forms)])
+    s = _join(old, replace(new, quats=in_form(new.quats, forms)))
     layer = np.repeat(np.arange(len(before["layers"])), before["layers"])[known]
     layer = np.concatenate([layer, born_in])
     place = np.lexsort((np.arange(len(layer)) >= len(known), layer))  # in each layer survivors, then births
-    s, positions = s.take(place), np.concatenate([positions, places])[place]
+    s, positions, rotations = s.take(place), np.concatenate([positions, places])[place], rotations[place]
     measured = measured.take(np.concatenate([survivors, births])[place])
     channels = {n: c | {"values": np.ascontiguousarray(c["values"][:, place])} for n, c in channels.items()}
     if motion:
@@ -111,7 +119,9 @@ def predict_group(
         "lifetimes": None if s.lifetimes is None else s.lifetimes.astype(np.uint16),
     }
     price = rdo.bit_price(error_for(quality), len(positions), group.nodes is not None)
-    return out | motion_integers(s, channels, steps, measured, price, grid.to_world(positions), nodes, motion)
+    return out | motion_integers(
+        s, channels, rotations, steps, measured, price, grid.to_world(positions), nodes, motion
+    )
 
 
 def _nodes(group: Group, positions, x: np.ndarray, means: np.ndarray, reference: Coded) -> Nodes | None:
@@ -155,25 +165,22 @@ def _carry_back(
 
 
 def _canonical_births(s: Stack, middle: int, motion: NodeMotion | None) -> tuple[Stack, np.ndarray]:
-    """Births with their axes in canonical form, and the vector part of their canonical quaternions, [B, 3]."""
+    """Births with their axes by falling scale, and their canonical quaternions, [B, 4]."""
     at, each = s.near(middle), np.arange(s.means.shape[1])
     quats = s.quats[at, each]
     if motion is not None:
         quats = quat_multiply(quat_conjugate(motion.turned[at, each]), quats)
     turn, order = canonical_axes(quats, s.log_scales[at, each])
-    quats = quat_multiply(quats.astype(np.float64), turn)
-    quats *= np.where(quats[:, :1] < 0, -1, 1)
-    return align_axes(s, middle, turn, order), quats[:, 1:]
+    return align_axes(s, middle, turn, order), quat_multiply(quats.astype(np.float64), turn)
 
 
-def _with_births(c: dict, known: np.ndarray, values: np.ndarray, shifts: np.ndarray, name: str) -> dict:
+def _with_births(c: dict, known: np.ndarray, values: np.ndarray, shifts: np.ndarray) -> dict:
     """Channels of the survivors, those at `known` of the reference's, and of births with `values` [B, C], whose steps
     are 2^shifts ([B]) times those of the attribute."""
     steps, offsets = np.array(c["steps"], np.float32), np.array(c["offsets"], np.float32)
     unit = 2.0 ** shifts[:, None]
     values = curved.along(values, curves_of(c))
     own = c | {"values": (np.rint((values - offsets) / (steps * unit)) * unit).astype(np.int32).T}
-    own = inside_unit_ball(own, shifts) if name == "quats" else own
     return c | {"values": np.concatenate([c["values"][:, known], own["values"]], 1)}
 
 

@@ -83,7 +83,7 @@ def keyframe(x: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float,
     q = np.rint(x)
     if not len(x):
         return q
-    worth = _worth(weights, price)
+    bits_worth = worth(weights, price)
     for _ in range(passes):
         context = _contexts(q, near)
         bits = _code_lengths(context, q)
@@ -91,7 +91,7 @@ def keyframe(x: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float,
         toward = np.sign(context - np.rint(x))
         for candidate in (np.rint(x), np.rint(x) + toward, np.rint(x) - np.sign(np.rint(x)), context, 0 * x):
             level = np.clip(candidate, -RANGE, RANGE).astype(int)
-            c = worth * (x - candidate) ** 2 + bits[context + RANGE, level + RANGE]
+            c = bits_worth * (x - candidate) ** 2 + bits[context + RANGE, level + RANGE]
             c += 2 * np.log2(1 + np.maximum(np.abs(candidate) - RANGE, 0))
             best, cost = np.where(c < cost, candidate, best), np.minimum(c, cost)
         q = best
@@ -103,16 +103,22 @@ def margins(q: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float) 
     in steps: what the next one costs more. Other arguments are those of `keyframe`."""
     if not len(q):
         return q, q
-    worth, context = _worth(weights, price), _contexts(q, near)
+    context = _contexts(q, near)
     bits = _code_lengths(context, q)[context + RANGE]
     level = np.clip(q, -RANGE, RANGE).astype(int) + RANGE
     each = np.arange(len(q))
     more = (bits[each, np.clip(level + d, 0, 2 * RANGE)] - bits[each, level] for d in (1, -1))
-    up, down = (np.clip(m / (2 * worth), -0.4, 9) for m in more)
+    up, down = (np.clip(m / (2 * worth(weights, price)), -0.4, 9) for m in more)
     return up, down
 
 
-def _worth(weights: np.ndarray, price: float) -> np.ndarray:
+def code_lengths(q: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """[2 RANGE + 1, 2 RANGE + 1] bits of an integer (column) in a context (row), each from -RANGE to RANGE, from the
+    statistics of `q` [N]."""
+    return _code_lengths(_contexts(q, near), q)
+
+
+def worth(weights: np.ndarray, price: float) -> np.ndarray:
     """[N] bits that an error of one step is worth, squared."""
     return (weights + FLOOR * weights.mean()) / price
 

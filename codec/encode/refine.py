@@ -2,7 +2,8 @@
 
 Rounding each channel on its own leaves errors that a neighbour could make up for. Views that no step has seen before
 are drawn of source and decoded frame; the gradient of their squared difference moves what lies under the integers, and
-passes straight through the rounding (Bengio et al. 2013). Positions stay: they give the order.
+passes straight through the rounding (Bengio et al. 2013). Positions stay: they give the order. So do rotations, each of
+which is coded as a turn from another.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ INSIDE = 0.02  # quantization steps: so far from where it would change, at least
 
 def refine(
     source: Gaussians,
-    means: np.ndarray,
+    shown: Gaussians,
     latents: dict[str, np.ndarray],
     integers: dict[str, np.ndarray],
     margins: dict[str, tuple[np.ndarray, np.ndarray]],
@@ -36,7 +37,7 @@ def refine(
     """Better integers: attribute -> [N, C] i32.
 
     Args:
-        source: N Gaussians, as they are to look. means: [N, 3], decoded.
+        source: N Gaussians, as they are to look. shown: what stays of those that are shown.
         latents: attribute -> [N, C], what was quantized, in quantization steps of each Gaussian.
         integers: attribute -> [N, C], what it was quantized to.
         margins: attribute -> [N, C] each, of `rdo.margins`.
@@ -60,7 +61,7 @@ def refine(
         target, _ = workspace.forward(original, camera, GREY)
         values, slopes = decode(rounded())
         off = lambda image, target=target: np.ascontiguousarray(image - target)  # noqa: E731
-        derivative = derivatives(workspace, _frame(means, values), camera, off)
+        derivative = derivatives(workspace, _frame(shown, values), camera, off)
         rate = RATE * (1 - (step - 1) / len(views))
         for n, v in x.items():
             d = derivative[n] * slopes[n]
@@ -71,9 +72,7 @@ def refine(
     return {n: q.astype(np.int32) for n, q in rounded().items()}
 
 
-def _frame(means: np.ndarray, values: dict[str, np.ndarray]) -> Gaussians:
-    v, count = values["quats"], len(means)
-    quats = np.concatenate([np.sqrt(np.maximum(1e-6, 1 - (v * v).sum(1, keepdims=True))), v], 1)
-    shN = values.get("shN", np.zeros((count, 0))).reshape(count, -1, 3) @ TO_RGB.T
+def _frame(shown: Gaussians, values: dict[str, np.ndarray]) -> Gaussians:
+    shN = values.get("shN", np.zeros((len(shown), 0))).reshape(len(shown), -1, 3) @ TO_RGB.T
     colors = values["sh0"] @ TO_RGB.T
-    return Gaussians(means, quats, values["log_scales"], values["logit_opacities"][:, 0], colors, shN)
+    return Gaussians(shown.means, shown.quats, values["log_scales"], values["logit_opacities"][:, 0], colors, shN)

@@ -21,7 +21,6 @@ from gscodec.render.workspace import PARAMETERS, Workspace, call
 
 VIEWS, STILL_VIEWS, SIZE = 24, 48, 512  # STILL_VIEWS of a single frame
 GREY = (0.5, 0.5, 0.5)
-REAL_LEAST = 0.05  # canonical quaternions have 0.5 and more
 # Beyond these steps the derivative says too little; means are in radii of the subject.
 COARSEST = {"means": 0.02, "log_scales": 1.0, "quats": 0.25, "logit_opacities": 2.0, "sh0": 1.0, "shN": 1.0}
 
@@ -31,8 +30,9 @@ class Importance:
     """Sensitivities in the units of the coded channels; pixels are 0 to 1.
 
     Attributes:
-        weights: attribute -> [N, C] f64, W of each channel.
-        turns: [N, 3] f64, W of the vector part of a quaternion that the Gaussian's is multiplied by from the left.
+        weights: attribute -> [N, C] f64, W of each channel; quats: of the vector part of a quaternion that the
+            Gaussian's is multiplied by from the right, which turns it about its own axes.
+        turns: [N, 3] f64, the same from the left, about the axes of the scene.
         removal: [N] f64, mean squared error of the picture without this Gaussian.
     """
 
@@ -84,7 +84,7 @@ def arrays_of(g: Gaussians) -> tuple[np.ndarray, ...]:
 def derivatives(
     workspace: Workspace, g: Gaussians, camera: Camera, by_picture: Callable[[np.ndarray], np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """[N, C] derivatives by the channels that are coded, of quats by the vector part alone; and by "turns".
+    """[N, C] derivatives by the channels that are coded, of quats by turns about the own axes; and by "turns".
 
     Args:
         by_picture: the picture of `camera`, over mid-grey -> the derivative by its pixels, [H, W, 3] f32 both.
@@ -100,14 +100,13 @@ def derivatives(
 
 
 def _by_channels(g: Gaussians, grads: dict) -> dict[str, np.ndarray]:
-    real, vector = g.quats[:, :1], g.quats[:, 1:]
     w, x, y, z = g.quats.T
-    real = np.copysign(np.maximum(abs(real), REAL_LEAST), real)
     turns = np.stack([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])  # i q, j q, k q: [3, 4, N]
+    own = np.stack([[-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])  # q i, q j, q k
     derivatives = {
         "means": grads["means"],
         "log_scales": grads["log_scales"],
-        "quats": grads["quats"][:, 1:] - grads["quats"][:, :1] * vector / real,
+        "quats": np.einsum("kcn,nc->nk", own, grads["quats"]),
         "turns": np.einsum("kcn,nc->nk", turns, grads["quats"]),
         "logit_opacities": grads["logit_opacities"][:, None],
         "sh0": grads["sh0"] @ TO_RGB.astype(np.float32),

@@ -3,8 +3,8 @@
 Bits are code lengths of integers under Laplace laws, with uniform noise in place of rounding (Balle et al. 2017). A
 residual coefficient is held against zero. A canonical value is held against what the coder knows when it comes to it:
 the nearest Gaussians before it in Morton order (spec 7.3), all in the form that the encoder gives them (axes by falling
-scale, the quaternion's vector part where the real part is largest, colours as Y, Co, Cg). Positions have no term: they
-cost the same wherever they are.
+scale, rotations as turns from the nearest of them, colours as Y, Co, Cg). Positions have no term: they cost the same
+wherever they are.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from gscodec import _native
 from gscodec.bitstream.color import STEP_WEIGHTS, TO_YCOCG
 from gscodec.bitstream.quantization import Steps
-from gscodec.train.graph import quat_multiply
+from gscodec.train.graph import quat_conjugate, quat_multiply
 
 NEAR, WINDOW = 4, 32  # contexts: so many nearest among so many before (spec 7.3)
 GRID_MOST = 2**20  # steps along an axis: far floaters make them coarser
@@ -87,7 +87,7 @@ class CanonicalRate:
         order = params["log_scales"].detach().argsort(dim=1, descending=True, stable=True)
         values = {
             "log_scales": params["log_scales"].gather(1, order),
-            "quats": vector_part(params["quats"], order),
+            "quats": turns(params["quats"], order, self.near[:, 0]),
             "logit_opacities": params["logit_opacities"][:, None],
             "sh0": params["sh0"] @ self.to_ycocg,
             "shN": params["shN"] @ self.to_ycocg,
@@ -96,12 +96,12 @@ class CanonicalRate:
 
     def bits(self, params: dict[str, torch.Tensor], generator: torch.Generator) -> dict[str, torch.Tensor]:
         """Estimated bits of each attribute, all Gaussians together."""
-        return {n: self._bits(x, generator) for n, x in self.channels(params).items() if x.shape[1]}
+        return {n: self._bits(n, x, generator) for n, x in self.channels(params).items() if x.shape[1]}
 
-    def _bits(self, x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    def _bits(self, attribute: str, x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         x = x + torch.rand(x.shape, generator=generator) - 0.5
         around = x[self.near]
-        mean = around.mean(1)
+        mean = torch.zeros_like(x) if attribute == "quats" else around.mean(1)  # a turn may be to either side
         with torch.no_grad():  # the law's width follows the neighbours' own differences
             spread = (around - mean[:, None]).abs().mean(1) + LEAST_SPREAD
             width = spread * (x - mean).abs().mean(0) / spread.mean(0)
@@ -118,11 +118,15 @@ class CanonicalRate:
         return float(total.detach()), dict(zip(bits, grads, strict=True))
 
 
-def vector_part(quats: torch.Tensor, order: torch.Tensor) -> torch.Tensor:
-    """[N, 3] vector part of quaternions [N, 4] in the form that the encoder codes, axes in `order` ([N, 3])."""
-    with torch.no_grad():
-        turn = _TURNS[order[:, 0] * 9 + order[:, 1] * 3 + order[:, 2]]
-        turned = quat_multiply(quats, turn)
-        turn = quat_multiply(turn, torch.eye(4)[turned.abs().argmax(1)])
-    q = quat_multiply(torch.nn.functional.normalize(quats, dim=1), turn)
-    return q[:, 1:] * torch.where(q[:, :1] < 0, -1.0, 1.0)
+def turns(quats: torch.Tensor, order: torch.Tensor, nearest: torch.Tensor) -> torch.Tensor:
+    """[N, 3] sines of half the angles by which each of the quaternions [N, 4], axes in `order` ([N, 3]), is turned from
+    that of its `nearest` ([N]) about its first, second and third axis (spec 13.1), in the form that turns least."""
+    own = torch.nn.functional.normalize(quats, dim=1)
+    own = quat_multiply(own, _TURNS[order[:, 0] * 9 + order[:, 1] * 3 + order[:, 2]])
+    between = quat_multiply(quat_conjugate(own[nearest]), own)
+    form = torch.eye(4)[between.detach().abs().argmax(1)]
+    w, x, y, z = quat_multiply(between, quat_conjugate(form)).unbind(1)
+    first = torch.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    second = torch.asin((2 * (w * y - z * x)).clamp(-0.999, 0.999))
+    third = torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return torch.sin(torch.stack([first, second, third], 1) / 2)

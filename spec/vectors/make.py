@@ -262,6 +262,7 @@ INVALID = {  # name: (error, part of the package's message, bytes)
     "dependency_order": (B, "depend", lambda: units_file(lambda u: u[4].update(dependencies=[3, 1]))),
     "dependency_repeated": (B, "depend", lambda: units_file(lambda u: u[4].update(dependencies=[1, 1]))),
     "dependency_missing": (B, "depend", change_unit(2, 5, dependencies=[])),
+    "dependency_missing_sizes": (B, "log_scales", change_unit(2, 3, dependencies=[1])),
     "dependency_missing_nodes": (B, "depend", change_unit(5, dependencies=[])),
     "unit_attribute": (B, "", change_unit(2, 5, attribute=9)),
     "unit_attribute_of_positions": (B, "", change_unit(1, attribute=1)),

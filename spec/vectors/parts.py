@@ -63,6 +63,7 @@ def make_group(
             "steps": [0.01 + 0.002 * i for i in range(c)],
             "offsets": [0.1 * i - 0.2 for i in range(c)],
         }
+    channels["quats"]["levers"] = [[-12, 40, 3], [127, -128, 0], [25, -9, 1]]
     group = {
         "frames": frames,
         "origin": [-1.0, 0.5, 2.0],
@@ -553,7 +554,7 @@ def pack_header(**changes):
     data += b"".join(struct.pack(">IB", *layer) for layer in h["layer_counts"]) + bytes([len(h["channels"])])
     for attribute, pairs in h["channels"]:
         data += bytes([attribute]) + b"".join(struct.pack(">ff", *pair) for pair in pairs)
-    data += bytes(h.get("shifts", b""))
+    data += bytes(9) + bytes(h.get("shifts", b""))  # no levers
     data += b"".join(struct.pack(">ff8x", *curve) for curve in h.get("curves", ()))
     data += bytes([len(h["trajectories"])]) + b"".join(struct.pack(">BHf", *t) for t in h["trajectories"])
     data += struct.pack(">I", h["node_count"])

@@ -8,7 +8,7 @@ mod values;
 
 use gsv::levels::LEVELS;
 use gsv::unit;
-use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArray2};
+use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyList};
 use values::{bytes_of, invalid, raise, rows};
@@ -16,6 +16,7 @@ use values::{bytes_of, invalid, raise, rows};
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(morton_order, m)?)?;
     m.add_function(wrap_pyfunction!(node_weights, m)?)?;
+    m.add_function(wrap_pyfunction!(code_turns, m)?)?;
     m.add_function(wrap_pyfunction!(encode_group, m)?)?;
     m.add_function(wrap_pyfunction!(units, m)?)?;
     m.add_function(wrap_pyfunction!(reference_of, m)?)?;
@@ -63,6 +64,44 @@ fn node_weights<'py>(
     let shape = [p.len(), blend.per];
     let index = blend.index.into_pyarray(py).reshape(shape)?.into_any();
     Ok((index, blend.weight.into_pyarray(py).reshape(shape)?.into_any()))
+}
+
+/// Quaternions [N, 4] f32 of what a layer codes itself -> integers [N, 3] i32 of quats, and the form [N] u8 of each: 1, i, j or
+/// k, by whose inverse it was multiplied from the right.
+///
+/// `steps` [N, 3] f32 of each; `positions` [N, 3] u32 in Morton order; `worth` [N, 3] f32, bits that an error of one step costs,
+/// squared; `lengths` [3, 31, 31] f32, bits of an integer (last) in a context, from -15 to 15 each, or nothing: all cost the same.
+#[pyfunction]
+fn code_turns<'py>(
+    py: Python<'py>,
+    quats: PyReadonlyArray2<'py, f32>,
+    steps: PyReadonlyArray2<'py, f32>,
+    positions: PyReadonlyArray2<'py, u32>,
+    worth: PyReadonlyArray2<'py, f32>,
+    lengths: PyReadonlyArray1<'py, f32>,
+) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
+    let p = grid(&positions, "positions")?;
+    let (quats, steps, worth) = (quats.as_slice()?, steps.as_slice()?, worth.as_slice()?);
+    let lengths = lengths.as_slice()?;
+    if [quats.len() / 4, steps.len() / 3, worth.len() / 3] != [p.len(); 3] {
+        return invalid(format!(
+            "expected as many quats, steps and worths as positions, {}",
+            p.len()
+        ));
+    }
+    let turns = gsv::turns::Turns {
+        quats: quats.as_chunks().0,
+        steps: steps.as_chunks().0,
+        worth: worth.as_chunks().0,
+        lengths,
+    };
+    let coded = py.detach(|| turns.code(&gsv::neighbors::nearest(&p)));
+    let integers: Vec<i32> = coded.iter().flat_map(|c| c.integers).collect();
+    let forms: Vec<u8> = coded.iter().map(|c| c.form).collect();
+    Ok((
+        integers.into_pyarray(py).reshape([p.len(), 3])?.into_any(),
+        forms.into_pyarray(py).into_any(),
+    ))
 }
 
 /// Encodes a group of integers: payload and a report per unit. A predicted group needs the group that it refers to.

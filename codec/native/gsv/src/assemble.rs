@@ -1,9 +1,10 @@
 //! What the units of each layer decode to -> a group: survivors before births, layer after layer.
 
 use crate::attributes::Attribute;
+use crate::dequantize;
 use crate::group::{BIRTH, Group};
 use crate::header::{Header, LayerHeader};
-use crate::neighbors::Contexts;
+use crate::neighbors::{Contexts, Near};
 use crate::trajectories::Trajectories;
 
 /// What a unit decodes to, besides points.
@@ -43,6 +44,15 @@ impl Slot {
         }
     }
 
+    /// Quaternions of births, whose neighbours are `near`.
+    fn rotations(&self, h: &Header, near: &[Near]) -> Vec<[f32; 4]> {
+        let integers = |a| {
+            let at = h.attributes().iter().position(|b| *b == a);
+            at.and_then(|k| self.channels.get(k)).map_or(&[][..], Vec::as_slice)
+        };
+        dequantize::rotations(h, integers(Attribute::Quats), integers(Attribute::LogScales), near)
+    }
+
     pub fn place(&mut self, h: &Header, attribute: Option<Attribute>, part: Part) {
         match part {
             Part::Lifetimes(l) => self.lifetimes = Some(l),
@@ -73,11 +83,17 @@ pub fn assemble(layers: Vec<LayerPoints>, slots: Vec<Slot>, reference: Option<&G
     };
     let cut = slots.iter().any(|s| s.lifetimes.is_some());
     let mut lifetimes = Vec::new();
-    for (layer, slot) in layers.into_iter().zip(slots) {
+    for (layer, mut slot) in layers.into_iter().zip(slots) {
         let (n, births) = (layer.positions.len(), layer.header.births as usize);
-        for (k, (own, mut values)) in group.channels.iter_mut().zip(slot.channels).enumerate() {
+        for (values, scale) in slot.channels.iter_mut().zip(&h.scales) {
+            values.resize(births * scale.steps.len(), 0);
+        }
+        let before = reference.map_or(&[][..], |r| &r.rotations);
+        let known = layer.survivors.iter().filter_map(|p| before.get(*p as usize)).copied();
+        group.rotations.extend(known);
+        append(&mut group.rotations, slot.rotations(h, layer.contexts.births()));
+        for (k, (own, values)) in group.channels.iter_mut().zip(slot.channels).enumerate() {
             let c = h.scales.get(k).map_or(0, |s| s.steps.len());
-            values.resize(births * c, 0);
             let before = reference.and_then(|r| r.channels.get(k)).map_or(&[][..], Vec::as_slice);
             let rows = layer.survivors.iter().map(|p| *p as usize);
             own.extend(rows.flat_map(|p| before.get(p * c..(p + 1) * c).unwrap_or(&[])));

@@ -75,7 +75,8 @@ pub fn encode_group(group: &Group, reference: Option<&Group>) -> Result<Vec<u8>>
 
 /// Indices of the units that `u` needs; the header comes before all of them.
 fn dependencies(u: &Pending, units: &[Pending]) -> Vec<u8> {
-    let needed = |d: &Pending| d.layer == u.layer && u.kind.needs().contains(&d.kind);
+    let needs = u.kind.needs(u.attribute);
+    let needed = |d: &Pending| d.layer == u.layer && needs.contains(&(d.kind, d.attribute));
     let found = units.iter().zip(1..).filter(|(d, _)| needed(d));
     found.map(|(_, i)| i).collect()
 }

@@ -5,12 +5,11 @@
 
 use crate::attributes::Attribute;
 use crate::blend::Blend;
-use crate::curve::{Curve, Pieces};
+use crate::dequantize::{IDENTITY, Quat, multiply, plus, values};
 use crate::group::Group;
 use crate::trajectories::Trajectories;
 use rayon::prelude::*;
 
-type Quat = [f32; 4]; // wxyz
 const CHANNELS_MAX: usize = 45; // of shN at degree 3
 
 /// Attributes of all N Gaussians in one frame, in the layout of `codec.gaussians.Gaussians`.
@@ -57,15 +56,16 @@ impl Evaluator {
         let place = |p: &[u32; 3]| p.map(|v| h.grid_step * v as i32 as f32); // below 2^21, and signed ones convert faster
         let nodes = group.node_positions.iter().map(place).collect();
         let [scales_shift, opacities_shift] = group.correction();
+        let channels = |a, shift| values(h, a, group.channels_of(a).unwrap_or(&[]), shift);
         let (blend, canonical) = rayon::join(
             || Blend::new(&group.positions, &group.node_positions, usize::from(h.nodes.neighbors)),
             || Frame {
                 means: group.positions.par_iter().map(place).collect(),
-                quats: quaternions(&dequantized(&group, Attribute::Quats, 0.0)),
-                log_scales: dequantized(&group, Attribute::LogScales, scales_shift),
-                logit_opacities: dequantized(&group, Attribute::LogitOpacities, opacities_shift),
-                sh0: colours(dequantized(&group, Attribute::Sh0, 0.0)),
-                sh_n: colours(dequantized(&group, Attribute::ShN, 0.0)),
+                quats: Vec::new(), // those of the group
+                log_scales: channels(Attribute::LogScales, scales_shift),
+                logit_opacities: channels(Attribute::LogitOpacities, opacities_shift),
+                sh0: colours(channels(Attribute::Sh0, 0.0)),
+                sh_n: colours(channels(Attribute::ShN, 0.0)),
             },
         );
         let motion = |(h, coefficients): (&crate::header::TrajectoryHeader, Trajectories)| Motion {
@@ -113,7 +113,7 @@ impl Evaluator {
     pub fn frame(&self, t: u16, frame: &mut Frame) {
         let rest = &self.canonical;
         frame.means.resize(rest.means.len(), [0.0; 3]);
-        frame.quats.resize(rest.quats.len(), [0.0; 4]);
+        frame.quats.resize(rest.means.len(), [0.0; 4]);
         frame.log_scales.resize(rest.log_scales.len(), 0.0);
         frame.logit_opacities.resize(rest.logit_opacities.len(), 0.0);
         frame.sh0.resize(rest.sh0.len(), 0.0);
@@ -177,7 +177,7 @@ impl Evaluator {
         };
         let (rest, per) = (&self.canonical, self.blend.per);
         let out = means.par_chunks_mut(RUN).zip(quats.par_chunks_mut(RUN));
-        let rest = rest.means.par_chunks(RUN).zip(rest.quats.par_chunks(RUN));
+        let rest = rest.means.par_chunks(RUN).zip(self.group.rotations.par_chunks(RUN));
         if per == 0 {
             out.zip(rest).for_each(|((x, q), (x0, q0))| {
                 x.iter_mut().zip(x0).for_each(|(x, x0)| *x = add(origin, *x0));
@@ -302,49 +302,12 @@ fn pose(q: Quat, centre: [f32; 3], shift: [f32; 3]) -> Pose {
     p
 }
 
-/// a + w b
-#[inline]
-fn plus(a: [f32; 4], w: f32, b: [f32; 4]) -> [f32; 4] {
-    std::array::from_fn(|i| a[i] + w * b[i])
-}
-
 fn dot(a: [f32; 4], b: [f32; 4]) -> f32 {
     (0..4).map(|i| a[i] * b[i]).sum()
 }
 
 fn add(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
     [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
-}
-
-/// offset + step * integer, along its curve if it has one, + shift: C per Gaussian; empty if the group lacks the attribute.
-///
-/// `shift` makes up for the layers behind that are not there (spec 10.2).
-fn dequantized(group: &Group, a: Attribute, shift: f32) -> Vec<f32> {
-    let at = group.header.attributes().iter().position(|b| *b == a);
-    let Some((values, scale)) = at.and_then(|k| Some((group.channels.get(k)?, group.header.scales.get(k)?))) else {
-        return Vec::new();
-    };
-    let scales: Vec<(f32, f32)> = scale.steps.iter().copied().zip(scale.offsets.iter().copied()).collect();
-    let curves: Vec<Pieces> = group.header.curves_of(a).iter().map(Curve::pieces).collect();
-    let mut out = vec![0.0; values.len()];
-    let channels = scales.len().max(1);
-    let rows = RUN * channels;
-    out.par_chunks_mut(rows)
-        .zip(values.par_chunks(rows))
-        .for_each(|(out, values)| {
-            for (out, row) in out.chunks_mut(channels).zip(values.chunks(channels)) {
-                for ((out, v), (step, offset)) in out.iter_mut().zip(row).zip(&scales) {
-                    *out = offset + step * *v as f32;
-                }
-                out.iter_mut().zip(&curves).for_each(|(v, curve)| *v = curve.value(*v));
-                out.iter_mut().for_each(|v| *v += shift);
-            }
-        });
-    out
-}
-
-fn quaternions(vectors: &[f32]) -> Vec<Quat> {
-    vectors.as_chunks().0.par_iter().map(|v| unit(*v)).collect()
 }
 
 fn colours(mut values: Vec<f32>) -> Vec<f32> {
@@ -382,10 +345,6 @@ fn transform<const C: usize>(coefficients: &[i32], channels: usize, basis: &[f32
     sum
 }
 
-fn unit(v: [f32; 3]) -> Quat {
-    normalize(with_real_part(v))
-}
-
 /// A unit quaternion, unless `v` is longer than 1.
 fn with_real_part(v: [f32; 3]) -> Quat {
     let w = (1.0 - v.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
@@ -398,7 +357,7 @@ fn normalize(q: Quat) -> Quat {
         let scale = 1.0 / length;
         q.map(|v| scale * v)
     } else {
-        [1.0, 0.0, 0.0, 0.0]
+        IDENTITY
     }
 }
 
@@ -426,13 +385,4 @@ fn matrix([w, x, y, z]: Quat) -> [[f32; 3]; 3] {
             1.0 - 2.0 * (x * x + y * y),
         ],
     ]
-}
-
-/// Hamilton product.
-#[inline]
-fn multiply([aw, ax, ay, az]: Quat, [bw, bx, by, bz]: Quat) -> Quat {
-    let sum = plus([0.0; 4], aw, [bw, bx, by, bz]);
-    let sum = plus(sum, ax, [-bx, bw, -bz, by]);
-    let sum = plus(sum, ay, [-by, bz, bw, -bx]);
-    plus(sum, az, [-bz, -by, bx, bw])
 }

@@ -26,6 +26,8 @@ pub struct Group {
     pub positions: Vec<[u32; 3]>,
     /// Per attribute of the header, C integers per Gaussian.
     pub channels: Vec<Vec<i32>>,
+    /// What quats and log_scales decode to, wxyz; none where there is nothing but integers, before encoding.
+    pub rotations: Vec<[f32; 4]>,
     pub lifetimes: Option<Vec<[u16; 2]>>,
     pub node_positions: Vec<[u32; 3]>,
     pub node_trajectories: Trajectories,

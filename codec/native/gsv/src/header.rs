@@ -17,6 +17,8 @@ const FLAG_UNIT_SIZES: u8 = 4;
 const FLAG_LAYER_SHIFTS: u8 = 8;
 /// Channels with a curve: those of log_scales, and logit_opacities.
 pub const CURVES: usize = 4;
+/// Levers of the header are in units of 1 / LEVER_UNIT.
+pub const LEVER_UNIT: f32 = 32.0;
 /// Low bits that a layer may leave out.
 pub const SHIFT_MAX: u8 = 15;
 /// Layers of a group.
@@ -73,6 +75,8 @@ pub struct Header {
     pub layers: Vec<LayerHeader>,
     /// In the order of `Attribute::canonical(sh_degree)`.
     pub scales: Vec<Scale>,
+    /// Of each channel of quats: how its step falls with each of the log_scales, in octaves, times `LEVER_UNIT`.
+    pub levers: [[i8; 3]; 3],
     /// Of each layer: how many low bits of positions, then of each attribute's integers, are 0 and not coded. Empty: none.
     pub shifts: Vec<[u8; 6]>,
     /// Of the channels of log_scales, then of logit_opacities. None: their values are as they are coded.
@@ -131,6 +135,11 @@ impl Header {
             self.grid(f)?;
             self.layers(f, None)?;
             self.scales(f)?;
+            for lever in self.levers.as_flattened_mut() {
+                let mut byte = lever.to_be_bytes();
+                f.bytes(&mut byte)?;
+                *lever = i8::from_be_bytes(byte);
+            }
             self.shifts(f)?;
             if let Some(curves) = &mut self.curves {
                 curves.iter_mut().try_for_each(|c| c.fields(f))?;

@@ -67,15 +67,16 @@ pub fn check(units: &[Unit], header: &Header, reference: Option<&Header>, layers
         if !announced.contains(&(kind, u.layer, u.attribute)) {
             return fail("only units that the header announces".into());
         }
-        for need in kind.needs() {
-            let key = (*need, u.layer, None);
+        for (need, attribute) in kind.needs(u.attribute) {
+            let key = (*need, u.layer, *attribute);
             let met = |d: &u8| {
                 units
                     .get(usize::from(*d))
-                    .is_some_and(|d| (d.kind, d.layer) == (Some(*need), u.layer))
+                    .is_some_and(|d| (d.kind, d.layer, d.attribute) == (Some(*need), u.layer, *attribute))
             };
             if announced.contains(&key) && !u.dependencies.iter().any(met) {
-                return fail(format!("a dependency on the {} unit", need.name()));
+                let of = attribute.map_or(String::new(), |a| format!(" of {}", a.name()));
+                return fail(format!("a dependency on the {} unit{of}", need.name()));
             }
         }
     }

@@ -54,12 +54,13 @@ impl UnitType {
         }
     }
 
-    /// The unit types that it must depend on, where its layer has them.
-    pub fn needs(self) -> &'static [UnitType] {
-        match self {
-            Channels => &[Positions],
-            Lifetimes | Trajectories => &[Positions, Deaths],
-            NodeTrajectories => &[NodePositions],
+    /// The units that one of this type and of `attribute` must depend on, where its layer has them.
+    pub fn needs(self, attribute: Option<Attribute>) -> &'static [(UnitType, Option<Attribute>)] {
+        match (self, attribute) {
+            (Channels, Some(Attribute::Quats)) => &[(Positions, None), (Channels, Some(Attribute::LogScales))],
+            (Channels, _) => &[(Positions, None)],
+            (Lifetimes | Trajectories, _) => &[(Positions, None), (Deaths, None)],
+            (NodeTrajectories, _) => &[(NodePositions, None)],
             _ => &[],
         }
     }

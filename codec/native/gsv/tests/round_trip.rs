@@ -102,7 +102,7 @@ proptest! {
 
     #[test]
     fn frames_are_finite(s in shape()) {
-        let g = group(&s);
+        let g = decoded(&group(&s));
         let frames = g.header.frames;
         let e = Evaluator::new(g);
         let mut f = Frame::default();

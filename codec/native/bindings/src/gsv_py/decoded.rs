@@ -1,7 +1,7 @@
 //! DecodedGroup: a payload -> integers in the form that encode_group takes, and attributes of frames.
 
 use super::values::{bytes_of, raise};
-use gsv::attributes::sh_coefficients;
+use gsv::attributes::{Attribute, sh_coefficients};
 use gsv::curve::Curve;
 use gsv::decode::{Decoding, decode_damaged, decode_group};
 use gsv::evaluate::{Evaluator, FrameMut};
@@ -275,6 +275,9 @@ fn integers<'py>(py: Python<'py>, e: &Evaluator) -> PyResult<Bound<'py, PyDict>>
         one.set_item("offsets", scale.offsets.clone())?;
         let curves = h.curves_of(*a).iter().map(curve_row).collect::<Vec<_>>();
         one.set_item("curves", curves)?;
+        if *a == Attribute::Quats {
+            one.set_item("levers", h.levers.map(|l| l.to_vec()).to_vec())?;
+        }
         channels.set_item(a.name(), one)?;
     }
     d.set_item("channels", channels)?;

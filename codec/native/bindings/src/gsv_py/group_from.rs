@@ -40,6 +40,9 @@ pub fn group_from(d: &Bound<PyDict>, reference: Option<&Group>) -> PyResult<Grou
             return invalid(format!("{}: expected {width} steps and offsets", a.name()));
         }
         header.scales.push(Scale { steps, offsets });
+        if *a == Attribute::Quats && optional(&c, "levers")?.is_some() {
+            header.levers = value(&c, "levers")?;
+        }
     }
     header.shifts = shifts_from(d, &header)?;
     header.curves = curves_from(&channels)?;
@@ -63,18 +66,14 @@ pub fn group_from(d: &Bound<PyDict>, reference: Option<&Group>) -> PyResult<Grou
     }
     let same = |r: &Group| {
         let h = &r.header;
-        (h.origin, h.grid_step, h.grid_bits, &h.scales, &h.shifts, &h.curves)
-            == (
-                header.origin,
-                header.grid_step,
-                header.grid_bits,
-                &header.scales,
-                &header.shifts,
-                &header.curves,
-            )
+        (h.origin, h.grid_step, h.grid_bits) == (header.origin, header.grid_step, header.grid_bits)
+            && (&h.scales, &h.levers, &h.shifts, &h.curves)
+                == (&header.scales, &header.levers, &header.shifts, &header.curves)
     };
     if header.reference > 0 && !reference.is_some_and(same) {
-        return invalid("a predicted group: expected its reference, with the same grid, steps and offsets".into());
+        return invalid(
+            "a predicted group: expected its reference, with the same grid, steps, offsets and levers".into(),
+        );
     }
     group.header = header;
     Ok(group)

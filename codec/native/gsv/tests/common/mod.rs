@@ -121,6 +121,7 @@ pub fn group(s: &Shape) -> Group {
         grid_bits: s.bits,
         sh_degree: s.sh_degree,
         layers: s.counts.iter().map(|n| layer(*n, *n)).collect(),
+        levers: [[0, 40, -8], [20, 0, 0], [127, -128, 3]],
         curves: (s.counts.len() > 1).then(|| std::array::from_fn(|c| curve(c as f32))),
         ..Header::default()
     };
@@ -128,6 +129,7 @@ pub fn group(s: &Shape) -> Group {
     let mut g = Group {
         positions: s.counts.iter().flat_map(|n| points(&mut r, *n, s.bits)).collect(),
         layers: header.layers.clone(),
+        rotations: vec![[1.0, 0.0, 0.0, 0.0]; count],
         corrections: s.counts.iter().map(|n| [*n as f32, 0.5 * (n % 2) as f32]).collect(),
         ..Group::default()
     };
