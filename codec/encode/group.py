@@ -395,9 +395,7 @@ def layer_shifts(measured: Importance, layer: np.ndarray, layers: int, room: dic
     return shifts
 
 
-def _bent(
-    s: Stack, middle: int, measured: Importance
-) -> tuple[dict[str, list[curved.Curve]], np.ndarray, Importance]:
+def _bent(s: Stack, middle: int, measured: Importance) -> tuple[dict[str, list[curved.Curve]], np.ndarray, Importance]:
     """Curves of attributes, levers of rotations, and the importance of what is coded along them."""
     values = canonical_appearance(s)
     curves = curved.fit_all(values, measured.weights)
@@ -477,9 +475,7 @@ def _rest_pose(
     return nodes, means, quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
 
 
-def motion_integers(
-    s: Stack, channels, rotations, steps, measured: Importance, price: float, x, nodes, motion
-) -> dict:
+def motion_integers(s: Stack, channels, rotations, steps, measured: Importance, price: float, x, nodes, motion) -> dict:
     """ "nodes" and "trajectories" of a group with canonical positions x [N, 3], channels and rotations [N, 4], which
     `nodes` carry as `motion` says (both None: not at all)."""
     out = {"trajectories": {}}
