@@ -33,7 +33,7 @@ GRID_BITS_MAX = 21
 SHIFTED = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
 LEVEL_RANGE = (3, 97)  # percentiles of log sensitivity between which layers are even
 LEAST_LEVEL = 1e-4  # of the mean sensitivity
-STILL_LAYERS, STILL_LEAST = 3, 1000  # layers of a single frame of so many Gaussians, which can be refined too
+STILL_LAYERS, STILL_LEAST = 4, 1000  # layers of a single frame of so many Gaussians, which can be refined too
 SHIFT_MOST = 8  # doublings of a layer's step
 PRUNE = 0.3  # a Gaussian goes if the picture without it errs by less than this share of the error per coded Gaussian
 
@@ -283,13 +283,16 @@ def code_group(
     shifts["means"] = np.minimum(shifts["means"], grid.bits - 1)
     order = _native.morton_order(grid.to_integers(rest[source]))
     source, layer = source[order], layer[order]
-    nodes, x, quats = _rest_pose(s.take(source), rest[source], grid, nominal.node_translation, given)
+    price = rdo.bit_price(error, len(source), group.nodes is not None)
+    heard_means = measured.weights["means"][source]
+    nodes, x, quats = _rest_pose(
+        s.take(source), rest[source], grid, nominal.node_translation, given, heard_means, price
+    )
     positions = grid.to_integers(x, shifts["means"][layer])
     order = _native.morton_order(positions)
     order = order[layer[order].argsort(kind="stable")]
     positions, quats, source, layer = positions[order], quats[order], source[order], layer[order]
     s, measured = s.take(source), measured.take(source)
-    price = rdo.bit_price(error, len(source), group.nodes is not None)
     counts = np.bincount(layer, minlength=layers)
     parts = [
         (slice(b - n, b), rdo.neighbours(positions[b - n : b])) for n, b in zip(counts, counts.cumsum(), strict=True)
@@ -453,7 +456,7 @@ def _steps(
 
 
 def _rest_pose(
-    s: Stack, rest: np.ndarray, grid: Grid, node_step: float, given: GivenNodes | None
+    s: Stack, rest, grid: Grid, node_step: float, given: GivenNodes | None, weights: np.ndarray, price: float
 ) -> tuple[Nodes | None, np.ndarray, np.ndarray]:
     """Nodes, and the means [N, 3] and quaternions [N, 4] that they carry nearest to all frames: what jitters in `rest`
     ([N, 3], in Morton order) is not the canonical of all."""
@@ -464,7 +467,7 @@ def _rest_pose(
     if given is None:
         nodes = choose_nodes(positions, x, s.means, grid.step, node_step, grid.to_world)
     else:
-        nodes = given_nodes(given, x, node_step, grid)
+        nodes = given_nodes(given, positions, node_step, grid, weights, price)
     if nodes is None:
         means, quats = s.means.mean(0, dtype=np.float64), s.quats.mean(0)
     else:

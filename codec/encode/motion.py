@@ -16,6 +16,7 @@ import numpy as np
 from gscodec import _native
 from gscodec.bitstream.quantization import trajectory_step
 from gscodec.bitstream.transform import dct_basis
+from gscodec.encode import rdo
 from gscodec.encode.parallel import each_frame
 from gscodec.gaussians import Nodes as GivenNodes
 from gscodec.sampling import farthest_points
@@ -24,6 +25,7 @@ NEIGHBORS = 4  # nodes that a Gaussian blends
 NODE_COUNTS = (1, 16, 64, 256, 1024)
 NODE_BITS = 50.0  # what one more node costs in a group of 20 frames, measured on statue
 RIDGE = 1e-3  # pull of a node's translation towards its own Kabsch solution
+GIVEN_STEP = 2.0  # of nodes that a trainer hands over, times those that are fitted: there are more of them
 SAMPLE = 12000  # Gaussians that tell how many nodes to take
 
 
@@ -182,27 +184,38 @@ def fit_nodes(grid_positions: np.ndarray, x: np.ndarray, means: np.ndarray, seed
     return fitted, rotated + np.moveaxis(moved, 1, 0)
 
 
-def given_nodes(given: GivenNodes, x: np.ndarray, step: float, grid) -> Nodes:
+def given_nodes(
+    given: GivenNodes, grid_positions: np.ndarray, step: float, grid, weights: np.ndarray, price: float
+) -> Nodes:
     """The nodes that a trainer knows, quantized.
 
     Args:
-        x: [N, 3], world positions of the Gaussians in the pose in which the nodes rest.
-        step: of the translations, world units; grid: the lattice of positions.
+        grid_positions: [N, 3], of the Gaussians in the pose in which the nodes rest.
+        step: of the translations of nodes that are fitted, world units; grid: the lattice of positions.
+        weights: [N, 3] sensitivities of means. price: of a bit.
     """
     from scipy.spatial import cKDTree
 
     positions, first = np.unique(grid.to_integers(given.positions), axis=0, return_index=True)
     order = _native.morton_order(positions)
     positions, first = positions[order], first[order]
-    places = grid.to_world(positions)
+    places, x = grid.to_world(positions), grid.to_world(grid_positions)
+    step *= GIVEN_STEP
     rotation_step = _rotation_step(step, cKDTree(places).query(x)[0])
-    basis = dct_basis(len(given.rotations))
     moved = given.translations[:, first] + (given.positions[first] - places)  # the node is at rest on the grid
-    coefficients = (
-        quantize_trajectory(given.rotations[:, first], basis, rotation_step),
-        quantize_trajectory(moved, basis, step),
+    index, share = _native.node_weights(grid_positions, positions, NEIGHBORS)
+    heard = share.astype(np.float64) ** 2 * weights.mean(1, keepdims=True)
+    away = ((x[:, None] - places[index]) ** 2).sum(2)
+    shifts, turns = (
+        np.bincount(index.ravel(), w.ravel(), len(places))[:, None].repeat(3, 1) for w in (heard, heard * away * 2 / 3)
     )
-    return Nodes(positions, places, trim(np.concatenate(coefficients, 2).transpose(0, 2, 1)), rotation_step, step)
+    parts = (
+        rdo.trajectory(given.rotations[:, first], turns, rotation_step, price),
+        rdo.trajectory(moved, shifts, step, price),
+    )
+    used = max(map(len, parts))
+    coefficients = np.concatenate([np.pad(p, ((0, used - len(p)), (0, 0), (0, 0))) for p in parts], 1)
+    return Nodes(positions, places, coefficients, rotation_step, step)
 
 
 def _rotation_step(step: float, distance: np.ndarray) -> float:

@@ -77,7 +77,9 @@ def predict_group(
     positions = reference.integers["positions"][known]
     old = align_axes(old, middle, reference.turn[known], reference.order[known])
     x = grid.to_world(positions)
-    nodes = _nodes(group, positions, x, old.means, reference) if len(known) else None
+    price = rdo.bit_price(error_for(quality), len(known) + len(births), group.nodes is not None)
+    heard = measured.weights["means"][survivors]
+    nodes = _nodes(group, positions, x, old.means, reference, heard, price) if len(known) else None
     motion = nodes and carry(nodes, positions, x, len(s.means))
     rest = None if group.nodes is None else group.nodes.rest[births]
     places = _carry_back(new, middle, rest, x, nodes, motion, grid)
@@ -118,16 +120,17 @@ def predict_group(
         "nodes": None,
         "lifetimes": None if s.lifetimes is None else s.lifetimes.astype(np.uint16),
     }
-    price = rdo.bit_price(error_for(quality), len(positions), group.nodes is not None)
     return out | motion_integers(
         s, channels, rotations, steps, measured, price, grid.to_world(positions), nodes, motion
     )
 
 
-def _nodes(group: Group, positions, x: np.ndarray, means: np.ndarray, reference: Coded) -> Nodes | None:
+def _nodes(
+    group: Group, positions, x: np.ndarray, means: np.ndarray, reference: Coded, weights: np.ndarray, price: float
+) -> Nodes | None:
     """The trainer's nodes, which rest where the reference does, or what fits the means [T, N, 3]."""
     if group.nodes is not None:
-        return given_nodes(group.nodes, x, reference.node_step, reference.grid)
+        return given_nodes(group.nodes, positions, reference.node_step, reference.grid, weights, price)
     grid = reference.grid
     return choose_nodes(positions, x, means, grid.step, reference.node_step, grid.to_world)
 

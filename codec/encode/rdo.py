@@ -12,7 +12,7 @@ import numpy as np
 from gscodec.bitstream.quantization import QUALITY_DEFAULT, error_for
 from gscodec.bitstream.transform import dct_basis
 
-BIT_PRICE = 0.03  # of a bit, in units of the picture's error per Gaussian: the slope on a trained capture
+BIT_PRICE = 0.05  # of a bit, in units of the picture's error per Gaussian: the slope on a trained capture
 FLOOR = 0.2  # share of the mean sensitivity that all have: few views say little of one, and errors that agree add up
 ZERO_BITS, NONZERO_BITS, LENGTH_BITS = (
     0.5,
