@@ -13,10 +13,11 @@ from gscodec.bitstream.color import correlate, decorrelate
 from gscodec.bitstream.quantization import steps_for, subject_radius
 from gscodec.bitstream.transform import dct_basis
 from gscodec.decode import Stream, open_stream
-from gscodec.encode.canonical import canonical_axes, quat_multiply
+from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply
 from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
-from gscodec.encode.group import group_integers, shifts_of, stack_group
+from gscodec.encode.group import code_group, group_integers, shifts_of, stack_group
 from gscodec.encode.motion import carry, choose_nodes
+from gscodec.encode.turns import LEVER_UNIT, SHARE, code_turns, fit_levers, in_form, widths
 from gscodec.encode.writer import StreamWriter
 from gscodec.errors import BitstreamError, CaptureError, UsageError
 from gscodec.gaussians import Gaussians, Group, Nodes
@@ -40,13 +41,39 @@ def nearest(a: Gaussians, b: Gaussians) -> np.ndarray:
 
 def test_canonical_form_keeps_the_covariance_and_sorts_the_axes():
     g = blob(500)
-    turn, order = canonical_axes(g.quats, g.log_scales)
+    turn, order = canonical_axes(g.log_scales)
     q = quat_multiply(g.quats.astype(float), turn)
     scales = np.take_along_axis(g.log_scales, order, 1)
     assert (np.diff(scales, axis=1) <= 0).all()
-    assert (np.abs(q[:, 0]) >= np.abs(q[:, 1:]).max(1) - 1e-9).all(), "the real part is the largest"
     same = Gaussians(g.means, q.astype(np.float32), scales, g.logit_opacities, g.sh0, g.shN)
     np.testing.assert_allclose(covariances(same), covariances(g), atol=1e-7)
+
+
+def test_turns_come_back_and_errors_do_not_add_up():
+    group = code_group(Group([blob(3000)]), 60, keep_all=True, layers=2)
+    step = np.array([2e-3, 1e-3, 3e-3])
+    channel = {"steps": step, "levers": np.zeros((3, 3))}
+    ends = np.cumsum([0, *group.integers["layers"]])
+    layers = [(slice(a, b), None) for a, b in itertools.pairwise(ends)]
+    positions, still = group.integers["positions"], np.zeros((3000, 3))
+    turns, forms = code_turns(group.rotations, still, positions, channel, layers, np.zeros(3000, int))
+    group.integers["channels"]["quats"] |= {"values": turns, "steps": step.tolist(), "levers": still[:3].astype(int)}
+    group.integers["shifts"] = None
+    decoded = _native.DecodedGroup(_native.encode_group(group.integers)[0], 1).frame(0)["quats"]
+    off = quat_multiply(quat_conjugate(decoded.astype(float)), in_form(group.rotations, forms).astype(float))
+    assert (np.abs(off[:, 1:]) < step.sum()).all(), "of three turns, none off by more than half a step"
+    assert np.abs(turns * step[:, None]).max() < 0.95, "the form that turns least"
+
+
+def test_levers_follow_the_sizes():
+    log_scales = np.random.default_rng(0).normal(-4, 0.3, (5000, 3))
+    weights = np.exp(2 * log_scales[:, [1, 0, 0]])
+    wanted = np.zeros((3, 3))
+    wanted[[0, 1, 2], [1, 0, 0]] = LEVER_UNIT * SHARE * 2 / np.log(2)
+    np.testing.assert_allclose(fit_levers(log_scales, weights), wanted, atol=0.15 * wanted.max())
+    equal = weights * widths(log_scales, fit_levers(log_scales, weights)) ** 2
+    assert np.log(equal).std() < 0.2 * np.log(weights).std()
+    assert not fit_levers(log_scales[:50], weights[:50]).any(), "too few to tell"
 
 
 def test_dct_is_orthonormal_for_every_length():

@@ -1,9 +1,8 @@
-"""One form for each Gaussian: the (quaternion, scale) pair has 24 equal forms, of which one codes best.
+"""The axes of each Gaussian by falling scale: of the 24 equal forms of a (quaternion, scale) pair, four are left.
 
-A covariance does not change when its axes are permuted or flipped. Axes are sorted by falling scale, so that a scale
-tells something about the next; of the four orientations left, the one with the largest real part is kept, so that
-the vector part of the quaternion says it all (w >= 1/2) and no index is sent. In -> out: Gaussians of T frames ->
-the same content, with the same choice made in every frame, so that trajectories stay smooth.
+A covariance does not change when its axes are permuted or flipped. Sorted, a scale tells something about the next; of
+the four orientations left, the one nearest to a neighbour's is coded (turns.py). In -> out: scales of one frame -> the
+same choice for every frame, so that trajectories stay smooth.
 """
 
 from itertools import permutations
@@ -53,15 +52,10 @@ def _permutation_quat(order: tuple[int, ...]) -> np.ndarray:
 
 _ORDERS = list(permutations(range(3)))
 _PERMUTATION_QUATS = np.stack([_permutation_quat(o) for o in _ORDERS])  # [6, 4]
-_FLIPS = np.eye(4)  # right-multiplying by 1, i, j, k flips pairs of axes
 
 
-def canonical_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The form to code.
-
-    Args:
-        quats: [N, 4] unit, wxyz, at the frame that decides.
-        log_scales: [N, 3] at that frame.
+def canonical_axes(log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The form to code, by log_scales [N, 3] of the frame that decides.
 
     Returns:
         turn [N, 4] f64, by which quaternions of every frame are right-multiplied; order [N, 3] int, the axes by
@@ -70,8 +64,4 @@ def canonical_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarra
     order = np.argsort(-log_scales, axis=1, kind="stable")
     code = np.array([o[0] * 9 + o[1] * 3 + o[2] for o in _ORDERS])
     which = np.searchsorted(code, order[:, 0] * 9 + order[:, 1] * 3 + order[:, 2])
-    turn = _PERMUTATION_QUATS[which]
-    turned = quat_multiply(quats.astype(np.float64), turn)
-    # The real part of q * e_m is +-component m of q: flip by the component that is largest.
-    flip = _FLIPS[np.abs(turned).argmax(1)]
-    return quat_multiply(turn, flip), order
+    return _PERMUTATION_QUATS[which], order

@@ -264,7 +264,7 @@ def code_group(
     """
     s, layers = stack_group(group), layers or _layers(group)
     frames, middle = len(s.means), len(s.means) // 2
-    turn, axes = canonical_axes(s.quats[middle], s.log_scales[middle])
+    turn, axes = canonical_axes(s.log_scales[middle])
     s = align_axes(s, middle, turn, axes)
     measured, error = measure_stack(s, cameras), error_for(quality)
     source = np.arange(len(turn)) if keep_all else np.flatnonzero(measured.removal >= PRUNE * error / max(len(turn), 1))

@@ -173,7 +173,7 @@ def _canonical_births(s: Stack, middle: int, motion: NodeMotion | None) -> tuple
     quats = s.quats[at, each]
     if motion is not None:
         quats = quat_multiply(quat_conjugate(motion.turned[at, each]), quats)
-    turn, order = canonical_axes(quats, s.log_scales[at, each])
+    turn, order = canonical_axes(s.log_scales[at, each])
     return align_axes(s, middle, turn, order), quat_multiply(quats.astype(np.float64), turn)
 
 
