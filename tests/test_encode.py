@@ -14,9 +14,11 @@ from gscodec.bitstream.quantization import steps_for, subject_radius
 from gscodec.bitstream.transform import dct_basis
 from gscodec.decode import Stream, open_stream
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply
+from gscodec.encode.channels import shifts_of
 from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
-from gscodec.encode.group import code_group, group_integers, shifts_of, stack_group
+from gscodec.encode.group import code_group, group_integers
 from gscodec.encode.motion import carry, choose_nodes
+from gscodec.encode.stack import stack_group
 from gscodec.encode.turns import LEVER_UNIT, SHARE, code_turns, fit_levers, in_form, widths
 from gscodec.encode.writer import StreamWriter
 from gscodec.errors import BitstreamError, CaptureError, UsageError

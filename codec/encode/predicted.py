@@ -18,22 +18,11 @@ from gscodec.camera import Camera
 from gscodec.encode import curves as curved
 from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
-from gscodec.encode.group import (
-    PRUNE,
-    Coded,
-    Grid,
-    Stack,
-    align_axes,
-    canonical_appearance,
-    curves_of,
-    dequantize_channels,
-    layer_of,
-    measure_stack,
-    motion_integers,
-    shifts_of,
-    stack_group,
-)
+from gscodec.encode.channels import curves_of, dequantize_channels, shifts_of
+from gscodec.encode.group import Coded, Grid, motion_integers
 from gscodec.encode.motion import NodeMotion, Nodes, carry, choose_nodes, given_nodes
+from gscodec.encode.plan import PRUNE, layer_of, measure_stack
+from gscodec.encode.stack import Stack, align_axes, canonical_appearance, stack_group
 from gscodec.encode.turns import code_turns, in_form
 from gscodec.gaussians import Group
 
