@@ -2,10 +2,10 @@
 
 One entry of bench/results/train.json per (case, recipe, preset): case, recipe, preset, seconds_per_frame, psnr,
 psnr_fg, ssim, gaussians, kb_per_frame, flicker, all on the test cameras. What gscodec trains is measured twice: before
-coding ("model", no size) and decoded from the stream ("gscodec"). "alone" trains a keyframe for every frame it is asked
-for, with the keyframe budget of the preset: what tracking is to be compared with; "alone-coded" is the same from our
-stream, every frame a group. "v3" is V3's recipe at about the time that our preset medium takes (baselines/v3.py),
-"v3-coded" the same through its own packing (baselines/videogs.py).
+coding ("model", no size) and decoded from the stream ("gscodec", with `still_gaussians` and `still_bits`: still.py).
+"alone" trains a keyframe for every frame it is asked for, with the keyframe budget of the preset: what tracking is to
+be compared with; "alone-coded" is the same from our stream, every frame a group. "v3" is V3's recipe at about the time
+that our preset medium takes (baselines/v3.py), "v3-coded" the same through its own packing (baselines/videogs.py).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from gscodec.bench.machine import update_entries
+from gscodec.bench.still import still_share
 from gscodec.capture import Capture
 from gscodec.errors import UsageError
 from gscodec.gaussians import Gaussians, Group
@@ -93,18 +94,22 @@ def measure(case: str, recipe: str, preset: str, frames: str | None, data: Path,
     chosen = range(capture.frame_count)[slice(*(int(x) if x else None for x in (frames or ":").split(":")))]
     settings = train_settings(preset, quality=quality)
     run = {"gscodec": _ours, "alone": _alone, "v3": _v3}[recipe]
-    for name, seconds, size, models in run(capture, chosen, settings):
+    for name, seconds, size, models, *more in run(capture, chosen, settings):
         result = evaluate(part(capture, chosen), models)
-        yield {
-            "capture": case,
-            "recipe": name,
-            "preset": preset,
-            "quality": quality if name in ("gscodec", "alone-coded") else None,
-            "frames": [chosen.start, chosen.stop, chosen.step],
-            "seconds_per_frame": round(seconds / len(chosen), 2),
-            **{k: result[k] for k in KEYS},
-            "psnr_of_frame": [round(r["psnr_fg"], 2) for r in result["per_frame"]],
-        } | {"kb_per_frame": size / 1000 / len(chosen) if size else None}
+        yield (
+            {
+                "capture": case,
+                "recipe": name,
+                "preset": preset,
+                "quality": quality if name in ("gscodec", "alone-coded") else None,
+                "frames": [chosen.start, chosen.stop, chosen.step],
+                "seconds_per_frame": round(seconds / len(chosen), 2),
+                **{k: result[k] for k in KEYS},
+                "psnr_of_frame": [round(r["psnr_fg"], 2) for r in result["per_frame"]],
+            }
+            | {"kb_per_frame": size / 1000 / len(chosen) if size else None}
+            | dict(*more)
+        )
 
 
 def _ours(capture: Capture, frames: range, settings) -> Iterator[tuple]:
@@ -113,7 +118,9 @@ def _ours(capture: Capture, frames: range, settings) -> Iterator[tuple]:
     groups, trained = sequence(part(capture, frames), settings)
     yield "model", trained, None, shown(groups)
     size, decoded, seconds = coded(part(capture, frames), groups, settings)
-    yield "gscodec", trained + seconds, size, decoded
+    share, bits = still_share(groups[0], settings.quality, [c for c in capture.cameras if c.split == "train"])
+    still = {"still_gaussians": round(share, 3), "still_bits": round(bits, 4)}
+    yield "gscodec", trained + seconds, size, decoded, still
 
 
 def _alone(capture: Capture, frames: range, settings) -> Iterator[tuple]:
