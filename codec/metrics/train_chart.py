@@ -20,10 +20,11 @@ def train_chart(result: dict):
     """A row for each capture, a panel for time and one for size (matplotlib)."""
     from matplotlib.figure import Figure
 
-    captures = list(dict.fromkeys(e["capture"] for e in result["entries"]))
+    shown = [e for e in result["entries"] if e["frames"][0] == 0]  # a few frames in a row from the middle: for flicker
+    captures = list(dict.fromkeys(e["capture"] for e in shown))
     figure = Figure(figsize=(10, 3.4 * len(captures)), layout="constrained")
     for row, capture in zip(figure.subplots(len(captures), 2, squeeze=False), captures, strict=True):
-        entries = [e for e in result["entries"] if e["capture"] == capture]
+        entries = [e for e in shown if e["capture"] == capture]
         for axes, (key, label) in zip(row, PANELS.items(), strict=True):
             axes.set(xlabel=label, ylabel="PSNR of the subject, dB", xscale="log")
             _panel(axes, [e for e in entries if e[key]], key)
