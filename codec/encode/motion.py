@@ -25,7 +25,6 @@ NEIGHBORS = 4  # nodes that a Gaussian blends
 NODE_COUNTS = (1, 16, 64, 256, 1024)
 NODE_BITS = 50.0  # what one more node costs in a group of 20 frames, measured on statue
 RIDGE = 1e-3  # pull of a node's translation towards its own Kabsch solution
-GIVEN_STEP = 2.0  # of nodes that a trainer hands over, times those that are fitted: there are more of them
 SAMPLE = 12000  # Gaussians that tell how many nodes to take
 
 
@@ -191,7 +190,7 @@ def given_nodes(
 
     Args:
         grid_positions: [N, 3], of the Gaussians in the pose in which the nodes rest.
-        step: of the translations of nodes that are fitted, world units; grid: the lattice of positions.
+        step: of the translations, world units; grid: the lattice of positions.
         weights: [N, 3] sensitivities of means. price: of a bit.
     """
     from scipy.spatial import cKDTree
@@ -200,7 +199,6 @@ def given_nodes(
     order = _native.morton_order(positions)
     positions, first = positions[order], first[order]
     places, x = grid.to_world(positions), grid.to_world(grid_positions)
-    step *= GIVEN_STEP
     rotation_step = _rotation_step(step, cKDTree(places).query(x)[0])
     moved = given.translations[:, first] + (given.positions[first] - places)  # the node is at rest on the grid
     index, share = _native.node_weights(grid_positions, positions, NEIGHBORS)

