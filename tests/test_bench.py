@@ -54,15 +54,19 @@ def test_charts_are_drawn_from_the_results_alone(tmp_path):
 
 def test_training_has_a_chart_of_what_is_there(tmp_path):
     pytest.importorskip("matplotlib")
+    runs = (("model", "fast", 2, None), ("gscodec", "fast", 2.1, 7.0), ("gscodec", "medium", 7, 8.0))
     made = [
         {"capture": "a", "recipe": r, "preset": p, "seconds_per_frame": s, "kb_per_frame": kb, "psnr_fg": 26.0 + s}
-        for r, p, s, kb in (("model", "fast", 2, None), ("gscodec", "fast", 2.1, 7.0), ("gscodec", "medium", 7, 8.0))
+        | {"frames": [0, 30, 1]}
+        for r, p, s, kb in runs
     ]
+    made.append(made[-1] | {"preset": "of a few frames", "frames": [4, 10, 1]})
     write_result(tmp_path / "train.json", {"entries": made})
     assert [p.name for p in draw_charts(tmp_path, tmp_path / "charts")] == ["train.svg", "train.png"]
     svg = (tmp_path / "charts" / "train.svg").read_text()
     assert "medium" in svg
     assert "V3" not in svg
+    assert "few" not in svg, "for flicker alone"
 
 
 def test_ablation_shows_what_each_tool_is_worth(tmp_path):
