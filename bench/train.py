@@ -96,20 +96,18 @@ def measure(case: str, recipe: str, preset: str, frames: str | None, data: Path,
     run = {"gscodec": _ours, "alone": _alone, "v3": _v3}[recipe]
     for name, seconds, size, models, *more in run(capture, chosen, settings):
         result = evaluate(part(capture, chosen), models)
-        yield (
-            {
-                "capture": case,
-                "recipe": name,
-                "preset": preset,
-                "quality": quality if name in ("gscodec", "alone-coded") else None,
-                "frames": [chosen.start, chosen.stop, chosen.step],
-                "seconds_per_frame": round(seconds / len(chosen), 2),
-                **{k: result[k] for k in KEYS},
-                "psnr_of_frame": [round(r["psnr_fg"], 2) for r in result["per_frame"]],
-            }
-            | {"kb_per_frame": size / 1000 / len(chosen) if size else None}
-            | dict(*more)
-        )
+        yield {
+            "capture": case,
+            "recipe": name,
+            "preset": preset,
+            "quality": quality if name in ("gscodec", "alone-coded") else None,
+            "frames": [chosen.start, chosen.stop, chosen.step],
+            "seconds_per_frame": round(seconds / len(chosen), 2),
+            **{k: result[k] for k in KEYS},
+            "kb_per_frame": size / 1000 / len(chosen) if size else None,
+            "psnr_of_frame": [round(r["psnr_fg"], 2) for r in result["per_frame"]],
+            **dict(*more),
+        }
 
 
 def _ours(capture: Capture, frames: range, settings) -> Iterator[tuple]:

@@ -172,8 +172,8 @@ def _with_births(c: dict, known: np.ndarray, values: np.ndarray, shifts: np.ndar
     steps, offsets = np.array(c["steps"], np.float32), np.array(c["offsets"], np.float32)
     unit = 2.0 ** shifts[:, None]
     values = curved.along(values, curves_of(c))
-    own = c | {"values": (np.rint((values - offsets) / (steps * unit)) * unit).astype(np.int32).T}
-    return c | {"values": np.concatenate([c["values"][:, known], own["values"]], 1)}
+    own = (np.rint((values - offsets) / (steps * unit)) * unit).astype(np.int32).T
+    return c | {"values": np.concatenate([c["values"][:, known], own], 1)}
 
 
 def _join(a: Stack, b: Stack) -> Stack:

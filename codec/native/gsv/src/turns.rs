@@ -5,12 +5,12 @@
 
 use crate::dequantize::{Quat, before, multiply, turn};
 use crate::neighbors::Near;
+use crate::values::NEAR_WEIGHT;
 
 /// Integers and contexts beyond are counted together.
 pub const RANGE: i32 = 15;
 /// Integers that code lengths tell apart.
 pub const SIDE: usize = 2 * RANGE as usize + 1;
-const NEAR_WEIGHT: [i32; 4] = [4, 3, 2, 2]; // of contexts (spec 6.5)
 
 /// Gaussians to be coded: of each its quaternion, the steps of its three integers, and what an error of a step is worth, in bits,
 /// squared.

@@ -17,7 +17,7 @@ const UNARY: i32 = 16;
 const NEAR_UNARY: usize = 7; // magnitudes of either sign in the first cache line
 const ESCAPE_SLOT: usize = 34;
 const ESCAPE_MAX: u32 = 25;
-const NEAR_WEIGHT: [i32; NEAR] = [4, 3, 2, 2];
+pub const NEAR_WEIGHT: [i32; NEAR] = [4, 3, 2, 2];
 
 /// Adaptive model of the values of one unit.
 pub struct ValueModel {
