@@ -1,9 +1,12 @@
-"""Refinement of a single frame: the picture comes nearer to the source for about the same bytes."""
+"""Refinement: the picture comes nearer to the source for about the same bytes."""
+
+from dataclasses import replace
 
 import numpy as np
-from synthetic import blob
+from synthetic import blob, moved
 
 from gscodec import _native
+from gscodec.encode.coder import GroupCoder
 from gscodec.encode.group import group_integers
 from gscodec.gaussians import Gaussians, GaussianSequence, Group
 from gscodec.metrics.evaluate import evaluate_splats
@@ -15,7 +18,7 @@ def test_a_refined_frame_is_nearer(monkeypatch):
     sequence = GaussianSequence(30.0, [group])
     found = []
     for views in (0, 20):
-        payload, _ = _native.encode_group(group_integers(group, 60, refine_steps=views))
+        payload, _ = _native.encode_group(group_integers(group, 60, views=views))
         decoded = Gaussians(**_native.DecodedGroup(payload, 1).frame(0))
         found.append((len(payload), evaluate_splats(lambda _, g=decoded: g, sequence)["codec_psnr"]))
     (plain, before), (refined, after) = found
@@ -25,6 +28,30 @@ def test_a_refined_frame_is_nearer(monkeypatch):
 
 def test_positions_and_order_stay():
     group = Group([blob(1200)])
-    plain, refined = (group_integers(group, 70, refine_steps=n) for n in (0, 3))
+    plain, refined = (group_integers(group, 70, views=n) for n in (0, 3))
     assert np.array_equal(plain["positions"], refined["positions"])
     assert plain["shifts"] == refined["shifts"]
+
+
+def test_refined_groups_are_nearer():
+    """An independent group and one predicted from it, in which colours change and some Gaussians are not shown."""
+    groups, still, life = [], blob(1500), np.tile(np.array([0, 5], np.int32), (1500, 1))
+    life[:300, 1] = 3
+    for start in (0, 5):
+        frames = [moved(still, [0, 0.04 * t, 0], [0.02 * t, 0, 0]) for t in range(start, start + 5)]
+        frames = [replace(f, sh0=f.sh0 * np.float32(np.cos(0.3 * t))) for t, f in enumerate(frames, start)]
+        groups.append(Group(frames, life, parents=np.arange(1500) if start else None))
+    found = []
+    for views in (0, 40):
+        coder = GroupCoder(keep_all=True, layers=2, random_access=60, refine=views)
+        first, second = (coder.code(g, 40) for g in groups)
+        assert not second.independent
+        reference = _native.DecodedGroup(first.payload, 1)
+        decoded = [reference, _native.DecodedGroup(second.payload, 1, reference=reference)]
+        shown = lambda t, d=decoded: Gaussians(**d[t // 5].frame(t % 5)).take(d[t // 5].visible(t % 5))  # noqa: E731
+        sequence = GaussianSequence(30.0, groups)
+        near = [evaluate_splats(shown, sequence, r)["codec_psnr"] for r in (range(5), range(5, 10))]
+        found.append(([len(first.payload), len(second.payload)], near))
+    (plain, before), (refined, after) = found
+    assert all(b > a + 0.05 for a, b in zip(before, after, strict=True))
+    assert all(b < 1.03 * a for a, b in zip(plain, refined, strict=True))

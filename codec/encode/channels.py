@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import product
 
 import numpy as np
 
+from gscodec.bitstream.color import correlate
+from gscodec.camera import Camera
 from gscodec.encode import curves as curved
 from gscodec.encode import rdo
+from gscodec.encode.refine import Moving, refine
+from gscodec.gaussians import Gaussians
 
 SHIFTED = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
 
@@ -52,27 +55,53 @@ def shifts_of(integers: dict) -> dict[str, np.ndarray]:
     return dict(zip(names, np.array(shifts, int).T, strict=True))
 
 
+def margins_of(q: np.ndarray, weights: np.ndarray, step: np.ndarray, layers: list, price: float) -> np.ndarray:
+    """[2, N, C], `rdo.margins` of integers [N, C] with sensitivities [N, C] and steps [C] or [N, C]."""
+    found, weights = np.zeros((2, *q.shape), np.float32), weights * step**2
+    for (own, near), c in product(layers, range(q.shape[1])):
+        found[:, own, c] = rdo.margins(q[own, c], weights[own, c], near, price)
+    return found
+
+
 def refined_channels(
-    refine: Callable[..., dict], values: dict, channels: dict, shifts: dict, weights: dict, layers: list, price: float
+    values: dict,
+    channels: dict,
+    shifts: dict,
+    weights: dict,
+    layers: list,
+    price: float,
+    source: Gaussians,
+    placed: Gaussians,
+    cameras: list[Camera],
 ) -> dict:
-    """`channels` of a single frame with refined integers; `values`: what they were quantized from, `shifts`: [N]; the
-    others as in `quantize_channels`."""
+    """`channels` of a single frame with refined integers.
+
+    Args:
+        values: what they were quantized from. shifts: [N]. weights, layers, price: as in `quantize_channels`.
+        source: as it is to look. placed: the same at decoded positions. cameras: of `refine`.
+    """
     unit = {n: 2.0 ** shifts[n][:, None].astype(np.float32) for n in channels}
     step = {n: np.array(c["steps"], np.float32) * unit[n] for n, c in channels.items()}
     offset = {n: np.array(c["offsets"], np.float32) for n, c in channels.items()}
     curves = {n: curves_of(c) for n, c in channels.items()}
-
-    def decode(q):
-        coded = {n: offset[n] + step[n] * v for n, v in q.items()}
-        slopes = {n: step[n] * curved.rises(coded[n], curves[n]) if curves[n] else step[n] for n in coded}
-        return {n: curved.back(v, curves[n]) for n, v in coded.items()}, slopes
-
-    latents = {n: (values[n] - offset[n]) / step[n] for n in channels}
     q = {n: c["values"].T / unit[n] for n, c in channels.items()}
-    margins = {n: [np.zeros(v.shape, np.float32) for _ in range(2)] for n, v in q.items()}
-    for n, v in q.items():
-        for (own, near), c in product(layers, range(v.shape[1])):
-            found = rdo.margins(v[own, c], weights[n][own, c] * step[n][own, c] ** 2, near, price)
-            margins[n][0][own, c], margins[n][1][own, c] = found
-    q = refine(latents, q, margins, decode)
-    return {n: c | {"values": (q[n] << shifts[n][:, None]).T.astype(np.int32)} for n, c in channels.items()}
+    parts = [
+        Moving(n, (values[n] - offset[n]) / step[n], v, margins_of(v, weights[n], step[n], layers, price))
+        for n, v in q.items()
+    ]
+
+    def shown(_):
+        coded = {p.attribute: offset[p.attribute] + step[p.attribute] * p.integers for p in parts}
+        slopes = [step[n] * curved.rises(v, curves[n]) if curves[n] else step[n] for n, v in coded.items()]
+        chain = [lambda d, s=s: d * s for s in slopes]
+        return _with_values(placed, {n: curved.back(v, curves[n]) for n, v in coded.items()}), chain
+
+    refine(parts, lambda _: source, shown, cameras)
+    moved = {p.attribute: p.integers.astype(np.int32) for p in parts}
+    return {n: c | {"values": (moved[n] << shifts[n][:, None]).T} for n, c in channels.items()}
+
+
+def _with_values(g: Gaussians, values: dict) -> Gaussians:
+    shN = correlate(values["shN"].reshape(g.shN.shape)) if "shN" in values else g.shN
+    opacities = values["logit_opacities"][:, 0]
+    return Gaussians(g.means, g.quats, values["log_scales"], opacities, correlate(values["sh0"]), shN)

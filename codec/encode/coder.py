@@ -18,6 +18,7 @@ from gscodec.encode.predicted import predict_group
 from gscodec.errors import CaptureError
 from gscodec.gaussians import Group
 
+FEW, FRAME_VIEWS = 20_000, 10  # Gaussians up to which a group is refined if nobody says, and by how many views a frame
 DOUBT = 0.7  # a predicted group of more than so many bytes a frame of its reference is coded both ways
 
 
@@ -54,7 +55,7 @@ class GroupCoder:
     """Codes groups in their order. A shallow copy is a coder of its own, for trying.
 
     Args:
-        keep_all, layers, refine_steps, cameras: as in `code_group`.
+        keep_all, layers, cameras: as in `code_group`. refine: as in `EncodeSettings`.
         random_access: frames from one independent group to the next at most; 0 or 1: every group is independent.
     """
 
@@ -64,11 +65,11 @@ class GroupCoder:
         keep_all: bool,
         layers: int | None,
         random_access: int,
-        refine_steps: int = 0,
+        refine: int | None = None,
         cameras: list[Camera] = (),
     ):
         self._options = {"keep_all": keep_all, "cameras": cameras}
-        self._independent_options = {"layers": layers, "refine_steps": refine_steps}
+        self._layers, self._refine = layers, refine
         self._random_access, self._reference = random_access, None
 
     def code(self, group: Group, quality: float) -> CodedGroup:
@@ -76,7 +77,8 @@ class GroupCoder:
         parents, r = self._parents(group), self._reference
         if parents is None or r.frames + len(group) > self._random_access:
             return self._independent(group, quality)
-        integers = predict_group(group, parents, r.back, r.coded, quality=quality, **self._options)
+        options = self._options | {"views": self._views(group), "decoded": r.payload.decoded}
+        integers = predict_group(group, parents, r.back, r.coded, quality=quality, **options)
         payload, units = _native.encode_group(integers, r.payload.decoded)
         if len(payload) > DOUBT * len(r.payload.data):
             other = self._independent(group, quality)
@@ -86,12 +88,19 @@ class GroupCoder:
         return CodedGroup(payload, units, len(integers["positions"]), False)
 
     def _independent(self, group: Group, quality: float) -> CodedGroup:
-        coded = code_group(group, quality, **self._independent_options, **self._options)
+        coded = code_group(group, quality, layers=self._layers, views=self._views(group), **self._options)
         payload, units = _native.encode_group(coded.integers)
         if self._random_access > len(group):
             index = np.arange(len(group.frames[0]))
             self._reference = _Reference(coded, _Payload(payload), len(group), 1, index)
         return CodedGroup(payload, units, len(coded.source), True)
+
+    def _views(self, group: Group) -> int:
+        """By how many a group is refined."""
+        if self._refine is not None:
+            return self._refine
+        few = len(group) > 1 and len(group.frames[0]) <= FEW
+        return FRAME_VIEWS * len(group) if few else 0
 
     def state(self) -> dict[str, np.ndarray]:
         """What the next group may be predicted from; empty if from nothing."""

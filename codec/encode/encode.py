@@ -22,7 +22,7 @@ from gscodec.errors import UsageError
 from gscodec.gaussians import Group
 
 LAYERS_MAX = 16  # spec 4
-REFINE = 100  # views
+REFINE = 100  # views, of splats of one frame
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,7 @@ class EncodeSettings:
             where their parents are known and it is cheaper. 0 or 1: every group is independent.
         layers: layers of importance in each group, each with its own steps; any first few decode alone. None: what is
             smallest.
-        refine: views by which frames of many Gaussians that are coded alone are refined; 0: they are not. None: REFINE
-            for splats of one frame, 0 for all else.
+        refine: views by which each group is refined; 0: none is. None: by a few a frame, groups of few Gaussians.
     """
 
     quality: float = 50.0
@@ -141,7 +140,7 @@ def encode_groups(
     coder = GroupCoder(
         keep_all=settings.keep_all,
         layers=settings.layers,
-        refine_steps=settings.refine or 0,
+        refine=settings.refine,
         random_access=settings.random_access,
         cameras=[c for c in cameras if c.split == "train"],
     )

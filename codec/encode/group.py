@@ -8,7 +8,6 @@ over. Every later stage works on the values that the decoder will have, so error
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -20,13 +19,13 @@ from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
 from gscodec.encode.channels import SHIFTED, dequantize_channels, quantize_channels, refined_channels
 from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes
-from gscodec.encode.plan import STILL_LEAST, Plan, along_curves, plan_group
-from gscodec.encode.refine import refine
+from gscodec.encode.plan import Plan, along_curves, plan_group
+from gscodec.encode.refine_group import refine_group
 from gscodec.encode.stack import Stack, align_axes, canonical_appearance, stack_group
 from gscodec.encode.turns import code_turns, in_form
 from gscodec.gaussians import Group
 from gscodec.gaussians import Nodes as GivenNodes
-from gscodec.render.sensitivity import Importance
+from gscodec.render.sensitivity import Importance, sensitivity_cameras
 
 GRID_BITS_MAX = 21
 
@@ -123,7 +122,7 @@ def code_group(
     *,
     keep_all: bool = False,
     layers: int | None = None,
-    refine_steps: int = 0,
+    views: int = 0,
     cameras: list[Camera] = (),
 ) -> Coded:
     """An independent group in integers.
@@ -133,7 +132,7 @@ def code_group(
         quality: 0 to 100.
         keep_all: code every Gaussian, also the invisible ones.
         layers: number of layers of falling importance; None: STILL_LAYERS for many Gaussians in a single frame, else 1.
-        refine_steps: views by which a single frame of many Gaussians is refined.
+        views: by which integers are refined.
         cameras: from which the subject was captured, if it was.
     """
     s, frames, trained = stack_group(group), len(group), group.nodes is not None
@@ -142,11 +141,8 @@ def code_group(
     plan = plan_group(s, quality, layers=layers, keep_all=keep_all, trained=trained, cameras=cameras)
     grid, nodes, plan, positions, quats = _placed(s, group.nodes if frames > 1 else None, plan)
     s = s.take(plan.source)
-    looking = None
-    if refine_steps and frames == 1 and len(positions) >= STILL_LEAST:
-        shown = replace(s.frame(0), means=grid.to_world(positions))
-        looking = partial(refine, s.frame(0), shown, steps=refine_steps, cameras=cameras)
-    channels, forms = _canonical(s, quats, positions, plan, looking)
+    views = sensitivity_cameras(s.means[frames // 2], cameras, views) if views and len(positions) else []
+    channels, forms = _canonical(s, quats, grid.to_world(positions), positions, plan, views)
     s, rotations = replace(s, quats=in_form(s.quats, forms)), in_form(quats, forms).astype(np.float32)
     shifts = [plan.shifts[n] for n in SHIFTED if n in plan.shifts]
     out = {
@@ -164,6 +160,8 @@ def code_group(
         x = grid.to_world(positions)
         motion = nodes and carry(nodes, positions, x, frames)
         out |= motion_integers(s, channels, rotations, plan.even, plan.measured, plan.price, x, nodes, motion)
+        if views:
+            out = refine_group(out, s, plan.measured.weights, plan.price, views)
     turn, axes = in_form(turn[plan.source], forms), axes[plan.source]
     return Coded(out, plan.source, turn, axes, rotations, grid, plan.even, plan.node_step)
 
@@ -183,9 +181,13 @@ def _placed(s: Stack, given: GivenNodes | None, plan: Plan) -> tuple[Grid, Nodes
     return grid, nodes, plan.ordered(order), positions[order], quats[order]
 
 
-def _canonical(s: Stack, quats: np.ndarray, positions: np.ndarray, plan: Plan, refine) -> tuple[dict, np.ndarray]:
-    """Channels of canonical values, and the form [N] of each Gaussian; `refine`: None, or `refine.refine` but for what
-    is to be refined."""
+def _canonical(
+    s: Stack, quats: np.ndarray, x: np.ndarray, positions: np.ndarray, plan: Plan, views: list[Camera]
+) -> tuple[dict, np.ndarray]:
+    """Channels of canonical values, those of a single frame refined by `views`, and the form [N] of each Gaussian.
+
+    x: [N, 3], `positions` in the world.
+    """
     counts = np.bincount(plan.layer, minlength=plan.layers)
     ends = zip(counts, counts.cumsum(), strict=True)
     parts = [(slice(b - n, b), rdo.neighbours(positions[b - n : b])) for n, b in ends]
@@ -197,8 +199,9 @@ def _canonical(s: Stack, quats: np.ndarray, positions: np.ndarray, plan: Plan, r
     for n, own in plan.curves.items():
         channels[n]["curves"] = [c.row() for c in own]
     shifts = plan.own_shifts()
-    if refine is not None:
-        channels = refined_channels(refine, values, channels, shifts, weights, parts, plan.price)
+    if views and len(s.means) == 1:
+        source, placed = s.frame(0), replace(s.frame(0), means=x)
+        channels = refined_channels(values, channels, shifts, weights, parts, plan.price, source, placed, views)
     turning = {"steps": plan.steps["quats"].tolist(), "offsets": [0.0] * 3, "levers": plan.levers.tolist()}
     sizes, heard = dequantize_channels(channels["log_scales"]), plan.measured.weights["quats"]
     turning["values"], forms = code_turns(quats, sizes, positions, turning, parts, shifts["quats"], heard, plan.price)

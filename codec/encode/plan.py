@@ -20,7 +20,7 @@ from gscodec.render.sensitivity import STILL_VIEWS, VIEWS, Importance, coarsest,
 
 LEVEL_RANGE = (3, 97)  # percentiles of log sensitivity between which layers are even
 LEAST_LEVEL = 1e-4  # of the mean sensitivity
-STILL_LAYERS, STILL_LEAST = 4, 1000  # layers of a single frame of so many Gaussians, which can be refined too
+STILL_LAYERS, STILL_LEAST = 4, 1000  # layers of a single frame of so many Gaussians
 SHIFT_MOST = 8  # doublings of a layer's step
 PRUNE = 0.3  # a Gaussian goes if the picture without it errs by less than this share of the error per coded Gaussian
 

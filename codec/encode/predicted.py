@@ -22,9 +22,11 @@ from gscodec.encode.channels import curves_of, dequantize_channels, shifts_of
 from gscodec.encode.group import Coded, Grid, motion_integers
 from gscodec.encode.motion import NodeMotion, Nodes, carry, choose_nodes, given_nodes
 from gscodec.encode.plan import PRUNE, layer_of, measure_stack
+from gscodec.encode.refine_group import refine_group
 from gscodec.encode.stack import Stack, align_axes, canonical_appearance, stack_group
 from gscodec.encode.turns import code_turns, in_form
 from gscodec.gaussians import Group
+from gscodec.render.sensitivity import sensitivity_cameras
 
 REBIRTH = 8.0  # times PRUNE: what the reference left out must matter so much more to come back
 ROUNDS = 3  # of carrying births back
@@ -37,7 +39,9 @@ def predict_group(
     reference: Coded,
     *,
     quality: float,
+    decoded=None,
     keep_all: bool = False,
+    views: int = 0,
     cameras: list[Camera] = (),
 ) -> dict:
     """Integers of a group that is predicted.
@@ -46,7 +50,8 @@ def predict_group(
         group: T >= 1 frames of N Gaussians.
         parents: [N] int, index of each in the group that was coded as `reference`, -1: not there.
         back: how many groups before this one that is.
-        quality, keep_all, cameras: as in `code_group`.
+        decoded: the reference, as decoded.
+        quality, keep_all, views, cameras: as in `code_group`.
     """
     s = stack_group(group)
     parent = _coded_parents(parents, reference.source)
@@ -109,9 +114,12 @@ def predict_group(
         "nodes": None,
         "lifetimes": None if s.lifetimes is None else s.lifetimes.astype(np.uint16),
     }
-    return out | motion_integers(
-        s, channels, rotations, steps, measured, price, grid.to_world(positions), nodes, motion
-    )
+    x = grid.to_world(positions)
+    out |= motion_integers(s, channels, rotations, steps, measured, price, x, nodes, motion)
+    if views and len(positions):
+        views = sensitivity_cameras(s.means[middle], cameras, views)
+        out = refine_group(out, s, measured.weights, price, views, decoded)
+    return out
 
 
 def _nodes(

@@ -61,6 +61,14 @@ def trajectory(values: np.ndarray, weights: np.ndarray, step: float, price: floa
     return out
 
 
+def trajectory_margins(q: np.ndarray, weights: np.ndarray, step: float, frames: int, price: float) -> np.ndarray:
+    """[2, M, C], as of `margins`, of coefficients [M, C] of trajectories over so many frames, of sensitivities [M, C];
+    step, price: as in `trajectory`."""
+    bits = lambda q: np.where(q == 0, ZERO_BITS, NONZERO_BITS + 2 * np.log2(np.maximum(np.abs(q), 1)))  # noqa: E731
+    worth = np.maximum(weights * (step * step / frames / price), 1e-12)
+    return np.stack([np.clip((bits(q + d) - bits(q)) / (2 * worth), -0.4, 9) for d in (1, -1)]).astype(np.float32)
+
+
 def neighbours(positions: np.ndarray) -> np.ndarray:
     """[N, 4] the nearest in space among the 32 Gaussians before each, as contexts see them; itself where none is."""
     p = positions.astype(np.float32)
