@@ -129,7 +129,7 @@ def code_lengths(q: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 def worth(weights: np.ndarray, price: float) -> np.ndarray:
     """[N] bits that an error of one step is worth, squared."""
-    return (weights + FLOOR * weights.mean()) / price
+    return np.maximum(weights + FLOOR * weights.mean(), 1e-30) / price
 
 
 def _contexts(q: np.ndarray, near: np.ndarray) -> np.ndarray:

@@ -14,8 +14,9 @@ from gscodec import _native
 from gscodec.bitstream.color import correlate, decorrelate
 from gscodec.bitstream.transform import dct_basis
 from gscodec.camera import Camera
+from gscodec.encode import curves as curved
 from gscodec.encode import rdo
-from gscodec.encode.channels import margins_of, shifts_of
+from gscodec.encode.channels import curves_of, margins_of, shifts_of
 from gscodec.encode.refine import Moving, refine
 from gscodec.encode.stack import Stack
 from gscodec.gaussians import Gaussians
@@ -27,16 +28,21 @@ HIDDEN = -30.0  # logit of an opacity
 
 @dataclass(frozen=True)
 class _Canonical:
-    """Canonical integers [N, C] with steps [N, C]."""
+    """Canonical integers [N, C], of steps [N, C] along curves; `before`: [N, C] what is quantized, at the start."""
 
     moving: Moving
     step: np.ndarray
+    before: np.ndarray
+    curves: list[curved.Curve]
 
     def add(self, values: np.ndarray, t: int) -> None:
-        values += self.step * self.moving.change
+        now = self.before + self.step * self.moving.change
+        values += curved.back(now, self.curves) - curved.back(self.before, self.curves)
 
     def by_integers(self, derivative: np.ndarray, t: int) -> np.ndarray:
-        return self.step * derivative
+        if not self.curves:
+            return derivative * self.step
+        return derivative * self.step * curved.rises(self.before + self.step * self.moving.change, self.curves)
 
 
 @dataclass(frozen=True)
@@ -112,8 +118,13 @@ def _canonical(integers: dict, left: dict, weights: dict, price: float) -> list[
             c = integers["channels"][n]
             unit = np.repeat(1 << shifts[n], integers["layers"])[:, None]
             q, step = c["values"].T / unit, (unit * np.array(c["steps"])).astype(np.float32)
-            margins = margins_of(q, weights[n], step, layers, price)
-            parts.append(_Canonical(Moving(n, q + left[n].mean(0) / step, q, margins), step))
+            curves, before = curves_of(c), np.array(c["offsets"], np.float32) + step * q
+            values = curved.back(before, curves) + left[n].mean(0)
+            latents = q + (curved.along(values, curves) - before) / step
+            heard = curved.sensitivities(weights, {n: before}, {n: curves} if curves else {})[n]
+            parts.append(
+                _Canonical(Moving(n, latents, q, margins_of(q, heard, step, layers, price)), step, before, curves)
+            )
     return parts
 
 
