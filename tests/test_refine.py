@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from synthetic import blob, moved
 
 from gscodec import _native
@@ -33,8 +34,10 @@ def test_positions_and_order_stay():
     assert plain["shifts"] == refined["shifts"]
 
 
-def test_refined_groups_are_nearer():
+@pytest.mark.parametrize("curves_from", [1000, 10_000])
+def test_refined_groups_are_nearer(monkeypatch, curves_from):
     """An independent group and one predicted from it, in which colours change and some Gaussians are not shown."""
+    monkeypatch.setattr("gscodec.encode.curves.LEAST", curves_from)
     groups, still, life = [], blob(1500), np.tile(np.array([0, 5], np.int32), (1500, 1))
     life[:300, 1] = 3
     for start in (0, 5):
