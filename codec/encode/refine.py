@@ -70,13 +70,13 @@ def refine(
             derivative by its integers of that by its attribute ([N, C]).
         cameras: one a step, each for any one of `frames`.
     """
-    workspace, random = Workspace(), np.random.default_rng(0)
+    workspace, random, names = Workspace(), np.random.default_rng(0), {p.attribute for p in parts}
     for step, i in enumerate(random.permutation(len(cameras)), 1):
         t = int(random.integers(frames))
         target, _ = workspace.forward(arrays_of(source(t)), cameras[i], GREY)
         now, chain = shown(t)
         off = lambda image, target=target: np.ascontiguousarray(image - target)  # noqa: E731
-        derivative = derivatives(workspace, now, cameras[i], off)
+        derivative = derivatives(workspace, now, cameras[i], off, names)
         rate = RATE * (1 - (step - 1) / len(cameras))
         for part, by_integers in zip(parts, chain, strict=True):
             part.follow(by_integers(derivative[part.attribute]), rate, step)

@@ -8,7 +8,7 @@ subject; those by which `gscodec eval` judges are others.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -82,12 +82,17 @@ def arrays_of(g: Gaussians) -> tuple[np.ndarray, ...]:
 
 
 def derivatives(
-    workspace: Workspace, g: Gaussians, camera: Camera, by_picture: Callable[[np.ndarray], np.ndarray]
+    workspace: Workspace,
+    g: Gaussians,
+    camera: Camera,
+    by_picture: Callable[[np.ndarray], np.ndarray],
+    names: Iterable[str] = (*COARSEST, "turns"),
 ) -> dict[str, np.ndarray]:
-    """[N, C] derivatives by the channels that are coded, of quats by turns about the own axes; and by "turns".
+    """[N, C] derivatives by the channels that are coded, of quats by turns about the own axes; "turns": of the scene.
 
     Args:
         by_picture: the picture of `camera`, over mid-grey -> the derivative by its pixels, [H, W, 3] f32 both.
+        names: of the channels; those of shN are left out where there are none.
     """
     arrays = arrays_of(g)
     image, _ = workspace.forward(arrays, camera, GREY, training=True)
@@ -96,23 +101,19 @@ def derivatives(
     for a in grads + statistics:
         a.fill(0)
     call(workspace.native.backward, arrays, pixels, np.zeros(pixels.shape[:2], np.float32), (grads, statistics))
-    return _by_channels(g, dict(zip(PARAMETERS, grads, strict=True)))
+    grads = dict(zip(PARAMETERS, grads, strict=True))
+    return {n: _by_channels(g, grads, n) for n in names if n != "shN" or g.sh_degree}
 
 
-def _by_channels(g: Gaussians, grads: dict) -> dict[str, np.ndarray]:
-    w, x, y, z = g.quats.T
-    turns = np.stack([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])  # i q, j q, k q: [3, 4, N]
-    own = np.stack([[-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])  # q i, q j, q k
-    derivatives = {
-        "means": grads["means"],
-        "log_scales": grads["log_scales"],
-        "quats": np.einsum("kcn,nc->nk", own, grads["quats"]),
-        "turns": np.einsum("kcn,nc->nk", turns, grads["quats"]),
-        "logit_opacities": grads["logit_opacities"][:, None],
-        "sh0": grads["sh0"] @ TO_RGB.astype(np.float32),
-        "shN": (grads["shN"] @ TO_RGB.astype(np.float32)).reshape(len(g), -1),
-    }
-    return {n: d for n, d in derivatives.items() if d.shape[1]}
+def _by_channels(g: Gaussians, grads: dict, name: str) -> np.ndarray:
+    if name in ("quats", "turns"):
+        w, x, y, z = g.quats.T
+        scene = [[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]]  # i q, j q, k q: [3, 4, N]
+        own = [[-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]]  # q i, q j, q k
+        return np.einsum("kcn,nc->nk", np.stack(own if name == "quats" else scene), grads["quats"])
+    if name in ("sh0", "shN"):
+        return (grads[name] @ TO_RGB.astype(np.float32)).reshape(len(g), -1)
+    return grads[name].reshape(len(g), -1)
 
 
 def steps_for_error(
