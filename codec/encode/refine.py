@@ -68,11 +68,11 @@ def refine(
         source: frame -> Gaussians as they are to look.
         shown: frame -> the same as they look with the integers as they are now, and for each of `parts` what makes the
             derivative by its integers of that by its attribute ([N, C]).
-        cameras: one a step, each for any one of `frames`.
+        cameras: one a step. `frames` take turns, all of them before any one again.
     """
     workspace, random, names = Workspace(), np.random.default_rng(0), {p.attribute for p in parts}
-    for step, i in enumerate(random.permutation(len(cameras)), 1):
-        t = int(random.integers(frames))
+    rounds = np.concatenate([random.permutation(frames) for _ in range(0, len(cameras), frames)])
+    for step, (i, t) in enumerate(zip(random.permutation(len(cameras)), rounds, strict=False), 1):
         target, _ = workspace.forward(arrays_of(source(t)), cameras[i], GREY)
         now, chain = shown(t)
         off = lambda image, target=target: np.ascontiguousarray(image - target)  # noqa: E731
