@@ -14,11 +14,12 @@ import numpy as np
 from gscodec import _native
 from gscodec.camera import Camera
 from gscodec.encode.group import Coded, code_group
+from gscodec.encode.plan import FEW
 from gscodec.encode.predicted import predict_group
 from gscodec.errors import CaptureError
 from gscodec.gaussians import Group
 
-FEW, FRAME_VIEWS = 20_000, 10  # Gaussians up to which a group is refined if nobody says, and by how many views a frame
+FRAME_VIEWS = 10  # by which a group of few Gaussians is refined, if nobody says
 DOUBT = 0.7  # a predicted group of more than so many bytes a frame of its reference is coded both ways
 
 

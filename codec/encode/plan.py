@@ -16,11 +16,13 @@ from gscodec.encode import curves as curved
 from gscodec.encode import rdo
 from gscodec.encode.stack import Stack, canonical_appearance
 from gscodec.encode.turns import fit_levers, widths
-from gscodec.render.sensitivity import STILL_VIEWS, VIEWS, Importance, coarsest, measure, steps_for_error
+from gscodec.render.sensitivity import VIEWS, Importance, coarsest, measure, steps_for_error
 
 LEVEL_RANGE = (3, 97)  # percentiles of log sensitivity between which layers are even
 LEAST_LEVEL = 1e-4  # of the mean sensitivity
 STILL_LAYERS, STILL_LEAST = 4, 1000  # layers of a single frame of so many Gaussians
+FEW = 20_000  # Gaussians, for which there is time to look longer
+MORE_VIEWS = 48  # from which these, and a single frame, are measured
 SHIFT_MOST = 8  # doublings of a layer's step
 PRUNE = 0.3  # a Gaussian goes if the picture without it errs by less than this share of the error per coded Gaussian
 
@@ -93,7 +95,7 @@ def measure_stack(s: Stack, cameras: list[Camera] = ()) -> Importance:
         sizes = {"means": 3, "quats": 3} | {n: v.shape[2] for n, v in s.appearance.items()}
         return Importance({n: np.zeros((0, c)) for n, c in sizes.items()}, np.zeros((0, 3)), np.zeros(0))
     shown = [s.frame(t) for t in sorted({0, frames // 2, frames - 1})]
-    return measure(shown, cameras, VIEWS if frames > 1 else STILL_VIEWS)
+    return measure(shown, cameras, MORE_VIEWS if frames == 1 or count <= FEW else VIEWS)
 
 
 def layer_of(measured: Importance, layers: int) -> np.ndarray:

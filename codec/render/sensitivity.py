@@ -19,7 +19,7 @@ from gscodec.camera import Camera, cameras_around
 from gscodec.gaussians import Gaussians
 from gscodec.render.workspace import PARAMETERS, Workspace, call
 
-VIEWS, STILL_VIEWS, SIZE = 24, 48, 512  # STILL_VIEWS of a single frame
+VIEWS, SIZE = 24, 512
 GREY = (0.5, 0.5, 0.5)
 # Beyond these steps the derivative says too little; means are in radii of the subject.
 COARSEST = {"means": 0.02, "log_scales": 1.0, "quats": 0.25, "logit_opacities": 2.0, "sh0": 1.0, "shN": 1.0}
