@@ -6,11 +6,10 @@ from itertools import product
 
 import numpy as np
 
-from gscodec.bitstream.color import correlate
 from gscodec.camera import Camera
 from gscodec.encode import curves as curved
 from gscodec.encode import rdo
-from gscodec.encode.refine import Moving, refine
+from gscodec.encode.refine import Moving, refine, with_values
 from gscodec.gaussians import Gaussians
 
 SHIFTED = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
@@ -94,14 +93,8 @@ def refined_channels(
         coded = {p.attribute: offset[p.attribute] + step[p.attribute] * p.integers for p in parts}
         slopes = [step[n] * curved.rises(v, curves[n]) if curves[n] else step[n] for n, v in coded.items()]
         chain = [lambda d, s=s: d * s for s in slopes]
-        return _with_values(placed, {n: curved.back(v, curves[n]) for n, v in coded.items()}), chain
+        return with_values(placed, {n: curved.back(v, curves[n]) for n, v in coded.items()}), chain
 
     refine(parts, lambda _: source, shown, cameras)
     moved = {p.attribute: p.integers.astype(np.int32) for p in parts}
     return {n: c | {"values": (moved[n] << shifts[n][:, None]).T} for n, c in channels.items()}
-
-
-def _with_values(g: Gaussians, values: dict) -> Gaussians:
-    shN = correlate(values["shN"].reshape(g.shN.shape)) if "shN" in values else g.shN
-    opacities = values["logit_opacities"][:, 0]
-    return Gaussians(g.means, g.quats, values["log_scales"], opacities, correlate(values["sh0"]), shN)

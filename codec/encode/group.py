@@ -141,8 +141,8 @@ def code_group(
     plan = plan_group(s, quality, layers=layers, keep_all=keep_all, trained=trained, cameras=cameras)
     grid, nodes, plan, positions, quats = _placed(s, group.nodes if frames > 1 else None, plan)
     s = s.take(plan.source)
-    views = sensitivity_cameras(s.means[frames // 2], cameras, views) if views and len(positions) else []
-    channels, forms = _canonical(s, quats, grid.to_world(positions), positions, plan, views)
+    drawn = sensitivity_cameras(s.means[frames // 2], cameras, views) if views and len(positions) else []
+    channels, forms = _canonical(s, quats, grid.to_world(positions), positions, plan, drawn)
     s, rotations = replace(s, quats=in_form(s.quats, forms)), in_form(quats, forms).astype(np.float32)
     shifts = [plan.shifts[n] for n in SHIFTED if n in plan.shifts]
     out = {
@@ -160,8 +160,8 @@ def code_group(
         x = grid.to_world(positions)
         motion = nodes and carry(nodes, positions, x, frames)
         out |= motion_integers(s, channels, rotations, plan.even, plan.measured, plan.price, x, nodes, motion)
-        if views:
-            out = refine_group(out, s, plan.measured.weights, plan.price, views)
+        if drawn:
+            out = refine_group(out, s, plan.measured.weights, plan.price, drawn)
     turn, axes = in_form(turn[plan.source], forms), axes[plan.source]
     return Coded(out, plan.source, turn, axes, rotations, grid, plan.even, plan.node_step)
 

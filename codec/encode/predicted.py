@@ -117,8 +117,8 @@ def predict_group(
     x = grid.to_world(positions)
     out |= motion_integers(s, channels, rotations, steps, measured, price, x, nodes, motion)
     if views and len(positions):
-        views = sensitivity_cameras(s.means[middle], cameras, views)
-        out = refine_group(out, s, measured.weights, price, views, decoded)
+        drawn = sensitivity_cameras(s.means[middle], cameras, views)
+        out = refine_group(out, s, measured.weights, price, drawn, decoded)
     return out
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gscodec.bitstream.color import correlate
 from gscodec.camera import Camera
 from gscodec.gaussians import Gaussians
 from gscodec.render.sensitivity import GREY, arrays_of, derivatives
@@ -80,3 +81,13 @@ def refine(
         rate = RATE * (1 - (step - 1) / len(cameras))
         for part, by_integers in zip(parts, chain, strict=True):
             part.follow(by_integers(derivative[part.attribute]), rate, step)
+
+
+def with_values(g: Gaussians, values: dict[str, np.ndarray]) -> Gaussians:
+    """`g` with other values, attribute -> [N, C] as they are coded: colours decorrelated."""
+    means, shN = values.get("means", g.means), g.shN
+    if "shN" in values:
+        shN = correlate(values["shN"].reshape(shN.shape))
+    return Gaussians(
+        means, g.quats, values["log_scales"], values["logit_opacities"][:, 0], correlate(values["sh0"]), shN
+    )

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gscodec import _native
-from gscodec.bitstream.color import correlate, decorrelate
+from gscodec.bitstream.color import decorrelate
 from gscodec.bitstream.transform import dct_basis
 from gscodec.camera import Camera
 from gscodec.encode import curves as curved
 from gscodec.encode import rdo
 from gscodec.encode.channels import curves_of, margins_of, shifts_of
-from gscodec.encode.refine import Moving, refine
+from gscodec.encode.refine import Moving, refine, with_values
 from gscodec.encode.stack import Stack
 from gscodec.gaussians import Gaussians
 
@@ -89,23 +89,17 @@ def refine_group(integers: dict, s: Stack, weights: dict, price: float, cameras:
         now = {n: v.copy() for n, v in values[t].items()}
         for p in parts:
             p.add(now[p.moving.attribute], t)
-        return visible(_gaussians(before[t], now), t), [lambda d, p=p: p.by_integers(d, t) for p in parts]
+        return visible(with_values(before[t], now), t), [lambda d, p=p: p.by_integers(d, t) for p in parts]
 
     refine([p.moving for p in parts], lambda t: visible(s.frame(t), t), shown, cameras, frames)
     return _with_integers(integers, parts)
 
 
 def _values(g: Gaussians) -> dict[str, np.ndarray]:
-    """[N, C] of the attributes that move."""
+    """[N, C] of the attributes that move, as `with_values` takes them."""
     values = {"means": g.means, "log_scales": g.log_scales, "logit_opacities": g.logit_opacities[:, None]}
     values["sh0"] = decorrelate(g.sh0)
     return values | ({"shN": decorrelate(g.shN).reshape(len(g), -1)} if g.sh_degree else {})
-
-
-def _gaussians(g: Gaussians, v: dict[str, np.ndarray]) -> Gaussians:
-    """Inverse of `_values`, with the rotations of `g`."""
-    shN = correlate(v["shN"].reshape(g.shN.shape)) if g.sh_degree else g.shN
-    return Gaussians(v["means"], g.quats, v["log_scales"], v["logit_opacities"][:, 0], correlate(v["sh0"]), shN)
 
 
 def _canonical(integers: dict, left: dict, weights: dict, price: float) -> list[_Canonical]:
