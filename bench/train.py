@@ -1,8 +1,9 @@
 """Quality against time and size of training: our presets, and every frame trained alone.
 
 One entry of bench/results/train.json per (case, recipe, preset): case, recipe, preset, seconds_per_frame, psnr,
-psnr_fg, ssim, gaussians, kb_per_frame, flicker, all on the test cameras. What gscodec trains is measured twice: before
-coding ("model", no size) and decoded from the stream ("gscodec", with `still_gaussians` and `still_bits`: still.py).
+psnr_fg, ssim, gaussians, kb_per_frame, flicker, all on the test cameras; psnr_of_frame and flicker_of_frame (of the
+window that ends there) are for runs over other frames. What gscodec trains is measured twice: before coding ("model",
+no size) and decoded from the stream ("gscodec", with `still_gaussians` and `still_bits`: still.py).
 "alone" trains a keyframe for every frame it is asked for, with the keyframe budget of the preset: what tracking is to
 be compared with; "alone-coded" is the same from our stream, every frame a group. "v3" is V3's recipe at about the time
 that our preset medium takes (baselines/v3.py), "v3-coded" the same through its own packing (baselines/videogs.py).
@@ -106,6 +107,7 @@ def measure(case: str, recipe: str, preset: str, frames: str | None, data: Path,
             **{k: result[k] for k in KEYS},
             "kb_per_frame": size / 1000 / len(chosen) if size else None,
             "psnr_of_frame": [round(r["psnr_fg"], 2) for r in result["per_frame"]],
+            "flicker_of_frame": [r["flicker"] and round(r["flicker"], 3) for r in result["per_frame"]],
             **dict(*more),
         }
 

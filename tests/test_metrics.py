@@ -101,10 +101,9 @@ def test_flicker_within_a_mask_and_without_enough_frames():
     meter, mask = TemporalMeter(), np.zeros((32, 40), bool)
     mask[0, 0] = True
     for t in range(4):
-        meter.add(grey(100), grey(100 + t), mask)
+        assert meter.add(grey(100), grey(100 + t), mask) is None
     assert meter.flicker is None
-    meter.add(grey(100), grey(104), mask)
-    assert meter.flicker == pytest.approx(np.std(range(5)))
+    assert meter.add(grey(100), grey(104), mask) == meter.flicker == pytest.approx(np.std(range(5)))
 
 
 def test_stability_ignores_a_constant_error():

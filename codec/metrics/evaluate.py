@@ -108,7 +108,7 @@ def _compare(g: Gaussians, camera: Camera, view: View, temporal: TemporalMeter, 
 
     reference, image = composite(view, BACKGROUND), render_image(g, camera, background=BACKGROUND)
     inside = None if view.alpha is None else foreground(view.alpha)
-    temporal.add(reference, image, inside)
+    flicker = temporal.add(reference, image, inside)
     if vmaf:
         vmaf.add(reference, image, view.alpha)
     return {
@@ -116,6 +116,7 @@ def _compare(g: Gaussians, camera: Camera, view: View, temporal: TemporalMeter, 
         "psnr_fg": psnr(reference, image, inside),
         "ssim": ssim(reference, image),
         "haze": haze(reference, image, view.alpha),
+        "flicker": flicker,
     }
 
 

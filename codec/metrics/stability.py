@@ -26,8 +26,12 @@ class TemporalMeter:
         self._differences: list[float] = []
         self._deviation, self._samples = 0.0, 0
 
-    def add(self, reference: np.ndarray, image: np.ndarray, mask: np.ndarray | None = None) -> None:
-        """Adds a frame, [H, W, 3] u8; flicker is measured where `mask` ([H, W] bool) holds in the last frame."""
+    def add(self, reference: np.ndarray, image: np.ndarray, mask: np.ndarray | None = None) -> float | None:
+        """Adds a frame, [H, W, 3] u8; flicker is measured where `mask` ([H, W] bool) holds in the last frame.
+
+        Returns:
+            Flicker of the window that ends here, None as for `flicker`.
+        """
         if self._images:
             change = reference.astype(np.float32) - self._references[-1]
             seen = image.astype(np.float32) - self._images[-1]
@@ -35,7 +39,7 @@ class TemporalMeter:
         self._references.append(reference)
         self._images.append(image)
         if len(self._images) < WINDOW:
-            return
+            return None
         window = np.stack(self._references)
         still = window.max(0) - window.min(0) < STILL  # [H, W, 3]
         if mask is not None:
@@ -43,6 +47,7 @@ class TemporalMeter:
         deviation = np.stack(self._images).std(0, dtype=np.float32)[still]
         self._deviation += float(deviation.sum(dtype=np.float64))
         self._samples += deviation.size
+        return float(deviation.mean(dtype=np.float64)) if deviation.size else None
 
     @property
     def stability(self) -> float | None:
