@@ -17,10 +17,10 @@ from gscodec.camera import Camera
 from gscodec.encode import curves as curved
 from gscodec.encode import rdo
 from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
-from gscodec.encode.channels import SHIFTED, dequantize_channels, quantize_channels, refined_channels
+from gscodec.encode.channels import SHIFTED, dequantize_channels, quantize_channels
 from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes
 from gscodec.encode.plan import Plan, along_curves, plan_group
-from gscodec.encode.refine_group import refine_group
+from gscodec.encode.refine_group import refine_group, refine_still
 from gscodec.encode.stack import Stack, align_axes, canonical_appearance, stack_group
 from gscodec.encode.turns import code_turns, in_form
 from gscodec.gaussians import Group
@@ -188,23 +188,22 @@ def _canonical(
 
     x: [N, 3], `positions` in the world.
     """
-    counts = np.bincount(plan.layer, minlength=plan.layers)
-    ends = zip(counts, counts.cumsum(), strict=True)
-    parts = [(slice(b - n, b), rdo.neighbours(positions[b - n : b])) for n, b in ends]
+    layers = rdo.layers_of(positions, np.bincount(plan.layer, minlength=plan.layers).tolist())
     values = along_curves(canonical_appearance(s), plan.curves)
     weights = curved.sensitivities(plan.measured.weights, values, plan.curves)
     channels = {
-        n: quantize_channels(v, plan.steps[n], weights[n], parts, plan.shifts[n], plan.price) for n, v in values.items()
+        n: quantize_channels(v, plan.steps[n], weights[n], layers, plan.shifts[n], plan.price)
+        for n, v in values.items()
     }
     for n, own in plan.curves.items():
         channels[n]["curves"] = [c.row() for c in own]
     shifts = plan.own_shifts()
     if views and len(s.means) == 1:
         source, placed = s.frame(0), replace(s.frame(0), means=x)
-        channels = refined_channels(values, channels, shifts, weights, parts, plan.price, source, placed, views)
+        channels = refine_still(channels, shifts, values, weights, layers, plan.price, source, placed, views)
     turning = {"steps": plan.steps["quats"].tolist(), "offsets": [0.0] * 3, "levers": plan.levers.tolist()}
     sizes, heard = dequantize_channels(channels["log_scales"]), plan.measured.weights["quats"]
-    turning["values"], forms = code_turns(quats, sizes, positions, turning, parts, shifts["quats"], heard, plan.price)
+    turning["values"], forms = code_turns(quats, sizes, positions, turning, layers, shifts["quats"], heard, plan.price)
     return channels | {"quats": turning}, forms
 
 

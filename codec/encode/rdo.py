@@ -7,6 +7,8 @@ estimates: code lengths given the neighbours' prediction for keyframes, a fixed 
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from gscodec.bitstream.quantization import QUALITY_DEFAULT, error_for
@@ -67,6 +69,13 @@ def trajectory_margins(q: np.ndarray, weights: np.ndarray, step: float, frames: 
     bits = lambda q: np.where(q == 0, ZERO_BITS, NONZERO_BITS + 2 * np.log2(np.maximum(np.abs(q), 1)))  # noqa: E731
     worth = np.maximum(weights * (step * step / frames / price), 1e-12)
     return np.stack([np.clip((bits(q + d) - bits(q)) / (2 * worth), -0.4, 9) for d in (1, -1)]).astype(np.float32)
+
+
+def layers_of(positions: np.ndarray, counts: list[int]) -> list[tuple[slice, np.ndarray]]:
+    """Of each layer of so many Gaussians its span, and its `neighbours` ([n, 4], counted from its first)."""
+    ends = np.cumsum([0, *counts])
+    spans = [slice(a, b) for a, b in pairwise(ends)]
+    return [(own, neighbours(positions[own])) for own in spans]
 
 
 def neighbours(positions: np.ndarray) -> np.ndarray:

@@ -1,12 +1,14 @@
-"""Refinement of a group: once all is coded it is decoded, and what can still move makes up for the rest.
+"""Refinement of what is coded: integers that nothing else is decoded by make up for what the others have left.
 
-Canonical opacities and colours move, and coefficients of trajectories as far as those of each Gaussian go. Sizes stay,
-since rotations are decoded by them; so does what a reference tells.
+Of a single frame sizes, opacities and colours move, before its rotations are coded, which follow the sizes. Of a group
+that is coded whole canonical opacities and colours move, and the coefficients of trajectories as far as those of each
+Gaussian go; what a reference tells stays.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -16,7 +18,7 @@ from gscodec.bitstream.transform import dct_basis
 from gscodec.camera import Camera
 from gscodec.encode import curves as curved
 from gscodec.encode import rdo
-from gscodec.encode.channels import curves_of, margins_of, shifts_of
+from gscodec.encode.channels import coded_values, curves_of, shifts_of
 from gscodec.encode.refine import Moving, refine, with_values
 from gscodec.encode.stack import Stack
 from gscodec.gaussians import Gaussians
@@ -26,29 +28,52 @@ OVER_TIME = ("means", "log_scales", *CANONICAL)
 HIDDEN = -30.0  # logit of an opacity
 
 
-@dataclass(frozen=True)
 class _Canonical:
-    """Canonical integers [N, C], of steps [N, C] along curves; `before`: [N, C] what is quantized, at the start."""
+    """Canonical integers of an attribute.
 
-    moving: Moving
-    step: np.ndarray
-    before: np.ndarray
-    curves: list[curved.Curve]
+    Args:
+        channels: of `quantize_channels`. shifts: [N] low bits that each Gaussian's layer leaves out.
+        coded: [N, C] what they were quantized from. weights: [N, C] its sensitivities.
+        layers: of `rdo.layers_of`.
+    """
+
+    def __init__(self, name: str, channels: dict, shifts: np.ndarray, coded, weights, layers: list, price: float):
+        self._channels, self._curves, self._unit = channels, curves_of(channels), 1 << shifts[:, None]
+        self._offset = np.array(channels["offsets"], np.float32)
+        self._step = (self._unit * np.array(channels["steps"])).astype(np.float32)
+        q = channels["values"].T / self._unit
+        margins, weights = np.zeros((2, *q.shape), np.float32), weights * self._step**2
+        for (own, near), c in product(layers, range(q.shape[1])):
+            margins[:, own, c] = rdo.margins(q[own, c], weights[own, c], near, price)
+        self.moving = Moving(name, (coded - self._offset) / self._step, q, margins)
+        self._before = self.values()
+
+    def _coded(self) -> np.ndarray:
+        return self._offset + self._step * self.moving.integers
+
+    def values(self) -> np.ndarray:
+        """[N, C], as they are now."""
+        return curved.back(self._coded(), self._curves)
 
     def add(self, values: np.ndarray, t: int) -> None:
-        now = self.before + self.step * self.moving.change
-        values += curved.back(now, self.curves) - curved.back(self.before, self.curves)
+        """To `values` [N, C] of the decoded frame `t`, what has changed."""
+        values += self.values() - self._before
 
     def by_integers(self, derivative: np.ndarray, t: int) -> np.ndarray:
-        if not self.curves:
-            return derivative * self.step
-        return derivative * self.step * curved.rises(self.before + self.step * self.moving.change, self.curves)
+        """The derivative by them, from that by the values."""
+        return derivative * (self._step * curved.rises(self._coded(), self._curves) if self._curves else self._step)
+
+    def put(self, integers: dict) -> None:
+        """Puts them into those of the group."""
+        q = (self.moving.integers * self._unit).astype(np.int32)
+        moved = {self.moving.attribute: self._channels | {"values": np.ascontiguousarray(q.T)}}
+        integers["channels"] = integers["channels"] | moved
 
 
 @dataclass(frozen=True)
 class _Trajectory:
     """Coefficients [M, C]: of `frequency` [M] of the Gaussian `own` [M], sorted by it, along `basis` [K, T] times the
-    step. Those of each Gaussian begin at `starts`."""
+    step. Those of each Gaussian begin at `starts`. Methods as in `_Canonical`."""
 
     moving: Moving
     basis: np.ndarray
@@ -62,6 +87,40 @@ class _Trajectory:
 
     def by_integers(self, derivative: np.ndarray, t: int) -> np.ndarray:
         return self.basis[self.frequency, t, None] * derivative[self.own]
+
+    def put(self, integers: dict) -> None:
+        coded = integers["trajectories"][self.moving.attribute]
+        coefficients = coded["coefficients"].copy()
+        coefficients[self.frequency, :, self.own] += self.moving.change
+        moved = {self.moving.attribute: coded | {"coefficients": coefficients}}
+        integers["trajectories"] = integers["trajectories"] | moved
+
+
+def refine_still(
+    channels: dict,
+    shifts: dict,
+    values: dict,
+    weights: dict,
+    layers: list,
+    price: float,
+    source: Gaussians,
+    placed: Gaussians,
+    cameras: list[Camera],
+) -> dict:
+    """`channels` of a single frame, refined.
+
+    Args:
+        shifts: attribute -> [N]. values, weights: attribute -> [N, C], what is coded. layers, price: as it was.
+        source: as it is to look. placed: the same at decoded positions. cameras: of `refine`.
+    """
+    parts = [_Canonical(n, c, shifts[n], values[n], weights[n], layers, price) for n, c in channels.items()]
+
+    def shown(t):
+        now = with_values(placed, {p.moving.attribute: p.values() for p in parts})
+        return now, [lambda d, p=p: p.by_integers(d, t) for p in parts]
+
+    refine([p.moving for p in parts], lambda _: source, shown, cameras)
+    return _with_integers({"channels": channels}, parts)["channels"]
 
 
 def refine_group(integers: dict, s: Stack, weights: dict, price: float, cameras: list[Camera], reference=None) -> dict:
@@ -103,22 +162,16 @@ def _values(g: Gaussians) -> dict[str, np.ndarray]:
 
 
 def _canonical(integers: dict, left: dict, weights: dict, price: float) -> list[_Canonical]:
-    ends = np.cumsum(integers["layers"])
-    spans = [slice(a, b) for a, b in zip([0, *ends], ends, strict=False)]
-    layers = [(own, rdo.neighbours(integers["positions"][own])) for own in spans]
-    shifts, parts = shifts_of(integers), []
+    """`left`: attribute -> [T, N, C], what is missing in each frame."""
+    layers, shifts, parts = rdo.layers_of(integers["positions"], integers["layers"]), shifts_of(integers), []
     for n in CANONICAL:
         if n in integers["channels"]:
             c = integers["channels"][n]
-            unit = np.repeat(1 << shifts[n], integers["layers"])[:, None]
-            q, step = c["values"].T / unit, (unit * np.array(c["steps"])).astype(np.float32)
-            curves, before = curves_of(c), np.array(c["offsets"], np.float32) + step * q
-            values = curved.back(before, curves) + left[n].mean(0)
-            latents = q + (curved.along(values, curves) - before) / step
+            curves, before = curves_of(c), coded_values(c)
+            coded = curved.along(curved.back(before, curves) + left[n].mean(0), curves)
             heard = curved.sensitivities(weights, {n: before}, {n: curves} if curves else {})[n]
-            parts.append(
-                _Canonical(Moving(n, latents, q, margins_of(q, heard, step, layers, price)), step, before, curves)
-            )
+            own = np.repeat(shifts[n], integers["layers"])
+            parts.append(_Canonical(n, c, own, coded, heard, layers, price))
     return parts
 
 
@@ -139,16 +192,8 @@ def _trajectories(integers: dict, left: dict, weights: dict, price: float) -> li
     return parts
 
 
-def _with_integers(integers: dict, parts: list) -> dict:
-    channels, trajectories = dict(integers["channels"]), dict(integers["trajectories"])
+def _with_integers(integers: dict, parts: list[_Canonical | _Trajectory]) -> dict:
+    integers = dict(integers)
     for p in parts:
-        n, moved = p.moving.attribute, p.moving.change
-        if isinstance(p, _Canonical):
-            c = channels[n]
-            unit = np.rint(p.step[:, :1] / np.float32(c["steps"][0])).astype(np.int32)
-            channels[n] = c | {"values": np.ascontiguousarray(c["values"] + (moved * unit).T, dtype=np.int32)}
-        else:
-            coefficients = trajectories[n]["coefficients"].copy()
-            coefficients[p.frequency, :, p.own] += moved
-            trajectories[n] = trajectories[n] | {"coefficients": coefficients}
-    return integers | {"channels": channels, "trajectories": trajectories}
+        p.put(integers)
+    return integers
