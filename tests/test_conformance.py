@@ -20,7 +20,6 @@ SPEC = Path(__file__).resolve().parents[1] / "spec"
 VECTORS = SPEC / "vectors"
 sys.path[:0] = [str(SPEC), str(VECTORS)]
 import make  # noqa: E402
-import parts  # noqa: E402
 import reference_decoder as reference  # noqa: E402
 
 MANIFEST = json.loads((VECTORS / "manifest.json").read_text())
@@ -108,7 +107,7 @@ def test_invalid(name):
 
 
 def test_reference_stops_at_the_cap_of_symbols(monkeypatch):
-    payload = parts.encode(make.make_group(250, 20, **make.MOTION))
+    payload = make.encode(make.make_group(250, 20, **make.MOTION))
     symbols = 13 * 250 + 4 * 250 + (3 + 6 * 6) * 12
     monkeypatch.setitem(reference.LEVELS, 1, (65536, 64, 1024, symbols + 10, 2**24))
     with pytest.raises(reference.LimitError, match="symbols"):

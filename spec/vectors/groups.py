@@ -1,0 +1,197 @@
+"""Synthetic groups in integers, for the conformance vectors; the package's encoder makes payloads of them."""
+
+import numpy as np
+
+from gscodec import _native
+
+CHANNELS = {"log_scales": 3, "quats": 3, "logit_opacities": 1, "sh0": 3}
+
+
+def morton(positions, bits):
+    code = [0] * len(positions)
+    for i, point in enumerate(positions.tolist()):
+        for axis, value in enumerate(point):
+            code[i] |= sum((value >> j & 1) << (3 * j + 2 - axis) for j in range(bits))
+    return code
+
+
+def sample_positions(rng, count, bits):
+    """[N, 3] u32 in Morton order: a surface and a few points away from it."""
+    uv = rng.random((count, 2))
+    z = (
+        0.5
+        + 0.3 * np.sin(5 * uv[:, 0]) * np.cos(4 * uv[:, 1])
+        + 0.1 * rng.standard_normal(count) * (rng.random(count) < 0.1)
+    )
+    points = np.column_stack([uv, z.clip(0, 1)]) * (2**bits - 1)
+    positions = points.round().astype(np.uint32).reshape(count, 3)
+    code = morton(positions, bits)
+    return positions[sorted(range(count), key=code.__getitem__)]
+
+
+def make_group(
+    count, frames, *, seed=1, bits=10, sh_degree=0, nodes=0, neighbors=4, trajectories=None, lifetimes=False, spread=12
+):
+    """A group dict for encode_group: smooth in space with noise, small motions. `trajectories`: attribute -> K."""
+    rng = np.random.default_rng(seed)
+    positions = sample_positions(rng, count, bits)
+    names = dict(CHANNELS) | ({"shN": 3 * ((sh_degree + 1) ** 2 - 1)} if sh_degree else {})
+    smooth = np.sin(positions @ rng.random((3, 1)) * 8 / 2**bits).T
+    channels = {}
+    for name, c in names.items():
+        values = (
+            (spread * (smooth * rng.random((c, 1)) + 0.3 * rng.standard_normal((c, count)))).round().astype(np.int32)
+        )
+        channels[name] = {
+            "values": values,
+            "steps": [0.01 + 0.002 * i for i in range(c)],
+            "offsets": [0.1 * i - 0.2 for i in range(c)],
+        }
+    channels["quats"]["levers"] = [[-12, 40, 3], [127, -128, 0], [25, -9, 1]]
+    group = {
+        "frames": frames,
+        "origin": [-1.0, 0.5, 2.0],
+        "grid_step": 2.0 ** (1 - bits),
+        "grid_bits": bits,
+        "positions": positions,
+        "channels": channels,
+        "lifetimes": None,
+        "nodes": None,
+        "trajectories": {},
+    }
+    if nodes:
+        k = min(6, frames)
+        decay = 20 / (1 + np.arange(k)).reshape(k, 1, 1)
+        motion = (decay * rng.standard_normal((k, 6, nodes))).round().astype(np.int32)
+        group["nodes"] = {"positions": sample_positions(rng, nodes, bits), "coefficients": motion}
+        group["nodes"] |= {"rotation_step": 0.01, "translation_step": 0.005, "neighbors": neighbors}
+    for name, k in (trajectories or {}).items():
+        c = 3 if name == "means" else names[name]
+        values = (5 * rng.standard_normal((k, c, count))).round().astype(np.int32)
+        length = rng.integers(0, k + 1, count) * (rng.random(count) < 0.3)
+        values[np.broadcast_to(np.arange(k)[:, None, None] >= length, values.shape)] = 0
+        group["trajectories"][name] = {"coefficients": values, "step": 0.003}
+    if lifetimes:
+        cut = rng.random(count) < 0.4
+        start = rng.integers(0, frames, count)
+        end = start + 1 + (rng.random(count) * (frames - start)).astype(int)
+        group["lifetimes"] = np.column_stack([np.where(cut, start, 0), np.where(cut, end, frames)]).astype(np.uint16)
+    return group
+
+
+def extremes():
+    """Values at +-2^24, corners of the finest grid, steps from tiny to large."""
+    group = make_group(40, 3, bits=21, nodes=9, trajectories={"means": 3, "log_scales": 2})
+    top = 2**21 - 1
+    group["positions"][0], group["positions"][-1] = 0, top
+    for i, name in enumerate(group["channels"]):
+        channel = group["channels"][name]
+        channel["values"][:, 1::7], channel["values"][:, 3::5] = 2**24, -(2**24)
+        channel["steps"] = [2.0 ** -(30 + i)] * len(channel["steps"])
+    group["channels"]["logit_opacities"]["steps"] = [1e30]
+    group["trajectories"]["means"]["coefficients"][2, :, 4] = [2**24, -(2**24), 2**24]
+    group["trajectories"]["means"]["step"] = 1e-30
+    group["nodes"]["coefficients"][0, :, 2] = [2**24, -(2**24), 2**24] * 2
+    group["nodes"] |= {"rotation_step": 1e-8, "translation_step": 1e-7}
+    return group
+
+
+def duplicates():
+    """Many Gaussians on few grid points, more than 255 on one."""
+    group = make_group(700, 4, bits=3, nodes=20, neighbors=8)
+    group["positions"][:300] = group["positions"][0]
+    return group
+
+
+def two_trees():
+    """The least number of Gaussians whose positions are two trees; all else is 0."""
+    group = make_group(2**14, 1, bits=4)
+    for channel in group["channels"].values():
+        channel["values"][:] = 0
+    return group
+
+
+def tied_nodes():
+    """Nodes at equal distances and on top of each other: the order of clause 13.2 decides."""
+    group = make_group(60, 5, bits=2, nodes=30, neighbors=3)
+    group["nodes"]["positions"] = np.repeat(group["nodes"]["positions"][::2], 2, axis=0)
+    return group
+
+
+GAUSSIAN_AXIS = {"positions": 0, "lifetimes": 0, "parents": 0}
+
+
+def take(group, index):
+    """The Gaussians of a group dict at `index`, in that order."""
+    result = dict(group)
+    for name in GAUSSIAN_AXIS:
+        if group.get(name) is not None:
+            result[name] = group[name][index]
+    for kind, key in (("channels", "values"), ("trajectories", "coefficients")):
+        result[kind] = {n: c | {key: np.ascontiguousarray(c[key][..., index])} for n, c in group[kind].items()}
+    return result
+
+
+def layered(group, shares, corrections=None):
+    """A group dict in layers: layer k has every Gaussian whose index modulo len(shares) is one of shares[k]."""
+    n = len(group["positions"])
+    period = sum(len(share) for share in shares)
+    parts = [[i for i in range(n) if i % period in share] for share in shares]
+    result = take(group, np.array([i for part in parts for i in part], int))
+    result["layers"] = [len(part) for part in parts]
+    return result | ({"corrections": corrections} if corrections else {})
+
+
+def coarser(group, shifts):
+    """A layered group dict whose layer k leaves out shifts[k] low bits of positions and of each attribute."""
+    layer = np.repeat(np.arange(len(group["layers"])), group["layers"])
+    shifts = np.array(shifts)
+    cut = lambda v, s: (v >> s << s).astype(v.dtype)  # noqa: E731
+    channels = {
+        name: c | {"values": cut(c["values"], shifts[layer, i])}
+        for i, (name, c) in enumerate(group["channels"].items(), 1)
+    }
+    positions = cut(group["positions"], shifts[layer, :1].astype(np.uint32))
+    return group | {"positions": positions, "channels": channels, "shifts": shifts.tolist()}
+
+
+def curved(group):
+    """A group dict whose channels of log_scales and logit_opacities have curves: gentle, steep, flat, around 0."""
+    rows = [[-0.3, 0.02, *range(0, 40, 5)], [0.0, 1e-3, *range(255, 15, -32)], [-1.0, 0.5, *[0] * 8]]
+    curves = {"log_scales": rows, "logit_opacities": [[-0.4, 0.125, 48, 16, 0, 0, 3, 0, 16, 64]]}
+    channels = {name: c | {"curves": curves.get(name)} for name, c in group["channels"].items()}
+    return group | {"channels": channels}
+
+
+def predicted(reference, group, *, back=1, deaths=lambda i: i % 5 == 0, births=9):
+    """A predicted group dict: of `reference` those that do not die, and in each layer `births` Gaussians of `group`.
+
+    Nodes, trajectories and lifetimes are those of `group`, which must have enough Gaussians.
+    """
+    parents, kept, first = [], [], 0
+    layers = reference.get("layers") or [len(reference["positions"])]
+    for k, count in enumerate(layers):
+        alive = [i for i in range(first, first + count) if not deaths(i)]
+        kept.append((alive, list(range(k * births, (k + 1) * births))))
+        parents += alive + [-1] * births
+        first += count
+
+    def join(a, b, axis):
+        return np.concatenate([part for i, j in kept for part in (a.take(i, axis), b.take(j, axis))], axis)
+
+    result = dict(reference) | {"reference": back, "parents": np.array(parents, np.int32), "corrections": None}
+    result["frames"] = group["frames"]
+    result["layers"] = [len(alive) + births for alive, _ in kept]
+    result["positions"] = join(reference["positions"], group["positions"], 0)
+    result["channels"] = {
+        n: c | {"values": join(c["values"], group["channels"][n]["values"], 1)}
+        for n, c in reference["channels"].items()
+    }
+    own = take(group, np.arange(len(parents)))
+    return result | {name: own[name] for name in ("trajectories", "nodes", "lifetimes")}
+
+
+def encode(group, reference=None):
+    """The payload of a group dict; `reference`: the payload of the group that a predicted one refers to."""
+    known = reference and _native.DecodedGroup(reference, 4)
+    return _native.encode_group(group, known)[0]
