@@ -123,7 +123,7 @@ def test_wrong_paths_and_values(folder, tmp_path):
     fails(run("render", gsv, tmp_path / "o", "--camera", "cam99"), "cam99", "orbit")
     fails(run("render", gsv, tmp_path / "o", "--size", "huge"), "WxH")
     fails(run("render", gsv, tmp_path / "o.avi"), ".mp4")
-    fails(run("eval", gsv, folder), "")
+    fails(run("eval", gsv, folder), "neither a capture nor splats", "looked for")
     fails(run("encode"), "SEQ", code=2)
     assert not list(tmp_path.iterdir()), "nothing is left behind"
 

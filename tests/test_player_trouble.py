@@ -92,9 +92,10 @@ def test_layers_are_left_out_where_the_link_is_slow(browser, server, other, tmp_
     browser.wait(f"{PLAYER}.paused")
     assert browser.eval(f"{PLAYER}.frame") == GROUPS * LENGTH - 1
     asked = [tuple(map(int, value[6:].split("-"))) for value in handler.log]
+    asked = set().union(*(range(a, b + 1) for a, b in asked))  # some are asked for twice: the first request is a guess
+    assert len(asked) < 0.8 * path.stat().st_size
     group = open_stream(path).groups[-1]
-    last = group["offset"] + group["size"] - 1
-    assert not any(a <= last <= b for a, b in asked), "the last layer of the last group was left where it is"
+    assert group["offset"] + group["size"] - 1 not in asked, "the last layer of the last group was left where it is"
 
 
 def test_a_manifest_of_nothing(browser, server, other):
