@@ -169,7 +169,7 @@ def coded(capture: Capture, groups: list[Group], settings) -> tuple[int, list[Ga
     with tempfile.TemporaryDirectory() as folder:
         out, start = Path(folder) / "out.gsv", time.perf_counter()
         quality = EncodeSettings(settings.quality)
-        encode_groups(lambda *_: iter(groups), out, config, quality, fingerprint={}, cameras=cameras)
+        encode_groups(lambda *_: iter(groups), out, config, quality, fingerprint={}, cameras=cameras, capture=capture)
         seconds, stream = time.perf_counter() - start, open_stream(out)
         return out.stat().st_size, [stream.frame(t) for t in range(stream.frame_count)], seconds
 

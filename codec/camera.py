@@ -49,6 +49,19 @@ class Camera:
         return replace(self, K=K, width=int(width), height=int(height))
 
 
+@dataclass(frozen=True)
+class Calibration:
+    """What a trainer has found of the cameras of a capture.
+
+    Attributes:
+        cameras: each of them where it really stands.
+        gains: [C, 3] f32, by which what they show is brighter than the scene.
+    """
+
+    cameras: list[Camera]
+    gains: np.ndarray
+
+
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     """[4, 4] f64 world-to-camera matrix, OpenCV axes, of a camera at `eye` that looks at `target`, `up` upwards."""
     eye, target, up = (np.asarray(v, np.float64) for v in (eye, target, up))

@@ -159,6 +159,7 @@ def _encode_capture(source, out, settings, preset, frames, gop, cluster, bar) ->
         config,
         settings,
         cameras=capture.cameras,
+        capture=capture,
         fingerprint={"input": str(source.resolve()), "frames": frames, **asdict(recipe), **asdict(settings)},
     )
     if not report.interrupted:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from gscodec.camera import Calibration
 from gscodec.errors import CaptureError
 
 SH_C0 = 0.28209479177387814  # Y_00; colour = 0.5 + SH_C0 * sh0 (3D Gaussian Splatting, Kerbl et al. 2023)
@@ -120,12 +121,14 @@ class Group:
         parents: [N] int32, index in the group before of the Gaussian that each one continues, -1 for a new one; no two
             have the same parent. None: nothing is known, as in the first group. This is all that the encoder needs
             to predict a group: a trainer that starts from the last group's Gaussians says so here.
+        calibration: of the capture that it was trained on, as the trainer has found it; None: as the capture tells.
     """
 
     frames: Sequence[Gaussians]
     lifetimes: np.ndarray | None = None
     nodes: Nodes | None = None
     parents: np.ndarray | None = None
+    calibration: Calibration | None = None
 
     def __len__(self) -> int:
         return len(self.frames)

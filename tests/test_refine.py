@@ -7,10 +7,15 @@ import pytest
 from synthetic import blob, moved
 
 from gscodec import _native
+from gscodec.camera import Calibration
+from gscodec.capture import Capture, View
 from gscodec.encode.coder import GroupCoder
 from gscodec.encode.group import group_integers
 from gscodec.gaussians import Gaussians, GaussianSequence, Group
+from gscodec.metrics.codec_cameras import codec_cameras
 from gscodec.metrics.evaluate import evaluate_splats
+from gscodec.render.sensitivity import arrays_of
+from gscodec.render.workspace import Workspace
 
 
 def test_a_refined_frame_is_nearer(monkeypatch):
@@ -47,7 +52,7 @@ def test_refined_groups_are_nearer(monkeypatch, curves_from):
     found = []
     for views in (0, 40):
         coder = GroupCoder(keep_all=True, layers=2, random_access=60, refine=views)
-        first, second = (coder.code(g, 40) for g in groups)
+        first, second = (coder.code(g, 40, 5 * i) for i, g in enumerate(groups))
         assert not second.independent
         reference = _native.DecodedGroup(first.payload, 1)
         decoded = [reference, _native.DecodedGroup(second.payload, 1, reference=reference)]
@@ -58,3 +63,38 @@ def test_refined_groups_are_nearer(monkeypatch, curves_from):
     (plain, before), (refined, after) = found
     assert all(b > a + 0.05 for a, b in zip(before, after, strict=True))
     assert all(b < 1.03 * a for a, b in zip(plain, refined, strict=True))
+
+
+def pictures_of(truth, cameras, gains):
+    """A capture of `truth`, frame by frame, by cameras that show it brighter by `gains`."""
+
+    def read(i, t):
+        image, alpha = Workspace().forward(arrays_of(truth[t]), cameras[i], (0, 0, 0))
+        rgb = gains[i] * image / np.maximum(alpha, 1e-3)[..., None]
+        return View(*(np.rint(255 * x.clip(0, 1)).astype(np.uint8) for x in (rgb, alpha)))
+
+    return Capture("synthetic", 30.0, cameras, len(truth), True, read)
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+def test_a_trained_group_comes_nearer_to_its_pictures(frames):
+    """What training has left wrong, too, here the colours; each picture in the brightness of its camera."""
+    truth = [moved(blob(600), [0, 0.05 * t, 0], [0, 0, 0]) for t in range(frames)]
+    cameras = [
+        replace(c, K=c.K / 8 + np.diag([0, 0, 7 / 8]), width=64, height=64, split="train") for c in codec_cameras(truth)
+    ]
+    gains = np.geomspace(0.7, 1 / 0.7, len(cameras), dtype=np.float32)[:, None].repeat(3, 1)
+    wrong = np.random.default_rng(1).normal(0, 0.15, truth[0].sh0.shape).astype(np.float32)
+    model = [replace(g, sh0=g.sh0 + wrong) for g in truth]
+    capture, calibration = pictures_of(truth, cameras, gains), Calibration(cameras, gains)
+    found = []
+    for told in (None, calibration):
+        coder = GroupCoder(keep_all=True, layers=1, random_access=60, refine=80, capture=capture)
+        coded = coder.code(Group(model, calibration=told), 50, 0)
+        decoded = _native.DecodedGroup(coded.payload, 1)
+        shown = lambda t, d=decoded: Gaussians(**d.frame(t))  # noqa: E731
+        near = evaluate_splats(shown, GaussianSequence(30.0, [Group(truth)]))["codec_psnr"]
+        found.append((len(coded.payload), near))
+    (plain, before), (refined, after) = found
+    assert after > before + 0.5
+    assert refined < 1.1 * plain

@@ -80,6 +80,20 @@ class Capture:
         return replace(self, cameras=[c.resized(w, h) for c, (w, h) in zip(self.cameras, size, strict=True)])
 
 
+def cropped(view: View, camera: Camera, margin: int) -> tuple[View, Camera]:
+    """The part of a view that has the subject in it, and `margin` pixels around; all of it where nothing tells them
+    apart."""
+    if view.alpha is None or not view.alpha.any():
+        return View(np.ascontiguousarray(view.rgb), view.alpha), camera
+    (height, width), alpha = view.alpha.shape, view.alpha
+    rows, cols = np.flatnonzero(alpha.any(1)), np.flatnonzero(alpha.any(0))
+    top, bottom = max(rows[0] - margin, 0), min(rows[-1] + 1 + margin, height)
+    left, right = max(cols[0] - margin, 0), min(cols[-1] + 1 + margin, width)
+    part = (slice(top, bottom), slice(left, right))
+    part_of = View(np.ascontiguousarray(view.rgb[part]), np.ascontiguousarray(alpha[part]))
+    return part_of, camera.cropped(left, top, right - left, bottom - top)
+
+
 def blend(view: View, background: Sequence[float]) -> np.ndarray:
     """[H, W, 3] f32, 0 to 255: the view over `background` (r, g, b in 0..1), in sRGB as splat renderers do."""
     if view.alpha is None:

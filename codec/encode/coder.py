@@ -13,13 +13,16 @@ import numpy as np
 
 from gscodec import _native
 from gscodec.camera import Camera
+from gscodec.capture import Capture
 from gscodec.encode.group import Coded, code_group
 from gscodec.encode.plan import FEW
 from gscodec.encode.predicted import predict_group
+from gscodec.encode.targets import PictureTargets
 from gscodec.errors import CaptureError
 from gscodec.gaussians import Group
 
 FRAME_VIEWS = 10  # by which a group of few Gaussians is refined, if nobody says
+FRAME_PICTURES = 40  # the same where there are pictures: training took longer, so it pays for more Gaussians, too
 DOUBT = 0.7  # a predicted group of more than so many bytes a frame of its reference is coded both ways
 
 
@@ -56,7 +59,8 @@ class GroupCoder:
     """Codes groups in their order. A shallow copy is a coder of its own, for trying.
 
     Args:
-        keep_all, layers, cameras: as in `code_group`. refine: as in `EncodeSettings`.
+        keep_all, layers: as in `code_group`. refine: as in `EncodeSettings`.
+        cameras: of the capture, if there was one. capture: whose pictures groups are refined by, if they can be had.
         random_access: frames from one independent group to the next at most; 0 or 1: every group is independent.
     """
 
@@ -68,40 +72,51 @@ class GroupCoder:
         random_access: int,
         refine: int | None = None,
         cameras: list[Camera] = (),
+        capture: Capture | None = None,
     ):
         self._options = {"keep_all": keep_all, "cameras": cameras}
-        self._layers, self._refine = layers, refine
+        self._layers, self._refine, self._capture = layers, refine, capture
         self._random_access, self._reference = random_access, None
 
-    def code(self, group: Group, quality: float) -> CodedGroup:
-        """Raises CaptureError: its parents do not fit the group before."""
-        parents, r = self._parents(group), self._reference
+    def code(self, group: Group, quality: float, first_frame: int) -> CodedGroup:
+        """The next group, which begins at `first_frame` of the stream.
+
+        Raises:
+            CaptureError: its parents do not fit the group before, or a picture cannot be read.
+        """
+        parents, r, refining = self._parents(group), self._reference, self._refining(group, first_frame)
         if parents is None or r.frames + len(group) > self._random_access:
-            return self._independent(group, quality)
-        options = self._options | {"views": self._views(group), "decoded": r.payload.decoded}
+            return self._independent(group, quality, refining)
+        options = self._options | refining | {"decoded": r.payload.decoded}
         integers = predict_group(group, parents, r.back, r.coded, quality=quality, **options)
         payload, units = _native.encode_group(integers, r.payload.decoded)
         if len(payload) > DOUBT * len(r.payload.data):
-            other = self._independent(group, quality)
+            other = self._independent(group, quality, refining)
             if len(other.payload) <= len(payload):
                 return other
         self._reference = replace(r, frames=r.frames + len(group), back=r.back + 1, index=parents)
         return CodedGroup(payload, units, len(integers["positions"]), False)
 
-    def _independent(self, group: Group, quality: float) -> CodedGroup:
-        coded = code_group(group, quality, layers=self._layers, views=self._views(group), **self._options)
+    def _independent(self, group: Group, quality: float, refining: dict) -> CodedGroup:
+        coded = code_group(group, quality, layers=self._layers, **self._options, **refining)
         payload, units = _native.encode_group(coded.integers)
         if self._random_access > len(group):
             index = np.arange(len(group.frames[0]))
             self._reference = _Reference(coded, _Payload(payload), len(group), 1, index)
         return CodedGroup(payload, units, len(coded.source), True)
 
-    def _views(self, group: Group) -> int:
-        """By how many a group is refined."""
-        if self._refine is not None:
-            return self._refine
-        few = len(group) > 1 and len(group.frames[0]) <= FEW
-        return FRAME_VIEWS * len(group) if few else 0
+    def _refining(self, group: Group, first_frame: int) -> dict:
+        """By what a group is refined: `views` and `pictures` of `code_group`."""
+        pictured = self._capture is not None and group.calibration is not None
+        views = self._refine
+        if views is None and pictured:
+            views = FRAME_PICTURES * len(group)
+        elif views is None:
+            few = len(group) > 1 and len(group.frames[0]) <= FEW
+            views = FRAME_VIEWS * len(group) if few else 0
+        if not pictured:
+            return {"views": views}
+        return {"views": views, "pictures": PictureTargets(self._capture, group.calibration, first_frame, views)}
 
     def state(self) -> dict[str, np.ndarray]:
         """What the next group may be predicted from; empty if from nothing."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from gscodec.bitstream.levels import smallest_level
 from gscodec.camera import Camera
+from gscodec.capture import Capture
 from gscodec.encode.coder import CodedGroup, GroupCoder
 from gscodec.encode.rate import RateControl
 from gscodec.encode.writer import StreamWriter
@@ -37,7 +38,8 @@ class EncodeSettings:
             where their parents are known and it is cheaper. 0 or 1: every group is independent.
         layers: layers of importance in each group, each with its own steps; any first few decode alone. None: what is
             smallest.
-        refine: views by which each group is refined; 0: none is. None: by a few a frame, groups of few Gaussians.
+        refine: views by which each group is refined; 0: none is. None: 40 pictures a frame where there is a capture,
+            else 10 drawn views a frame in groups of few Gaussians.
     """
 
     quality: float = 50.0
@@ -128,11 +130,15 @@ def encode_groups(
     *,
     fingerprint: dict,
     cameras: list[Camera] = (),
+    capture: Capture | None = None,
     on_group: Callable[[EncodeReport], None] | None = None,
 ) -> EncodeReport:
     """Writes `out` from the groups that `groups(done, frames)` yields: those after the `done` groups, `frames` frames,
-    that an earlier run left in the file. `cameras`: those of the capture; from those for training, too, it is measured
-    what the Gaussians matter.
+    that an earlier run left in the file.
+
+    Args:
+        cameras: those of the capture; from those for training, too, it is measured what the Gaussians matter.
+        capture: what the groups were trained on, frame by frame of the stream; they are refined by its pictures.
 
     Ctrl-C finishes the file with the groups done and returns with `interrupted` set; the next run goes on.
     """
@@ -143,6 +149,7 @@ def encode_groups(
         refine=settings.refine,
         random_access=settings.random_access,
         cameras=[c for c in cameras if c.split == "train"],
+        capture=capture,
     )
     state = writer.state()
     coder.restore(state)
@@ -158,7 +165,7 @@ def encode_groups(
             if rate:
                 coder, coded = rate.code(coder, group, writer.frames, writer.bytes)
             else:
-                coded = coder.code(group, settings.quality)
+                coded = coder.code(group, settings.quality, writer.frames)
             report.seconds["code"] += clock() - mark
             state = coder.state() | ({"quality": np.array(rate.quality)} if rate else {})
             writer.append(coded.payload, len(group), sync=coded.independent, state=state)

@@ -22,10 +22,11 @@ from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_no
 from gscodec.encode.plan import Plan, along_curves, plan_group
 from gscodec.encode.refine_group import refine_group, refine_still
 from gscodec.encode.stack import Stack, align_axes, canonical_appearance, stack_group
+from gscodec.encode.targets import DrawnTargets, PictureTargets, targets_of
 from gscodec.encode.turns import code_turns, in_form
 from gscodec.gaussians import Group
 from gscodec.gaussians import Nodes as GivenNodes
-from gscodec.render.sensitivity import Importance, sensitivity_cameras
+from gscodec.render.sensitivity import Importance
 
 GRID_BITS_MAX = 21
 
@@ -124,6 +125,7 @@ def code_group(
     layers: int | None = None,
     views: int = 0,
     cameras: list[Camera] = (),
+    pictures: PictureTargets | None = None,
 ) -> Coded:
     """An independent group in integers.
 
@@ -132,8 +134,9 @@ def code_group(
         quality: 0 to 100.
         keep_all: code every Gaussian, also the invisible ones.
         layers: number of layers of falling importance; None: STILL_LAYERS for many Gaussians in a single frame, else 1.
-        views: by which integers are refined.
+        views: by which integers are refined; 0: they are not.
         cameras: from which the subject was captured, if it was.
+        pictures: by which integers are refined instead.
     """
     s, frames, trained = stack_group(group), len(group), group.nodes is not None
     turn, axes = canonical_axes(s.log_scales[frames // 2])
@@ -141,8 +144,8 @@ def code_group(
     plan = plan_group(s, quality, layers=layers, keep_all=keep_all, trained=trained, cameras=cameras)
     grid, nodes, plan, positions, quats = _placed(s, group.nodes if frames > 1 else None, plan)
     s = s.take(plan.source)
-    drawn = sensitivity_cameras(s.means[frames // 2], cameras, views) if views and len(positions) else []
-    channels, forms = _canonical(s, quats, grid.to_world(positions), positions, plan, drawn)
+    targets = targets_of(s.means[frames // 2], views, cameras, pictures)
+    channels, forms = _canonical(s, quats, grid.to_world(positions), positions, plan, targets)
     s, rotations = replace(s, quats=in_form(s.quats, forms)), in_form(quats, forms).astype(np.float32)
     shifts = [plan.shifts[n] for n in SHIFTED if n in plan.shifts]
     out = {
@@ -160,8 +163,8 @@ def code_group(
         x = grid.to_world(positions)
         motion = nodes and carry(nodes, positions, x, frames)
         out |= motion_integers(s, channels, rotations, plan.even, plan.measured, plan.price, x, nodes, motion)
-        if drawn:
-            out = refine_group(out, s, plan.measured.weights, plan.price, drawn)
+        if targets:
+            out = refine_group(out, s, plan.measured.weights, plan.price, targets)
     turn, axes = in_form(turn[plan.source], forms), axes[plan.source]
     return Coded(out, plan.source, turn, axes, rotations, grid, plan.even, plan.node_step)
 
@@ -182,9 +185,14 @@ def _placed(s: Stack, given: GivenNodes | None, plan: Plan) -> tuple[Grid, Nodes
 
 
 def _canonical(
-    s: Stack, quats: np.ndarray, x: np.ndarray, positions: np.ndarray, plan: Plan, views: list[Camera]
+    s: Stack,
+    quats: np.ndarray,
+    x: np.ndarray,
+    positions: np.ndarray,
+    plan: Plan,
+    targets: DrawnTargets | PictureTargets | None,
 ) -> tuple[dict, np.ndarray]:
-    """Channels of canonical values, those of a single frame refined by `views`, and the form [N] of each Gaussian.
+    """Channels of canonical values, those of a single frame refined by `targets`, and the form [N] of each Gaussian.
 
     x: [N, 3], `positions` in the world.
     """
@@ -198,9 +206,9 @@ def _canonical(
     for n, own in plan.curves.items():
         channels[n]["curves"] = [c.row() for c in own]
     shifts = plan.own_shifts()
-    if views and len(s.means) == 1:
+    if targets and len(s.means) == 1:
         source, placed = s.frame(0), replace(s.frame(0), means=x)
-        channels = refine_still(channels, shifts, values, weights, layers, plan.price, source, placed, views)
+        channels = refine_still(channels, shifts, values, weights, layers, plan.price, source, placed, targets)
     turning = {"steps": plan.steps["quats"].tolist(), "offsets": [0.0] * 3, "levers": plan.levers.tolist()}
     sizes, heard = dequantize_channels(channels["log_scales"]), plan.measured.weights["quats"]
     turning["values"], forms = code_turns(quats, sizes, positions, turning, layers, shifts["quats"], heard, plan.price)

@@ -24,9 +24,9 @@ from gscodec.encode.motion import NodeMotion, Nodes, carry, choose_nodes, given_
 from gscodec.encode.plan import PRUNE, layer_of, measure_stack
 from gscodec.encode.refine_group import refine_group
 from gscodec.encode.stack import Stack, align_axes, canonical_appearance, stack_group
+from gscodec.encode.targets import PictureTargets, targets_of
 from gscodec.encode.turns import code_turns, in_form
 from gscodec.gaussians import Group
-from gscodec.render.sensitivity import sensitivity_cameras
 
 REBIRTH = 8.0  # times PRUNE: what the reference left out must matter so much more to come back
 ROUNDS = 3  # of carrying births back
@@ -43,6 +43,7 @@ def predict_group(
     keep_all: bool = False,
     views: int = 0,
     cameras: list[Camera] = (),
+    pictures: PictureTargets | None = None,
 ) -> dict:
     """Integers of a group that is predicted.
 
@@ -51,7 +52,7 @@ def predict_group(
         parents: [N] int, index of each in the group that was coded as `reference`, -1: not there.
         back: how many groups before this one that is.
         decoded: the reference, as decoded.
-        quality, keep_all, views, cameras: as in `code_group`.
+        quality, keep_all, views, cameras, pictures: as in `code_group`.
     """
     s = stack_group(group)
     parent = _coded_parents(parents, reference.source)
@@ -116,9 +117,8 @@ def predict_group(
     }
     x = grid.to_world(positions)
     out |= motion_integers(s, channels, rotations, steps, measured, price, x, nodes, motion)
-    if views and len(positions):
-        drawn = sensitivity_cameras(s.means[middle], cameras, views)
-        out = refine_group(out, s, measured.weights, price, drawn, decoded)
+    if targets := targets_of(s.means[middle], views, cameras, pictures):
+        out = refine_group(out, s, measured.weights, price, targets, decoded)
     return out
 
 

@@ -34,7 +34,7 @@ class RateControl:
         quality, tried = self.quality, []  # of (how far off, quality, log of size over budget, coder, group)
         while len(tried) < TRIES:
             after = copy.copy(coder)
-            coded = after.code(group, quality)
+            coded = after.code(group, quality, frames)
             off = math.log(len(coded.payload) / budget)
             tried.append((abs(off), quality, off, after, coded))
             if abs(off) < TOLERANCE:

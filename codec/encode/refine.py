@@ -1,9 +1,9 @@
 """Refinement: integers move to where the picture is nearest to the source, given all other integers.
 
-Rounding each value on its own leaves errors that another could make up for. Views that no step has seen before are
-drawn of source and decoded frame; the gradient of their squared difference moves what lies under the integers, and
-passes straight through the rounding (Bengio et al. 2013). Integers that others are decoded by stay: positions, nodes,
-rotations.
+Rounding each value on its own leaves errors that another could make up for. The decoded frame is drawn and compared
+with what it is to look like (targets.py); the gradient of the squared difference moves what lies under the integers,
+and passes straight through the rounding (Bengio et al. 2013). Integers that others are decoded by stay: positions,
+nodes, rotations.
 """
 
 from __future__ import annotations
@@ -13,12 +13,11 @@ from collections.abc import Callable
 import numpy as np
 
 from gscodec.bitstream.color import correlate
-from gscodec.camera import Camera
+from gscodec.encode.targets import DrawnTargets, PictureTargets
 from gscodec.gaussians import Gaussians
-from gscodec.render.sensitivity import GREY, arrays_of, derivatives
+from gscodec.render.sensitivity import derivatives
 from gscodec.render.workspace import Workspace
 
-RATE = 0.01  # quantization steps a view, at first
 BETAS, EPS = (0.9, 0.99), 1e-30
 INSIDE = 0.02  # quantization steps: so far from where it would change, at least, starts what is under an integer
 
@@ -58,27 +57,24 @@ class Moving:
 
 def refine(
     parts: list[Moving],
+    targets: DrawnTargets | PictureTargets,
     source: Callable[[int], Gaussians],
     shown: Callable[[int], tuple[Gaussians, list[Callable]]],
-    cameras: list[Camera],
     frames: int = 1,
 ) -> None:
-    """Moves the integers of `parts`.
+    """Moves the integers of `parts`, one step for each of `targets`.
 
     Args:
         source: frame -> Gaussians as they are to look.
         shown: frame -> the same as they look with the integers as they are now, and for each of `parts` what makes the
             derivative by its integers of that by its attribute ([N, C]).
-        cameras: one a step. `frames` take turns, all of them before any one again.
     """
-    workspace, random, names = Workspace(), np.random.default_rng(0), {p.attribute for p in parts}
-    rounds = np.concatenate([random.permutation(frames) for _ in range(0, len(cameras), frames)])
-    for step, (i, t) in enumerate(zip(random.permutation(len(cameras)), rounds, strict=False), 1):
-        target, _ = workspace.forward(arrays_of(source(t)), cameras[i], GREY)
+    workspace, names = Workspace(), {p.attribute for p in parts}
+    for step, (t, camera, target) in enumerate(targets.draw(source, frames), 1):
         now, chain = shown(t)
         off = lambda image, target=target: np.ascontiguousarray(image - target)  # noqa: E731
-        derivative = derivatives(workspace, now, cameras[i], off, names)
-        rate = RATE * (1 - (step - 1) / len(cameras))
+        derivative = derivatives(workspace, now, camera, off, names)
+        rate = targets.rate * (1 - (step - 1) / len(targets))
         for part, by_integers in zip(parts, chain, strict=True):
             part.follow(by_integers(derivative[part.attribute]), rate, step)
 

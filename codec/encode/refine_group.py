@@ -15,12 +15,12 @@ import numpy as np
 from gscodec import _native
 from gscodec.bitstream.color import decorrelate
 from gscodec.bitstream.transform import dct_basis
-from gscodec.camera import Camera
 from gscodec.encode import curves as curved
 from gscodec.encode import rdo
 from gscodec.encode.channels import coded_values, curves_of, shifts_of
 from gscodec.encode.refine import Moving, refine, with_values
 from gscodec.encode.stack import Stack
+from gscodec.encode.targets import DrawnTargets, PictureTargets
 from gscodec.gaussians import Gaussians
 
 CANONICAL = ("logit_opacities", "sh0", "shN")
@@ -105,13 +105,13 @@ def refine_still(
     price: float,
     source: Gaussians,
     placed: Gaussians,
-    cameras: list[Camera],
+    targets: DrawnTargets | PictureTargets,
 ) -> dict:
     """`channels` of a single frame, refined.
 
     Args:
         shifts: attribute -> [N]. values, weights: attribute -> [N, C], what is coded. layers, price: as it was.
-        source: as it is to look. placed: the same at decoded positions. cameras: of `refine`.
+        source: as it is to look. placed: the same at decoded positions. targets: of `refine`.
     """
     parts = [_Canonical(n, c, shifts[n], values[n], weights[n], layers, price) for n, c in channels.items()]
 
@@ -119,16 +119,18 @@ def refine_still(
         now = with_values(placed, {p.moving.attribute: p.values() for p in parts})
         return now, [lambda d, p=p: p.by_integers(d, t) for p in parts]
 
-    refine([p.moving for p in parts], lambda _: source, shown, cameras)
+    refine([p.moving for p in parts], targets, lambda _: source, shown)
     return _with_integers({"channels": channels}, parts)["channels"]
 
 
-def refine_group(integers: dict, s: Stack, weights: dict, price: float, cameras: list[Camera], reference=None) -> dict:
+def refine_group(
+    integers: dict, s: Stack, weights: dict, price: float, targets: DrawnTargets | PictureTargets, reference=None
+) -> dict:
     """`integers` of a group, refined.
 
     Args:
         s: what it was made of, in the order of the integers. weights: of `Importance`. price: of a bit.
-        cameras: of `refine`. reference: the decoded group that a predicted one refers to.
+        targets: of `refine`. reference: the decoded group that a predicted one refers to.
     """
     frames, (payload, _) = len(s.means), _native.encode_group(integers, reference)
     decoded = _native.DecodedGroup(payload, len(_native.levels()), reference=reference)
@@ -150,7 +152,7 @@ def refine_group(integers: dict, s: Stack, weights: dict, price: float, cameras:
             p.add(now[p.moving.attribute], t)
         return visible(with_values(before[t], now), t), [lambda d, p=p: p.by_integers(d, t) for p in parts]
 
-    refine([p.moving for p in parts], lambda t: visible(s.frame(t), t), shown, cameras, frames)
+    refine([p.moving for p in parts], targets, lambda t: visible(s.frame(t), t), shown, frames)
     return _with_integers(integers, parts)
 
 

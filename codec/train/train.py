@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -252,7 +252,7 @@ class _Run:
         if len(done) == 1 and parents is None:
             subject.canonical = track.models[0]
             subject.parents = np.arange(len(subject.canonical))
-            return Group([subject.canonical.gaussians()])
+            return Group([subject.canonical.gaussians()], calibration=self.views.calibration())
         model = self._finetuned(subject, done, track)
         known = len(model.key) if parents is None else len(parents)
         born = np.full(len(model.key) - known, -1)
@@ -260,7 +260,7 @@ class _Run:
         subject.bury(model.key)
         if not len(subject.parents):
             self.subject = None
-        return group
+        return replace(group, calibration=self.views.calibration())
 
     def _keyframe(self, frames: range) -> Subject:
         """Of the first of `frames`."""

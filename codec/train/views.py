@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gscodec.camera import Camera
-from gscodec.capture import View
+from gscodec.camera import Calibration, Camera
+from gscodec.capture import View, cropped
 from gscodec.render.step import RenderLoss, Workspace, render_loss
 from gscodec.train.calibration import Exposure, Extrinsics
 from gscodec.train.settings import TrainSettings
@@ -70,6 +70,11 @@ class Views:
         """Camera `index` of the capture where it really stands."""
         return self.extrinsics.camera(index, self.capture.cameras[index])
 
+    def calibration(self) -> Calibration:
+        """Where the cameras stand and how bright they are, as far as that is known by now."""
+        every = range(len(self.capture.cameras))
+        return Calibration([self.camera(i) for i in every], np.stack([self.exposure.gain(i) for i in every]))
+
     def _hold(self, key: tuple, load: Callable[[], View | Target]):
         """What `load` gives, which is kept as long as there is room."""
         if key not in self._held:
@@ -101,20 +106,8 @@ class Views:
         return t.rgb.nbytes + (0 if t.alpha is None else t.alpha.nbytes)
 
     def _cropped(self, camera: int, frame: int) -> Target:
-        view, cam = self.view(camera, frame), self.capture.cameras[camera]
-        h, w = view.rgb.shape[:2]
-        if view.alpha is None or not view.alpha.any():
-            return Target(cam, np.ascontiguousarray(view.rgb), view.alpha, camera)
-        rows, cols = np.flatnonzero(view.alpha.any(1)), np.flatnonzero(view.alpha.any(0))
-        top, bottom = max(rows[0] - MARGIN, 0), min(rows[-1] + 1 + MARGIN, h)
-        left, right = max(cols[0] - MARGIN, 0), min(cols[-1] + 1 + MARGIN, w)
-        crop = (slice(top, bottom), slice(left, right))
-        return Target(
-            cam.cropped(left, top, right - left, bottom - top),
-            np.ascontiguousarray(view.rgb[crop]),
-            np.ascontiguousarray(view.alpha[crop]),
-            camera,
-        )
+        view, there = cropped(self.view(camera, frame), self.capture.cameras[camera], MARGIN)
+        return Target(there, view.rgb, view.alpha, camera)
 
 
 def shrink(target: Target, scale: float) -> Target:

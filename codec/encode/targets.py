@@ -1,0 +1,107 @@
+"""What refinement compares with: views drawn of the source, or the pictures of the capture that it was trained on.
+
+A model that was trained is only as near to its pictures as training came. Where they are at hand, rounded values are
+held against them and not against the model: so errors of the model are made up for as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+
+import numpy as np
+
+from gscodec.camera import Calibration, Camera
+from gscodec.capture import Capture, View, cropped
+from gscodec.gaussians import Gaussians
+from gscodec.render.sensitivity import GREY, arrays_of, sensitivity_cameras
+from gscodec.render.workspace import Workspace
+
+MARGIN = 24  # pixels around the subject
+CACHE_BYTES = 1 << 30  # of pictures
+
+Target = tuple[int, Camera, np.ndarray]  # frame, camera, [H, W, 3] f32 picture over mid-grey
+
+
+class DrawnTargets:
+    """Views of the source, by `cameras`, that no step has seen before.
+
+    Attributes:
+        rate: quantization steps that a value moves in one view, at first.
+    """
+
+    rate = 0.01
+
+    def __init__(self, cameras: list[Camera]):
+        self._cameras = cameras
+
+    def __len__(self) -> int:
+        return len(self._cameras)
+
+    def draw(self, source: Callable[[int], Gaussians], frames: int) -> Iterator[Target]:
+        """One for each camera; `frames` take turns, all of them before any one again.
+
+        Args:
+            source: frame -> what it is to look like.
+        """
+        workspace, random = Workspace(), np.random.default_rng(0)
+        turns = _turns(random, frames, len(self))
+        for i, t in zip(random.permutation(len(self)), turns, strict=True):
+            yield t, self._cameras[i], workspace.forward(arrays_of(source(t)), self._cameras[i], GREY)[0]
+
+
+class PictureTargets:
+    """`count` pictures of the training cameras, all cameras of a frame before any one again.
+
+    Args:
+        first_frame: of the capture, where the group begins. calibration: of its cameras.
+    """
+
+    rate = 0.03
+
+    def __init__(self, capture: Capture, calibration: Calibration, first_frame: int, count: int):
+        self._capture, self._calibration, self._first, self._count = capture, calibration, first_frame, count
+
+    def __len__(self) -> int:
+        return self._count
+
+    def draw(self, source: Callable[[int], Gaussians], frames: int) -> Iterator[Target]:
+        """As of `DrawnTargets`; what the source looks like is not asked."""
+        cameras = self._calibration.cameras
+        trained = [i for i, c in enumerate(cameras) if c.split == "train"]
+        largest = max(4 * c.width * c.height for c in cameras)
+        read = lru_cache(max(1, CACHE_BYTES // largest))(self._read)
+        random, order = np.random.default_rng(0), [[] for _ in range(frames)]
+        for t in _turns(random, frames, len(self)):
+            order[t] = order[t] or random.permutation(trained).tolist()
+            i = order[t].pop()
+            view, camera = read(i, t)
+            yield t, camera, _over_grey(view, self._calibration.gains[i])
+
+    def _read(self, camera: int, t: int) -> tuple[View, Camera]:
+        view = self._capture.view(camera, self._first + t)
+        return cropped(view, self._calibration.cameras[camera], MARGIN)
+
+
+def targets_of(
+    means: np.ndarray, views: int, cameras: list[Camera], pictures: PictureTargets | None
+) -> DrawnTargets | PictureTargets | None:
+    """The `pictures` if there are any, else so many `views` around `means` [N, 3] (`sensitivity_cameras`). None: no
+    views, or nothing to see."""
+    if not views or not len(means):
+        return None
+    return pictures or DrawnTargets(sensitivity_cameras(means, cameras, views))
+
+
+def _turns(random: np.random.Generator, frames: int, count: int) -> list[int]:
+    rounds = [random.permutation(frames) for _ in range(0, count, frames)]
+    return np.concatenate(rounds)[:count].tolist() if rounds else []
+
+
+def _over_grey(view: View, gain: np.ndarray) -> np.ndarray:
+    """The picture as a camera without a gain would show it."""
+    rgb = view.rgb / (255 * gain)
+    if view.alpha is not None:
+        alpha = view.alpha[..., None] / np.float32(255)
+        rgb = rgb * alpha + np.float32(GREY) * (1 - alpha)
+    return np.ascontiguousarray(rgb, np.float32)
