@@ -65,7 +65,7 @@ def animated(data: Path, folder: Path, frames: int) -> Path:
 
 def lumberjack(data: Path, folder: Path) -> dict:
     """The capture: 30 frames, 512 x 512, 20 training cameras."""
-    return measure("lumberjack", data / "lumberjack", folder, "--quality", "56")
+    return measure("lumberjack", data / "lumberjack", folder)
 
 
 def demo(_: Path | None, folder: Path) -> dict:
