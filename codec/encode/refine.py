@@ -70,10 +70,10 @@ def refine(
             derivative by its integers of that by its attribute ([N, C]).
     """
     workspace, names = Workspace(), {p.attribute for p in parts}
-    for step, (t, camera, target) in enumerate(targets.draw(source, frames), 1):
+    for step, (t, camera, background, target) in enumerate(targets.draw(source, frames), 1):
         now, chain = shown(t)
         off = lambda image, target=target: np.ascontiguousarray(image - target)  # noqa: E731
-        derivative = derivatives(workspace, now, camera, off, names)
+        derivative = derivatives(workspace, now, camera, off, names, background)
         rate = targets.rate * (1 - (step - 1) / len(targets))
         for part, by_integers in zip(parts, chain, strict=True):
             part.follow(by_integers(derivative[part.attribute]), rate, step)

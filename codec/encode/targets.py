@@ -20,7 +20,8 @@ from gscodec.render.workspace import Workspace
 MARGIN = 24  # pixels around the subject
 CACHE_BYTES = 1 << 30  # of pictures
 
-Target = tuple[int, Camera, np.ndarray]  # frame, camera, [H, W, 3] f32 picture over mid-grey
+Colour = tuple[float, float, float]
+Target = tuple[int, Camera, Colour, np.ndarray]  # frame, camera, background, [H, W, 3] f32 picture over it
 
 
 class DrawnTargets:
@@ -47,11 +48,13 @@ class DrawnTargets:
         workspace, random = Workspace(), np.random.default_rng(0)
         turns = _turns(random, frames, len(self))
         for i, t in zip(random.permutation(len(self)), turns, strict=True):
-            yield t, self._cameras[i], workspace.forward(arrays_of(source(t)), self._cameras[i], GREY)[0]
+            picture, _ = workspace.forward(arrays_of(source(t)), self._cameras[i], GREY)
+            yield t, self._cameras[i], GREY, picture
 
 
 class PictureTargets:
-    """`count` pictures of the training cameras, all cameras of a frame before any one again.
+    """`count` pictures of the training cameras, all cameras of a frame before any one again, each over a background of
+    its own: a haze in the colour of one that is known would pass for opacity.
 
     Args:
         first_frame: of the capture, where the group begins. calibration: of its cameras.
@@ -76,7 +79,8 @@ class PictureTargets:
             order[t] = order[t] or random.permutation(trained).tolist()
             i = order[t].pop()
             view, camera = read(i, t)
-            yield t, camera, _over_grey(view, self._calibration.gains[i])
+            background = tuple(random.uniform(0, 1, 3).tolist())
+            yield t, camera, background, _picture(view, self._calibration.gains[i], background)
 
     def _read(self, camera: int, t: int) -> tuple[View, Camera]:
         view = self._capture.view(camera, self._first + t)
@@ -98,10 +102,10 @@ def _turns(random: np.random.Generator, frames: int, count: int) -> list[int]:
     return np.concatenate(rounds)[:count].tolist() if rounds else []
 
 
-def _over_grey(view: View, gain: np.ndarray) -> np.ndarray:
+def _picture(view: View, gain: np.ndarray, background: Colour) -> np.ndarray:
     """The picture as a camera without a gain would show it."""
     rgb = view.rgb / (255 * gain)
     if view.alpha is not None:
         alpha = view.alpha[..., None] / np.float32(255)
-        rgb = rgb * alpha + np.float32(GREY) * (1 - alpha)
+        rgb = rgb * alpha + np.float32(background) * (1 - alpha)
     return np.ascontiguousarray(rgb, np.float32)

@@ -87,15 +87,16 @@ def derivatives(
     camera: Camera,
     by_picture: Callable[[np.ndarray], np.ndarray],
     names: Iterable[str] = (*COARSEST, "turns"),
+    background: tuple[float, ...] = GREY,
 ) -> dict[str, np.ndarray]:
     """[N, C] derivatives by the channels that are coded, of quats by turns about the own axes; "turns": of the scene.
 
     Args:
-        by_picture: the picture of `camera`, over mid-grey -> the derivative by its pixels, [H, W, 3] f32 both.
+        by_picture: the picture of `camera`, over `background` -> the derivative by its pixels, [H, W, 3] f32 both.
         names: of the channels; those of shN are left out where there are none.
     """
     arrays = arrays_of(g)
-    image, _ = workspace.forward(arrays, camera, GREY, training=True)
+    image, _ = workspace.forward(arrays, camera, background, training=True)
     pixels = by_picture(image)
     grads, statistics = workspace.gradients(arrays)
     for a in grads + statistics:
