@@ -132,18 +132,32 @@ def _encode_capture(source, out, settings, preset, frames, gop, cluster, bar) ->
             from gscodec.train.cluster import cluster_groups
 
             opened = partial(_open_capture, source.resolve(), frames)
-            on_progress = lambda done: bar.update("train on the cluster", done, capture.frame_count)  # noqa: E731
-            return cluster_groups(
-                cluster, opened, recipe, settings.random_access, first_frame=first_frame, on_progress=on_progress
+            yield from cluster_groups(
+                cluster,
+                opened,
+                recipe,
+                settings.random_access,
+                first_frame=first_frame,
+                on_progress=lambda done: bar.update("train on the cluster", done, capture.frame_count),
             )
-        return train_groups(
+            return
+        steps, start = [0, 1], first_frame
+
+        def on_progress(p) -> None:
+            steps[:] = p.done, p.total
+            bar.update(p.stage, *steps)
+
+        for group in train_groups(
             capture,
             recipe,
             first_frame=first_frame,
             random_access=settings.random_access,
             checkpoints=work,
-            on_progress=lambda p: bar.update(p.stage, p.done, p.total),
-        )
+            on_progress=on_progress,
+        ):
+            bar.update(f"code {start}-{start + len(group) - 1}", *steps)
+            start += len(group)
+            yield group
 
     config = stream_config(
         fps=capture.fps,
