@@ -20,7 +20,7 @@ ALLOWED = {
     "render": BASE | {"bitstream", "decode", "progress"},
     "metrics": BASE | {"render", "capture", "splats"},
     "decode": BASE | {"bitstream", "render"},
-    "encode": BASE | {"bitstream", "decode", "render"},
+    "encode": BASE | {"bitstream", "capture", "decode", "render"},
     "player": BASE | {"decode"},
     "train": BASE | {"bitstream", "render", "capture"},
 }

@@ -18,6 +18,7 @@ from gscodec.gaussians import Gaussians
 from gscodec.render.sensitivity import derivatives
 from gscodec.render.workspace import Workspace
 
+RATE = 0.01  # quantization steps a view, at first
 BETAS, EPS = (0.9, 0.99), 1e-30
 INSIDE = 0.02  # quantization steps: so far from where it would change, at least, starts what is under an integer
 
@@ -74,7 +75,7 @@ def refine(
         now, chain = shown(t)
         off = lambda image, target=target: np.ascontiguousarray(image - target)  # noqa: E731
         derivative = derivatives(workspace, now, camera, off, names, background)
-        rate = targets.rate * (1 - (step - 1) / len(targets))
+        rate = RATE * (1 - (step - 1) / len(targets))
         for part, by_integers in zip(parts, chain, strict=True):
             part.follow(by_integers(derivative[part.attribute]), rate, step)
 

@@ -25,13 +25,7 @@ Target = tuple[int, Camera, Colour, np.ndarray]  # frame, camera, background, [H
 
 
 class DrawnTargets:
-    """Views of the source, by `cameras`, that no step has seen before.
-
-    Attributes:
-        rate: quantization steps that a value moves in one view, at first.
-    """
-
-    rate = 0.01
+    """Views of the source, by `cameras`, that no step has seen before."""
 
     def __init__(self, cameras: list[Camera]):
         self._cameras = cameras
@@ -59,8 +53,6 @@ class PictureTargets:
     Args:
         first_frame: of the capture, where the group begins. calibration: of its cameras.
     """
-
-    rate = 0.03
 
     def __init__(self, capture: Capture, calibration: Calibration, first_frame: int, count: int):
         self._capture, self._calibration, self._first, self._count = capture, calibration, first_frame, count
