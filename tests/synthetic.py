@@ -87,3 +87,25 @@ def from_npz(path) -> GaussianSequence:
         g = Gaussians(means, quats, a["log_scales"], a["logit_opacities"], sh0, none)
         frames.append(g.validate(str(path)))
     return GaussianSequence(30.0, [Group(frames)])
+
+
+def gaussians(n, k=0, seed=0):
+    """`n` Gaussians without any order, with `k` harmonics."""
+    rng = np.random.default_rng(seed)
+
+    def normal(*shape):
+        return rng.normal(size=shape).astype(np.float32)
+
+    quats = normal(n, 4)
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    return Gaussians(normal(n, 3), quats, normal(n, 3) - 4, 2 * normal(n), normal(n, 3), 0.3 * normal(n, k, 3))
+
+
+def assert_close(a, b, means=1e-6, log_scales=1e-6, angle=1e-5, opacity=1e-6, sh0=1e-6, shN=1e-6):
+    """Of two sets of Gaussians."""
+    np.testing.assert_allclose(b.means, a.means, atol=means)
+    np.testing.assert_allclose(b.log_scales, a.log_scales, atol=log_scales)
+    np.testing.assert_allclose(np.abs((a.quats * b.quats).sum(1)), 1, atol=angle)
+    np.testing.assert_allclose(1 / (1 + np.exp(-b.logit_opacities)), 1 / (1 + np.exp(-a.logit_opacities)), atol=opacity)
+    np.testing.assert_allclose(b.sh0, a.sh0, atol=sh0)
+    np.testing.assert_allclose(b.shN, a.shN, atol=shN)

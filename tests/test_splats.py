@@ -1,10 +1,9 @@
-"""Splat formats and sequences: what is written comes back, what is damaged is named, what is tracked is found out."""
+"""Splat formats: what is written comes back, what is damaged is named."""
 
 import json
 import struct
 import subprocess
 import sys
-import threading
 import zipfile
 
 import cv2
@@ -12,43 +11,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from synthetic import assert_close, gaussians
 
-from gscodec.camera import Camera
 from gscodec.errors import CaptureError, UsageError
-from gscodec.gaussians import Gaussians, GaussianSequence, Group, Nodes
+from gscodec.gaussians import Gaussians
 from gscodec.splats import (
-    SequenceWriter,
-    detect_input,
-    open_sequence,
     read_splat,
-    write_sequence,
     write_splat,
 )
 from gscodec.splats.codebook import codebook, palette
 from gscodec.splats.files import splat_size
-from gscodec.splats.tracking import match, relate
 
 FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
-
-
-def gaussians(n, k=0, seed=0):
-    rng = np.random.default_rng(seed)
-
-    def normal(*shape):
-        return rng.normal(size=shape).astype(np.float32)
-
-    quats = normal(n, 4)
-    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-    return Gaussians(normal(n, 3), quats, normal(n, 3) - 4, 2 * normal(n), normal(n, 3), 0.3 * normal(n, k, 3))
-
-
-def assert_close(a, b, means=1e-6, log_scales=1e-6, angle=1e-5, opacity=1e-6, sh0=1e-6, shN=1e-6):
-    np.testing.assert_allclose(b.means, a.means, atol=means)
-    np.testing.assert_allclose(b.log_scales, a.log_scales, atol=log_scales)
-    np.testing.assert_allclose(np.abs((a.quats * b.quats).sum(1)), 1, atol=angle)
-    np.testing.assert_allclose(1 / (1 + np.exp(-b.logit_opacities)), 1 / (1 + np.exp(-a.logit_opacities)), atol=opacity)
-    np.testing.assert_allclose(b.sh0, a.sh0, atol=sh0)
-    np.testing.assert_allclose(b.shN, a.shN, atol=shN)
 
 
 # -- .ply
@@ -301,203 +275,6 @@ def test_palette_cuts_where_there_are_too_many():
     entries, label = palette(vectors, 256)
     assert len(entries) == 256
     assert np.mean((entries[label] - vectors) ** 2) < 0.6 * vectors.var()
-
-
-# -- sequences
-
-
-def moved(g, t):
-    """Turned about z by 0.02 rad a frame, as a body moves."""
-    c, s = np.cos(0.02 * t), np.sin(0.02 * t)
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    return Gaussians(g.means @ turn.T, *(getattr(g, f) for f in FIELDS[1:]))
-
-
-def save_frames(folder, frames):
-    folder.mkdir(exist_ok=True)
-    for t, g in enumerate(frames):
-        write_splat(folder / f"f{t}.ply", g)
-    return folder
-
-
-def test_tracked_folder(tmp_path):
-    g = gaussians(500)
-    s = open_sequence(save_frames(tmp_path / "s", [moved(g, t) for t in range(12)]), gop=5, fps=24)
-    assert (s.mode, s.fps, [len(x) for x in s.groups]) == ("tracked", 24, [5, 5, 2])
-    assert s.names[10] == "f10.ply"  # natural order: f2 before f10
-    np.testing.assert_allclose(s.frame(11).means, moved(g, 11).means, atol=1e-6)
-
-
-def test_shuffled_folder_is_matched(tmp_path):
-    g, rng = gaussians(500), np.random.default_rng(1)
-    frames = [moved(g, 0.2 * t) for t in range(4)]
-    frames = [frames[0]] + [f.take(rng.permutation(500)) for f in frames[1:3]] + [frames[3]]
-    s = open_sequence(save_frames(tmp_path / "s", frames))
-    assert (s.mode, len(s.groups)) == ("matched", 1)
-    for t in range(4):
-        np.testing.assert_allclose(s.frame(t).means, moved(g, 0.2 * t).means, atol=1e-5)
-        np.testing.assert_allclose(s.frame(t).sh0, g.sh0, atol=1e-6)
-
-
-def test_locally_swapped_indices_are_not_called_tracked():
-    """Each frame sorted along a curve: index i stays near, but a third of the Gaussians swap with neighbours."""
-    a = gaussians(2000).means
-    b = a + np.float32(0.001)
-    swap = np.arange(2000)
-    by_x = np.argsort(a[:, 0])
-    pairs = by_x[: 2 * 330].reshape(-1, 2)
-    swap[pairs[:, 0]], swap[pairs[:, 1]] = pairs[:, 1].copy(), pairs[:, 0].copy()
-    order = relate(a, b[swap])
-    assert order is not True
-    np.testing.assert_allclose(b[swap][order], b, atol=1e-7)
-
-
-def test_jitter_is_still_tracked():
-    a = gaussians(2000).means
-    noise = np.random.default_rng(2).normal(size=a.shape) * 0.02
-    assert relate(a, a + noise.astype(np.float32)) is True
-
-
-def test_unrelated_frames_are_independent(tmp_path):
-    frames = [gaussians(200, seed=1), gaussians(200, seed=2), gaussians(150, seed=3)]
-    s = open_sequence(save_frames(tmp_path / "s", frames))
-    assert (s.mode, [len(g) for g in s.groups]) == ("independent", [1, 1, 1])
-
-
-def test_a_cut_starts_a_group(tmp_path):
-    a, b = gaussians(200, seed=1), gaussians(220, seed=2)
-    s = open_sequence(save_frames(tmp_path / "s", [a, moved(a, 1), b, moved(b, 1), moved(b, 2)]))
-    assert (s.mode, [len(g) for g in s.groups]) == ("tracked", [2, 3])
-    assert (len(s.frame(1)), len(s.frame(2))) == (200, 220)
-
-
-def test_match_leaves_the_rest_to_an_assignment():
-    a = np.random.default_rng(0).uniform(size=(300, 3))
-    b = a.copy()
-    b[7], b[9] = a[9] + 0.3, a[9] + 0.4  # neither is anybody's nearest
-    order = match(a, b)
-    assert sorted(order) == list(range(300))
-    assert match(a, b + 5) is None
-
-
-def test_single_files_and_tiny_frames(tmp_path):
-    write_splat(tmp_path / "a.ply", gaussians(3))
-    write_splat(tmp_path / "b.ply", gaussians(3))
-    assert open_sequence(tmp_path / "a.ply").frame_count == 1
-    assert open_sequence(tmp_path).mode == "tracked"
-    write_splat(tmp_path / "b.ply", gaussians(3, seed=4))
-    assert open_sequence(tmp_path).mode == "independent"
-
-
-def stored_sequence():
-    g = gaussians(50, 3)
-    lifetimes = np.stack([np.zeros(50), np.full(50, 4)], 1).astype(np.int32)
-    lifetimes[:5] = (1, 3)
-    shapes = ((6, 3), (4, 6, 3), (4, 6, 3), (50, 3))
-    nodes = Nodes(*(np.random.default_rng(0).normal(size=s).astype(np.float32) for s in shapes))
-    camera = Camera("a", np.diag([9.0, 9, 1]), np.eye(4), 32, 24, split="test")
-    groups = [Group([moved(g, t) for t in range(4)], lifetimes, nodes), Group([gaussians(40, 3, 9)])]
-    return GaussianSequence(25, groups, [camera])
-
-
-def test_sequence_round_trip(tmp_path):
-    source = stored_sequence()
-    seen = []
-    write_sequence(source, tmp_path / "s", seen.append)
-    assert seen == [1, 2, 3, 4, 5]
-    s = open_sequence(tmp_path / "s")
-    assert (s.mode, s.fps, s.frame_count, s.cameras[0].split) == ("stored", 25, 5, "test")
-    for ours, theirs in zip(s.groups, source.groups, strict=True):
-        for a, b in zip(ours.frames, theirs.frames, strict=True):
-            for name in FIELDS:
-                np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-6)
-    np.testing.assert_array_equal(s.groups[0].lifetimes, source.groups[0].lifetimes)
-    np.testing.assert_array_equal(s.groups[0].nodes.rotations, source.groups[0].nodes.rotations)
-    assert (len(s.frame(0)), len(s.frame(1))) == (45, 50)
-    assert (read_splat(tmp_path / "s/000000.ply").logit_opacities[:5] == -30).all()  # hidden from other tools
-
-
-def test_writer_goes_on_after_a_stop(tmp_path):
-    groups = stored_sequence().groups
-    SequenceWriter(tmp_path, 25).add(groups[0])
-    assert open_sequence(tmp_path).frame_count == 4
-    writer = SequenceWriter(tmp_path, 25, resume=True)
-    assert (writer.frame_count, len(writer.groups)) == (4, 1)
-    writer.add(groups[1])
-    assert open_sequence(tmp_path).frame_count == 5
-
-
-def test_frames_are_lazy_and_thread_safe(tmp_path):
-    g = gaussians(100)
-    s = open_sequence(save_frames(tmp_path / "s", [moved(g, t) for t in range(8)]))
-    wrong = []
-
-    def check():
-        for t in range(8):
-            if not np.allclose(s.groups[0].frames[t].means, moved(g, t).means, atol=1e-6):
-                wrong.append(t)
-
-    threads = [threading.Thread(target=check) for _ in range(3)]
-    for t in threads:
-        t.start()
-    for t in threads:
-        t.join()
-    assert not wrong
-    (tmp_path / "s/f7.ply").unlink()
-    assert len(s.groups[0].frames[2:][1]) == 100
-    with pytest.raises(IndexError):
-        s.groups[0].frames[8]
-
-
-def edit(folder, change):
-    data = json.loads((folder / "sequence.json").read_text())
-    change(data)
-    (folder / "sequence.json").write_text(json.dumps(data))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda d: d.pop("fps"), "not valid .KeyError: 'fps'"),
-        (lambda d: d.update(fps=-1), "at -1.0 frames a second"),
-        (lambda d: d.update(groups=[]), "0 groups at"),
-        (lambda d: d["groups"][1].update(start=3), "group 1 is 1 frames from 3, expected to start at 4"),
-        (lambda d: d["groups"][1].update(frames=9), "group 1 is 9 frames from 4, .* within the 5 splats"),
-        (lambda d: d["groups"][0].update(extra="none.npz"), "none.npz: missing or damaged"),
-    ],
-)
-def test_bad_sequence_json(tmp_path, change, message):
-    write_sequence(stored_sequence(), tmp_path)
-    edit(tmp_path, change)
-    with pytest.raises(CaptureError, match=message):
-        open_sequence(tmp_path)
-
-
-def test_lifetimes_that_do_not_fit(tmp_path):
-    write_sequence(stored_sequence(), tmp_path)
-    write_splat(tmp_path / "000000.ply", gaussians(20, 3))
-    with pytest.raises(CaptureError, match=r"000000.ply: 20 Gaussians, sequence.json has lifetimes of 50"):
-        open_sequence(tmp_path).frame(0)
-
-
-def test_sequence_arguments(tmp_path):
-    with pytest.raises(CaptureError, match="no splats, expected one file per frame"):
-        open_sequence(tmp_path)
-    with pytest.raises(UsageError, match="gop 0 and fps None must be positive"):
-        open_sequence(tmp_path, gop=0)
-
-
-def test_detect_input(tmp_path):
-    with pytest.raises(
-        CaptureError, match=r"neither a capture nor splats; looked for transforms.json.*Qualisys.*splats"
-    ):
-        detect_input(tmp_path)
-    with pytest.raises(CaptureError, match="no such file or folder"):
-        detect_input(tmp_path / "gone")
-    write_splat(tmp_path / "a.ply", gaussians(2))
-    assert detect_input(tmp_path) == detect_input(tmp_path / "a.ply") == "splats"
-    (tmp_path / "transforms.json").write_text("{}")
-    assert detect_input(tmp_path) == "capture"  # an initial point cloud may lie beside it
 
 
 def test_ply_needs_numpy_alone(tmp_path):
