@@ -165,11 +165,10 @@ def coded(capture: Capture, groups: list[Group], settings) -> tuple[int, list[Ga
 
     degree, most = settings.sh_degree, settings.gaussians_max
     config = stream_config(fps=capture.fps, sh_degree=degree, gaussians=most, frames=settings.gop)
-    cameras = [c for c in capture.cameras if c.split == "train"]
     with tempfile.TemporaryDirectory() as folder:
         out, start = Path(folder) / "out.gsv", time.perf_counter()
         quality = EncodeSettings(settings.quality)
-        encode_groups(lambda *_: iter(groups), out, config, quality, fingerprint={}, cameras=cameras, capture=capture)
+        encode_groups(lambda *_: iter(groups), out, config, quality, fingerprint={}, capture=capture)
         seconds, stream = time.perf_counter() - start, open_stream(out)
         return out.stat().st_size, [stream.frame(t) for t in range(stream.frame_count)], seconds
 

@@ -172,7 +172,6 @@ def _encode_capture(source, out, settings, preset, frames, gop, cluster, bar) ->
         out,
         config,
         settings,
-        cameras=capture.cameras,
         capture=capture,
         fingerprint={"input": str(source.resolve()), "frames": frames, **asdict(recipe), **asdict(settings)},
     )

@@ -121,7 +121,7 @@ class Group:
         parents: [N] int32, index in the group before of the Gaussian that each one continues, -1 for a new one; no two
             have the same parent. None: nothing is known, as in the first group. This is all that the encoder needs
             to predict a group: a trainer that starts from the last group's Gaussians says so here.
-        calibration: of the capture that it was trained on, as the trainer has found it; None: as the capture tells.
+        calibration: of the capture that it was trained on; None: it has no pictures to be held against.
     """
 
     frames: Sequence[Gaussians]

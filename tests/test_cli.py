@@ -131,6 +131,7 @@ def test_wrong_paths_and_values(folder, tmp_path):
 def test_an_empty_folder_says_what_was_looked_for(tmp_path):
     (tmp_path / "empty").mkdir()
     fails(run("encode", tmp_path / "empty", tmp_path / "o.gsv"), "empty", "transforms.json", ".ply")
+    assert [p.name for p in tmp_path.iterdir()] == ["empty"], "nothing is left behind"
 
 
 def test_broken_files(folder, tmp_path):

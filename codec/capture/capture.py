@@ -16,6 +16,8 @@ from gscodec.camera import Camera
 from gscodec.capture.images import View, resize_area
 from gscodec.errors import UsageError
 
+MARGIN = 24  # pixels of background kept around the subject
+
 
 @dataclass(frozen=True)
 class Capture:
@@ -80,15 +82,14 @@ class Capture:
         return replace(self, cameras=[c.resized(w, h) for c, (w, h) in zip(self.cameras, size, strict=True)])
 
 
-def cropped(view: View, camera: Camera, margin: int) -> tuple[View, Camera]:
-    """The part of a view that has the subject in it, and `margin` pixels around; all of it where nothing tells them
-    apart."""
+def cropped(view: View, camera: Camera) -> tuple[View, Camera]:
+    """The part of a view with the subject and MARGIN pixels around it; all of it where nothing tells them apart."""
     if view.alpha is None or not view.alpha.any():
         return View(np.ascontiguousarray(view.rgb), view.alpha), camera
     (height, width), alpha = view.alpha.shape, view.alpha
     rows, cols = np.flatnonzero(alpha.any(1)), np.flatnonzero(alpha.any(0))
-    top, bottom = max(rows[0] - margin, 0), min(rows[-1] + 1 + margin, height)
-    left, right = max(cols[0] - margin, 0), min(cols[-1] + 1 + margin, width)
+    top, bottom = max(rows[0] - MARGIN, 0), min(rows[-1] + 1 + MARGIN, height)
+    left, right = max(cols[0] - MARGIN, 0), min(cols[-1] + 1 + MARGIN, width)
     part = (slice(top, bottom), slice(left, right))
     part_of = View(np.ascontiguousarray(view.rgb[part]), np.ascontiguousarray(alpha[part]))
     return part_of, camera.cropped(left, top, right - left, bottom - top)

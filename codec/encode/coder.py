@@ -108,12 +108,9 @@ class GroupCoder:
     def _refining(self, group: Group, first_frame: int) -> dict:
         """By what a group is refined: `views` and `pictures` of `code_group`."""
         pictured = self._capture is not None and group.calibration is not None
-        views = self._refine
-        if views is None and pictured:
-            views = FRAME_PICTURES * len(group)
-        elif views is None:
-            few = len(group) > 1 and len(group.frames[0]) <= FEW
-            views = FRAME_VIEWS * len(group) if few else 0
+        few = len(group) > 1 and len(group.frames[0]) <= FEW
+        usual = FRAME_PICTURES if pictured else FRAME_VIEWS if few else 0
+        views = usual * len(group) if self._refine is None else self._refine
         if not pictured:
             return {"views": views}
         return {"views": views, "pictures": PictureTargets(self._capture, group.calibration, first_frame, views)}

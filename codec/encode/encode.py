@@ -137,8 +137,9 @@ def encode_groups(
     that an earlier run left in the file.
 
     Args:
-        cameras: those of the capture; from those for training, too, it is measured what the Gaussians matter.
-        capture: what the groups were trained on, frame by frame of the stream; they are refined by its pictures.
+        cameras: of splats, if known; from those for training, too, it is measured what the Gaussians matter.
+        capture: what the groups were trained on, frame by frame of the stream: its cameras count instead, and groups
+            that have a calibration are refined by its pictures.
 
     Ctrl-C finishes the file with the groups done and returns with `interrupted` set; the next run goes on.
     """
@@ -148,7 +149,7 @@ def encode_groups(
         layers=settings.layers,
         refine=settings.refine,
         random_access=settings.random_access,
-        cameras=[c for c in cameras if c.split == "train"],
+        cameras=[c for c in (capture.cameras if capture else cameras) if c.split == "train"],
         capture=capture,
     )
     state = writer.state()

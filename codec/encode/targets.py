@@ -12,12 +12,11 @@ from functools import lru_cache
 import numpy as np
 
 from gscodec.camera import Calibration, Camera
-from gscodec.capture import Capture, View, cropped
+from gscodec.capture import Capture, View, blend, cropped
 from gscodec.gaussians import Gaussians
 from gscodec.render.sensitivity import GREY, arrays_of, sensitivity_cameras
 from gscodec.render.workspace import Workspace
 
-MARGIN = 24  # pixels around the subject
 CACHE_BYTES = 1 << 30  # of pictures
 
 Colour = tuple[float, float, float]
@@ -72,11 +71,12 @@ class PictureTargets:
             i = order[t].pop()
             view, camera = read(i, t)
             background = tuple(random.uniform(0, 1, 3).tolist())
-            yield t, camera, background, _picture(view, self._calibration.gains[i], background)
+            evened = View(view.rgb / self._calibration.gains[i], view.alpha)
+            yield t, camera, background, np.ascontiguousarray(blend(evened, background) / 255, np.float32)
 
     def _read(self, camera: int, t: int) -> tuple[View, Camera]:
         view = self._capture.view(camera, self._first + t)
-        return cropped(view, self._calibration.cameras[camera], MARGIN)
+        return cropped(view, self._calibration.cameras[camera])
 
 
 def targets_of(
@@ -91,13 +91,4 @@ def targets_of(
 
 def _turns(random: np.random.Generator, frames: int, count: int) -> list[int]:
     rounds = [random.permutation(frames) for _ in range(0, count, frames)]
-    return np.concatenate(rounds)[:count].tolist() if rounds else []
-
-
-def _picture(view: View, gain: np.ndarray, background: Colour) -> np.ndarray:
-    """The picture as a camera without a gain would show it."""
-    rgb = view.rgb / (255 * gain)
-    if view.alpha is not None:
-        alpha = view.alpha[..., None] / np.float32(255)
-        rgb = rgb * alpha + np.float32(background) * (1 - alpha)
-    return np.ascontiguousarray(rgb, np.float32)
+    return np.concatenate(rounds)[:count].tolist()

@@ -200,7 +200,7 @@ def train_groups(
             if start == segment.stop:
                 run.subject = None
             store.save(start, run.subject)
-            yield group
+            yield replace(group, calibration=run.views.calibration())
 
 
 def segments(frame_count: int, gop: int, random_access: int) -> list[range]:
@@ -252,7 +252,7 @@ class _Run:
         if len(done) == 1 and parents is None:
             subject.canonical = track.models[0]
             subject.parents = np.arange(len(subject.canonical))
-            return Group([subject.canonical.gaussians()], calibration=self.views.calibration())
+            return Group([subject.canonical.gaussians()])
         model = self._finetuned(subject, done, track)
         known = len(model.key) if parents is None else len(parents)
         born = np.full(len(model.key) - known, -1)
@@ -260,7 +260,7 @@ class _Run:
         subject.bury(model.key)
         if not len(subject.parents):
             self.subject = None
-        return replace(group, calibration=self.views.calibration())
+        return group
 
     def _keyframe(self, frames: range) -> Subject:
         """Of the first of `frames`."""

@@ -19,7 +19,6 @@ from gscodec.train.calibration import Exposure, Extrinsics
 from gscodec.train.settings import TrainSettings
 
 CACHE_BYTES = 2 << 30  # of decoded targets
-MARGIN = 24  # pixels of background kept around the subject
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,7 @@ class Views:
         return t.rgb.nbytes + (0 if t.alpha is None else t.alpha.nbytes)
 
     def _cropped(self, camera: int, frame: int) -> Target:
-        view, there = cropped(self.view(camera, frame), self.capture.cameras[camera], MARGIN)
+        view, there = cropped(self.view(camera, frame), self.capture.cameras[camera])
         return Target(there, view.rgb, view.alpha, camera)
 
 
