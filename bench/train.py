@@ -27,6 +27,7 @@ from gscodec.gaussians import Gaussians, Group
 
 RECIPES = ("gscodec", "alone", "v3")
 V3_PACKING = {"qp": 25, "raw": True}  # its default, in the better of its two forms
+V3_GOP = 20  # frames in a group of its
 KEYS = ("psnr", "psnr_fg", "ssim", "gaussians", "kb_per_frame", "flicker")
 
 
@@ -138,8 +139,8 @@ def _v3(capture: Capture, frames: range, settings) -> Iterator[tuple]:
     models = train_v3(part(capture, frames), range(len(frames)), settings)
     yield "v3", time.perf_counter() - start, None, models
     size, decoded = 0, []
-    for first in range(0, len(models), settings.gop):
-        files = videogs.encode(models[first : first + settings.gop], **V3_PACKING)
+    for first in range(0, len(models), V3_GOP):
+        files = videogs.encode(models[first : first + V3_GOP], **V3_PACKING)
         size += sum(map(len, files.values()))
         decoded += videogs.decode(files)
     yield "v3-coded", time.perf_counter() - start, size, decoded

@@ -20,6 +20,7 @@ from rich.console import Console
 from gscodec import __version__
 from gscodec.errors import GscodecError, UsageError
 from gscodec.frames import frame_range
+from gscodec.gaussians import GOP
 
 app = typer.Typer(
     help="Streaming volumetric video: captures and Gaussian sequences to one small playable file.",
@@ -36,7 +37,7 @@ Sequence = Annotated[
 Stream = Annotated[Path, typer.Argument(metavar="OUT.gsv", help="A .gsv file.")]
 Frames = Annotated[str | None, typer.Option(metavar="A:B", help="Only frames A to B-1.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-Gop = Annotated[int, typer.Option(help="Frames in a group.")]
+Gop = Annotated[int, typer.Option(help="Frames in a group at most.")]
 RandomAccess = Annotated[
     int, typer.Option(metavar="N", help="Frames from one independent group to the next at most; 0: no prediction.")
 ]
@@ -69,7 +70,7 @@ def encode(
     ] = None,
     preset: Preset = "medium",
     frames: Frames = None,
-    gop: Gop = 20,
+    gop: Gop = GOP,
     keep_all: Annotated[bool, typer.Option("--keep-all", help="Keep Gaussians that nobody can see.")] = False,
     random_access: RandomAccess = 60,
     layers: Annotated[
@@ -123,7 +124,7 @@ def train(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the .ply files go.")],
     preset: Preset = "medium",
     frames: Frames = None,
-    gop: Gop = 20,
+    gop: Gop = GOP,
     random_access: RandomAccess = 60,
     quality: Quality = 50.0,
 ) -> None:

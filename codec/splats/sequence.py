@@ -21,12 +21,11 @@ import numpy as np
 from gscodec.camera import Camera
 from gscodec.capture.detect import LOOKED_FOR, find_capture
 from gscodec.errors import CaptureError, UsageError
-from gscodec.gaussians import Gaussians, GaussianSequence, Group, Nodes
+from gscodec.gaussians import GOP, Gaussians, GaussianSequence, Group, Nodes
 from gscodec.splats.files import EXPECTED, is_splat, read_means, read_splat, splat_size
 from gscodec.splats.tracking import relate
 
 FPS = 30.0  # of folders that do not say
-GOP = 20  # frames of a group
 KEEP = 4  # frames in memory
 
 

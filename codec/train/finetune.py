@@ -29,8 +29,10 @@ from gscodec.train.rate import CanonicalRate, laplace_bits
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, compare
 
-# attribute -> temporal frequencies that may be used; what is not listed is constant in a group
+# attribute -> temporal frequencies that a group of so many frames may use, a longer one more in proportion; what is not
+# listed is constant in a group
 FREQUENCIES = {"means": 10, "quats": 4, "log_scales": 3, "logit_opacities": 3, "sh0": 6}
+FREQUENCIES_OF = 20
 STARTS = 0.5  # steps: a residual that is there from the start, of a Gaussian that has moved in an earlier group
 ROUND_DOWN = 0.1  # a coefficient below 0.6 steps is not coded, as the encoder does it
 RESIDUAL_RATE = 0.05  # in steps of the stream a step of the optimiser
@@ -134,7 +136,7 @@ class GroupModel:
             residual["logit_opacities"].append(torch.where(q["logit_opacities"][:, None] > HIDDEN, faded, 0.0))
         out = {}
         for name, most in FREQUENCIES.items():
-            low = self.basis[: min(most, len(tracked))]
+            low = self.basis[: -(-most * max(len(tracked), FREQUENCIES_OF) // FREQUENCIES_OF)]
             c = torch.einsum("kt,tnc->knc", low, self._held(residual[name])) / self.unit[name]
             out[name] = c.contiguous().requires_grad_()
         return out

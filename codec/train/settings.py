@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gscodec.errors import UsageError
+from gscodec.gaussians import GOP
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class TrainSettings:
         seed: of everything random.
     """
 
-    gop: int = 20
+    gop: int = GOP
     keyframe_steps: int = 1500
     motion_steps: int = 200
     finetune_steps: int = 120
