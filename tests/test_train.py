@@ -323,6 +323,9 @@ def test_laplace_bits_are_code_lengths():
     x = torch.tensor([0.3, 2.0, -7.0, 300.0], requires_grad=True)
     laplace_bits(x, torch.tensor(-1.0)).sum().backward()
     assert (x.grad * x.detach() > 0).all(), "every coefficient is pulled to zero, however far away"
+    x = torch.tensor([[-3.2, -0.4, 0.1], [0.45, 0.7, 25.0]], dtype=torch.double, requires_grad=True)
+    log_scale = torch.tensor([[-1.0], [0.7]], dtype=torch.double, requires_grad=True)
+    assert torch.autograd.gradcheck(laplace_bits, (x, log_scale)), "the closed form of its derivatives"
 
 
 def test_rate_term_tracks_the_coders_bits():

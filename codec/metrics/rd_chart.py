@@ -21,7 +21,7 @@ LOOK = {  # codec -> (name on the chart, colour)
 }
 SEQUENCES = {
     "statue": "Statue, 20 frames, 101,275 Gaussians",
-    "lumberjack": "Trained lumberjack, 20 frames",
+    "lumberjack": "Trained lumberjack, 30 frames",
     "statue-0": "statue (SH 0)",
     "playbot": "playbot (SH 2)",
     "fruit": "fruit (SH 3)",

@@ -45,8 +45,8 @@ RATE_EVERY = 8  # the rate term has every coefficient, an image few of them: onc
 
 
 def rounded(c: torch.Tensor) -> torch.Tensor:
-    """The decoder's integers; the gradient passes straight through."""
-    return c + (torch.sign(c) * torch.floor(c.abs() + 0.5 - ROUND_DOWN) - c).detach()
+    """The decoder's integers."""
+    return torch.nn.functional.softshrink(c, ROUND_DOWN).round_()
 
 
 class GroupModel:
@@ -141,10 +141,21 @@ class GroupModel:
             out[name] = c.contiguous().requires_grad_()
         return out
 
-    def residual(self, name: str, t: int) -> torch.Tensor:
-        """[N, C] residual of an attribute at frame `t`, in its own units."""
-        c = rounded(self.coefficients[name])
-        return self.unit[name] * torch.einsum("k,knc->nc", self.basis[: len(c), t], c)
+    @torch.no_grad()
+    def residuals(self, t: int) -> dict[str, torch.Tensor]:
+        """attribute -> [N, C], residual at frame `t`, in its own units."""
+        return {n: torch.tensordot(self._at(n, t), rounded(c), 1) for n, c in self.coefficients.items()}
+
+    @torch.no_grad()
+    def backward(self, t: int, residuals: dict[str, torch.Tensor]) -> None:
+        """Adds to the gradient of the coefficients that of `residuals`, of frame `t`, straight through the rounding."""
+        for n, c in self.coefficients.items():
+            grad = self._at(n, t)[:, None, None] * (residuals[n].grad * self.free[:, None])
+            c.grad = grad if c.grad is None else c.grad.add_(grad)
+
+    def _at(self, name: str, t: int) -> torch.Tensor:
+        """[K] what each coefficient of an attribute is worth at frame `t`."""
+        return self.unit[name] * self.basis[: len(self.coefficients[name]), t]
 
     def _relaxed(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
         """Canonical attributes with uniform noise in place of their quantization, where they are new."""
@@ -155,22 +166,24 @@ class GroupModel:
             out[name] = p[name] + noise
         return out
 
-    def frame(self, t: int, generator: torch.Generator | None = None) -> dict[str, torch.Tensor]:
-        """Attributes of frame `t`, with noise on the canonical ones if there is a generator; differentiable in the
-        coefficients."""
+    def frame(
+        self, t: int, residuals: dict[str, torch.Tensor], generator: torch.Generator | None = None
+    ) -> dict[str, torch.Tensor]:
+        """Attributes of frame `t`, with noise on the canonical ones if there is a generator; differentiable in its
+        residuals."""
         new = self.known < len(self.key)
         p = self._relaxed(generator) if new and generator is not None else self.key.params
         means = self.graph.carry(p["means"], self.poses[t])[0] if new else self.means[t]
-        dq = self.residual("quats", t)
-        opacities = p["logit_opacities"] + self.residual("logit_opacities", t)[:, 0]
+        dq = residuals["quats"]
+        opacities = p["logit_opacities"] + residuals["logit_opacities"][:, 0]
         w = (1 - dq.square().sum(1, keepdim=True)).clamp(min=1e-6).sqrt()
         return {
             **p,
-            "means": means + self.residual("means", t),
+            "means": means + residuals["means"],
             "quats": quat_multiply(torch.cat([w, dq], 1), quat_multiply(self.turned[t], p["quats"])),
-            "log_scales": p["log_scales"] + self.residual("log_scales", t),
+            "log_scales": p["log_scales"] + residuals["log_scales"],
             "logit_opacities": torch.where((self.born <= t) & (t < self.end), opacities, HIDDEN),
-            "sh0": p["sh0"] + self.residual("sh0", t),
+            "sh0": p["sh0"] + residuals["sh0"],
         }
 
     def bits(self, generator: torch.Generator) -> torch.Tensor:
@@ -205,7 +218,7 @@ class GroupModel:
 
     def gaussians(self, t: int) -> Gaussians:
         """Frame `t` in numpy."""
-        return Model(self.frame(t)).gaussians()
+        return Model(self.frame(t, self.residuals(t))).gaussians()
 
 
 def _padded(model: Model, last: Model) -> Model:
@@ -244,7 +257,8 @@ class _Finetuner:
         for g in self.optimizer.param_groups:
             g["lr"] = g["base"] * fade
         group, names = self.group, list(self.group.coefficients)
-        params = group.frame(t, self.noise)
+        residuals = {n: r.requires_grad_() for n, r in group.residuals(t).items()}
+        params = group.frame(t, residuals, self.noise)
         target = self.views.draw(self.frames[t])
         result = compare(params, target, self.settings, self.rng, self.workspace)
         self.loss += (result.loss - self.loss) * (LOSS_SHARE if self.loss else 1.0)
@@ -260,6 +274,7 @@ class _Finetuner:
                 extra = {n: CANONICAL_PRICE * price * g for n, g in rate.items()}
         self.optimizer.zero_grad()
         torch.autograd.backward(heads, seeds)
+        group.backward(t, residuals)
         self.optimizer.step()
         if self.canonical_rates:
             back = quat_conjugate(group.turned[t])

@@ -20,6 +20,7 @@ from gscodec.train.graph import quat_conjugate, quat_multiply
 NEAR, WINDOW = 4, 32  # contexts: so many nearest among so many before (spec 7.3)
 GRID_MOST = 2**20  # steps along an axis: far floaters make them coarser
 LEAST_SPREAD, LEAST_WIDTH = 0.5, 0.05  # steps
+LN2 = float(np.log(2))
 _H = 0.5**0.5
 _TURNS = torch.zeros(27, 4)  # [9 a + 3 b + c] the turn after which axes a, b, c are the first, second, third
 _TURNS[[5, 7, 11, 15, 19, 21]] = torch.tensor(
@@ -30,16 +31,37 @@ _TURNS[[5, 7, 11, 15, 19, 21]] = torch.tensor(
 def laplace_bits(x: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
     """Bits of integers under a Laplace law of scale exp(log_scale), at real x (the relaxed quantizer's output).
 
-    Probability of the unit interval around x, computed without cancellation.
+    Probability of the unit interval around x, computed without cancellation; differentiable in both.
     """
-    b = torch.exp(log_scale)
-    a = x.abs()
-    near = a.clamp(max=0.5)  # keeps the branch that is not taken, and its gradient, finite
-    inner = 1 - 0.5 * (torch.exp((near - 0.5) / b) + torch.exp(-(near + 0.5) / b))
-    tail = torch.exp(-(a - 0.5).clamp(min=0) / b) * 0.5 * (-torch.expm1(-1 / b))
-    p = torch.where(a < 0.5, inner, tail)
-    far = (a - 0.5).clamp(min=0) / b / np.log(2) + 1 - torch.log2(-torch.expm1(-1 / b))  # where p underflows
-    return torch.where(p > 1e-9, -torch.log2(p.clamp(min=1e-9)), far)
+    return _LaplaceBits.apply(x, log_scale)
+
+
+class _LaplaceBits(torch.autograd.Function):
+    """With its derivatives in closed form: a few passes over memory in place of one for each operation."""
+
+    @staticmethod
+    def forward(ctx, x: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
+        rate = torch.exp(-log_scale)
+        a = x.abs()
+        inside, near = a < 0.5, a.clamp(max=0.5)
+        rising, falling = torch.exp((near - 0.5) * rate), torch.exp(-(near + 0.5) * rate)
+        p = 1 - 0.5 * (rising + falling)
+        off, beyond = (a - 0.5) * rate, -torch.expm1(-rate)
+        bits = torch.where(inside, -torch.log2(p), off / LN2 + 1 - torch.log2(beyond))
+        share = rate / (2 * LN2) / p
+        by_x = torch.where(inside, share * (rising - falling), rate / LN2) * x.sign()
+        by_scale = None
+        if ctx.needs_input_grad[1]:
+            tail = (rate * (1 - beyond) / beyond - off) / LN2
+            by_scale = torch.where(inside, share * (rising * (0.5 - near) + falling * (0.5 + near)), tail)
+        ctx.save_for_backward(by_x, by_scale)
+        ctx.shape = log_scale.shape
+        return bits
+
+    @staticmethod
+    def backward(ctx, seed: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        by_x, by_scale = ctx.saved_tensors
+        return seed * by_x, None if by_scale is None else (seed * by_scale).sum_to_size(ctx.shape)
 
 
 def neighbours(means: torch.Tensor, step: float) -> torch.Tensor:
