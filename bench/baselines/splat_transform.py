@@ -1,6 +1,6 @@
 """PlayCanvas' splat-transform, the reference writer of .sog and .spz: frames in, one file for each out.
 
-Found on the PATH or where the environment variable SPLAT_TRANSFORM says: `npm i -g @playcanvas/splat-transform`. Its
+Found on the PATH or where the environment variable SPLAT_TRANSFORM says: `npm i -g @playcanvas/splat-transform@3`. Its
 times contain the start of node and the reading of a .ply.
 """
 
@@ -27,7 +27,7 @@ def splat_transform() -> str:
     found = shutil.which(os.environ.get("SPLAT_TRANSFORM", "splat-transform"))
     if not found:
         raise UsageError(
-            "the SOG and SPZ baselines need splat-transform; npm i -g @playcanvas/splat-transform, "
+            "the SOG and SPZ baselines need splat-transform; npm i -g @playcanvas/splat-transform@3, "
             "or name it in SPLAT_TRANSFORM"
         )
     return found
