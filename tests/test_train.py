@@ -281,6 +281,17 @@ def test_what_jumps_is_found_and_what_is_gone_is_not():
     assert whereabouts(model, some, 2, views, changes, changes.advance(2)) is None
 
 
+def test_a_longer_group_has_more_temporal_frequencies():
+    key = from_gaussians(blob(50))
+    everything = torch.ones(50, dtype=torch.bool)
+    graph = NodeGraph.of(key.params["means"], torch.ones(50), 1.0, everything, count=8)
+    for frames, means, colours in ((4, 4, 4), (20, 10, 6), (30, 15, 9), (31, 16, 10)):
+        poses = [Pose.rest(graph)] * frames
+        group = GroupModel(graph, None, [key] * frames, poses, steps_for(50, 1.0), everything)
+        assert len(group.coefficients["means"]) == means
+        assert len(group.coefficients["sh0"]) == colours
+
+
 def test_masks_say_where_nothing_is():
     """A part of the subject is gone in frame 1, everything in frame 2: what is dead ends its lifetime."""
     left, right = (
