@@ -331,6 +331,7 @@ def test_laplace_bits_are_code_lengths():
     for b in (0.1, 0.5, 2.0, 20.0):
         bits = laplace_bits(x, torch.tensor(np.log(b)))
         assert torch.exp2(-bits.double()).sum() == pytest.approx(1, abs=1e-3)
+    assert laplace_bits(x, torch.tensor(20.0)).isfinite().all(), "no law is too wide"
     x = torch.tensor([0.3, 2.0, -7.0, 300.0], requires_grad=True)
     laplace_bits(x, torch.tensor(-1.0)).sum().backward()
     assert (x.grad * x.detach() > 0).all(), "every coefficient is pulled to zero, however far away"

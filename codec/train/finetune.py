@@ -93,8 +93,6 @@ class GroupModel:
         self.coefficients = self._project(tracked)  # in units of the quantization step
         self.free = torch.stack([(c.detach().abs() > STARTS).any(2).any(0) for c in self.coefficients.values()]).any(0)
         self.free |= moved
-        for c in self.coefficients.values():
-            c.register_hook(lambda grad: grad * self.free[:, None])
         self.log_scales = {
             n: torch.full((len(c), 1, 1), -1.0, requires_grad=True) for n, c in self.coefficients.items()
         }
@@ -148,10 +146,12 @@ class GroupModel:
 
     @torch.no_grad()
     def backward(self, t: int, residuals: dict[str, torch.Tensor]) -> None:
-        """Adds to the gradient of the coefficients that of `residuals`, of frame `t`, straight through the rounding."""
+        """Adds to the gradient of the coefficients (of their bits, if it has been taken) that of `residuals`, of frame
+        `t`, straight through the rounding. Gaussians that are not free have none."""
+        free = self.free[:, None]
         for n, c in self.coefficients.items():
-            grad = self._at(n, t)[:, None, None] * (residuals[n].grad * self.free[:, None])
-            c.grad = grad if c.grad is None else c.grad.add_(grad)
+            grad = self._at(n, t)[:, None, None] * (residuals[n].grad * free)
+            c.grad = grad if c.grad is None else c.grad.mul_(free).add_(grad)
 
     def _at(self, name: str, t: int) -> torch.Tensor:
         """[K] what each coefficient of an attribute is worth at frame `t`."""

@@ -45,7 +45,7 @@ class _LaplaceBits(torch.autograd.Function):
         a = x.abs()
         inside, near = a < 0.5, a.clamp(max=0.5)
         rising, falling = torch.exp((near - 0.5) * rate), torch.exp(-(near + 0.5) * rate)
-        p = 1 - 0.5 * (rising + falling)
+        p = (1 - 0.5 * (rising + falling)).clamp(min=1e-9)  # a law so wide that it would be rounded to 0
         off, beyond = (a - 0.5) * rate, -torch.expm1(-rate)
         bits = torch.where(inside, -torch.log2(p), off / LN2 + 1 - torch.log2(beyond))
         share = rate / (2 * LN2) / p
