@@ -11,6 +11,7 @@ from gscodec.camera import Calibration
 from gscodec.capture import Capture, View
 from gscodec.encode.coder import GroupCoder
 from gscodec.encode.group import group_integers
+from gscodec.encode.refine import Moving
 from gscodec.gaussians import Gaussians, GaussianSequence, Group
 from gscodec.metrics.codec_cameras import codec_cameras
 from gscodec.metrics.evaluate import evaluate_splats
@@ -30,6 +31,17 @@ def test_a_refined_frame_is_nearer(monkeypatch):
     (plain, before), (refined, after) = found
     assert after > before + 0.1
     assert refined < 1.03 * plain
+
+
+def test_what_no_view_shows_does_not_move():
+    """Squares of such derivatives are 0 in single precision, where Adam would divide by nothing."""
+    latents = np.full((1, 1), 0.4)
+    part = Moving("sh0", latents, np.zeros((1, 1)), (np.zeros((1, 1)), np.zeros((1, 1))))
+    for step, derivative in enumerate((-1e-24, 1e-24, -1e-24), 1):
+        part.follow(np.full((1, 1), derivative, np.float32), 0.1, step)
+    assert part.change == 0
+    part.follow(np.full((1, 1), -1e-2, np.float32), 0.2, 4)
+    assert part.change == 1
 
 
 def test_positions_and_order_stay():

@@ -18,8 +18,8 @@ from gscodec.gaussians import Gaussians
 from gscodec.render.sensitivity import derivatives
 from gscodec.render.workspace import Workspace
 
-RATE = 0.01  # quantization steps a view, at first
-BETAS, EPS = (0.9, 0.99), 1e-30
+BETAS = (0.9, 0.99)
+EPS = 1e-6  # of the squared differences' sum, by a step: what changes less stays (its square may be 0 in f32)
 INSIDE = 0.02  # quantization steps: so far from where it would change, at least, starts what is under an integer
 
 
@@ -71,11 +71,12 @@ def refine(
             derivative by its integers of that by its attribute ([N, C]).
     """
     workspace, names = Workspace(), {p.attribute for p in parts}
+    first = targets.drift / max(len(targets), 1) ** 0.5
     for step, (t, camera, background, target) in enumerate(targets.draw(source, frames), 1):
         now, chain = shown(t)
         off = lambda image, target=target: np.ascontiguousarray(image - target)  # noqa: E731
         derivative = derivatives(workspace, now, camera, off, names, background)
-        rate = RATE * (1 - (step - 1) / len(targets))
+        rate = first * (1 - (step - 1) / len(targets))
         for part, by_integers in zip(parts, chain, strict=True):
             part.follow(by_integers(derivative[part.attribute]), rate, step)
 

@@ -1,7 +1,7 @@
 """What refinement compares with: views drawn of the source, or the pictures of the capture that it was trained on.
 
 A model that was trained is only as near to its pictures as training came. Where they are at hand, rounded values are
-held against them and not against the model: so errors of the model are made up for as well.
+held against them and not against the model: so errors of the model are made up for as well, for which they go farther.
 """
 
 from __future__ import annotations
@@ -24,7 +24,13 @@ Target = tuple[int, Camera, Colour, np.ndarray]  # frame, camera, background, [H
 
 
 class DrawnTargets:
-    """Views of the source, by `cameras`, that no step has seen before."""
+    """Views of the source, by `cameras`, that no step has seen before.
+
+    Attributes:
+        drift: quantization steps that the first view moves an integer, times the root of the number of views.
+    """
+
+    drift = 0.1
 
     def __init__(self, cameras: list[Camera]):
         self._cameras = cameras
@@ -51,7 +57,12 @@ class PictureTargets:
 
     Args:
         first_frame: of the capture, where the group begins. calibration: of its cameras.
+
+    Attributes:
+        drift: as of `DrawnTargets`.
     """
+
+    drift = 0.7
 
     def __init__(self, capture: Capture, calibration: Calibration, first_frame: int, count: int):
         self._capture, self._calibration, self._first, self._count = capture, calibration, first_frame, count
