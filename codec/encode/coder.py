@@ -113,7 +113,8 @@ class GroupCoder:
         views = usual * len(group) if self._refine is None else self._refine
         if not pictured:
             return {"views": views}
-        return {"views": views, "pictures": PictureTargets(self._capture, group.calibration, first_frame, views)}
+        given = self._capture, group.calibration, first_frame, views, len(group.frames[0])
+        return {"views": views, "pictures": PictureTargets(*given)}
 
     def state(self) -> dict[str, np.ndarray]:
         """What the next group may be predicted from; empty if from nothing."""

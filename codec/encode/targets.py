@@ -57,15 +57,16 @@ class PictureTargets:
 
     Args:
         first_frame: of the capture, where the group begins. calibration: of its cameras.
+        gaussians: in the group.
 
     Attributes:
-        drift: as of `DrawnTargets`.
+        drift: as of `DrawnTargets`; the fewer pixels tell about each Gaussian, the nearer integers stay to the model.
     """
 
-    drift = 0.7
-
-    def __init__(self, capture: Capture, calibration: Calibration, first_frame: int, count: int):
+    def __init__(self, capture: Capture, calibration: Calibration, first_frame: int, count: int, gaussians: int):
         self._capture, self._calibration, self._first, self._count = capture, calibration, first_frame, count
+        pixels = sum(c.width * c.height for c in calibration.cameras if c.split == "train")
+        self.drift = min(1.0, 0.03 * (pixels / max(gaussians, 1)) ** 0.5)
 
     def __len__(self) -> int:
         return self._count
