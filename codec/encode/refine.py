@@ -71,7 +71,7 @@ def refine(
             derivative by its integers of that by its attribute ([N, C]).
     """
     workspace, names = Workspace(), {p.attribute for p in parts}
-    first = targets.drift / max(len(targets), 1) ** 0.5
+    first = targets.drift / len(targets) ** 0.5
     for step, (t, camera, background, target) in enumerate(targets.draw(source, frames), 1):
         now, chain = shown(t)
         off = lambda image, target=target: np.ascontiguousarray(image - target)  # noqa: E731
