@@ -79,7 +79,9 @@ def encode(
     ] = None,
     refine: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Views to refine each group by.", show_default="40 a frame of a capture"),
+        typer.Option(
+            metavar="N", help="Views to refine each group by.", show_default="4 times each picture of a capture"
+        ),
     ] = None,
     ray: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Train on this Ray cluster; its machines see SEQ too.")

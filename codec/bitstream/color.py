@@ -17,4 +17,4 @@ def decorrelate(rgb: np.ndarray) -> np.ndarray:
 
 def correlate(channels: np.ndarray) -> np.ndarray:
     """Inverse of `decorrelate`."""
-    return channels @ TO_RGB.T
+    return channels @ TO_RGB.T.astype(channels.dtype)

@@ -22,7 +22,7 @@ from gscodec.errors import CaptureError
 from gscodec.gaussians import Group
 
 FRAME_VIEWS = 10  # by which a group of few Gaussians is refined, if nobody says
-FRAME_PICTURES = 40  # the same where there are pictures: training took longer, so it pays for more Gaussians, too
+SEEN, FRAME_PICTURES = 4, 80  # where there are pictures, so often each of them, so many of a frame at most
 DOUBT = 0.7  # a predicted group of more than so many bytes a frame of its reference is coded both ways
 
 
@@ -108,11 +108,11 @@ class GroupCoder:
     def _refining(self, group: Group, first_frame: int) -> dict:
         """By what a group is refined: `views` and `pictures` of `code_group`."""
         pictured = self._capture is not None and group.calibration is not None
-        few = len(group) > 1 and len(group.frames[0]) <= FEW
-        usual = FRAME_PICTURES if pictured else FRAME_VIEWS if few else 0
-        views = usual * len(group) if self._refine is None else self._refine
         if not pictured:
-            return {"views": views}
+            usual = FRAME_VIEWS if len(group) > 1 and len(group.frames[0]) <= FEW else 0
+            return {"views": usual * len(group) if self._refine is None else self._refine}
+        trained = sum(c.split == "train" for c in group.calibration.cameras)
+        views = min(SEEN * trained, FRAME_PICTURES) * len(group) if self._refine is None else self._refine
         given = self._capture, group.calibration, first_frame, views, len(group.frames[0])
         return {"views": views, "pictures": PictureTargets(*given)}
 

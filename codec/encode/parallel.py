@@ -1,9 +1,9 @@
-"""Frames side by side in threads: numpy lets go of the interpreter while it computes."""
+"""Work side by side in threads: numpy and the kernels let go of the interpreter while they compute."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
@@ -14,3 +14,13 @@ def each_frame(make: Callable[[int], Result], frames: int) -> list[Result]:
     """`make(t)` of every frame, in order; the calls must not depend on each other."""
     with ThreadPoolExecutor(min(frames, os.cpu_count() or 1)) as pool:
         return list(pool.map(make, range(frames)))
+
+
+def ahead(items: Iterable[Result]) -> Iterator[Result]:
+    """`items`, the next one being made while one is used."""
+    items, end = iter(items), object()
+    with ThreadPoolExecutor(1) as pool:
+        coming = pool.submit(next, items, end)
+        while (item := coming.result()) is not end:
+            coming = pool.submit(next, items, end)
+            yield item

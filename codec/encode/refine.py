@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gscodec.bitstream.color import correlate
+from gscodec.encode.parallel import ahead
 from gscodec.encode.targets import DrawnTargets, PictureTargets
 from gscodec.gaussians import Gaussians
 from gscodec.render.sensitivity import derivatives
@@ -29,6 +30,9 @@ class Moving:
     Args:
         latents: what was quantized. integers: to what.
         margins: how much farther than half a step above, and below, an integer still is the better one (`rdo.margins`).
+
+    Attributes:
+        change: of the integers since the start: -1, 0 or 1.
     """
 
     def __init__(self, attribute: str, latents: np.ndarray, integers: np.ndarray, margins: tuple):
@@ -36,17 +40,12 @@ class Moving:
         self.attribute, self._integers, self._margins = attribute, integers, margins
         self._under = np.clip(latents, integers - 0.5 - down + INSIDE, integers + 0.5 + up - INSIDE).astype(np.float32)
         self._first, self._second = (np.zeros_like(self._under) for _ in range(2))
+        self.change = np.zeros(self._under.shape, np.int8)
 
     @property
     def integers(self) -> np.ndarray:
         """As they are now."""
         return self._integers + self.change
-
-    @property
-    def change(self) -> np.ndarray:
-        """-1, 0 or 1, since the start."""
-        off, (up, down) = self._under - self._integers, self._margins
-        return (off > 0.5 + up).astype(np.int8) - (-off > 0.5 + down)
 
     def follow(self, derivative: np.ndarray, rate: float, step: int) -> None:
         """Adam's `step` (from 1) along the derivative by the integers."""
@@ -54,6 +53,8 @@ class Moving:
         self._second += (1 - BETAS[1]) * (derivative * derivative - self._second)
         size = np.sqrt(self._second / (1 - BETAS[1] ** step)) + EPS
         self._under -= rate * self._first / (1 - BETAS[0] ** step) / size
+        off, (up, down) = self._under - self._integers, self._margins
+        self.change = (off > 0.5 + up).astype(np.int8) - (-off > 0.5 + down)
 
 
 def refine(
@@ -72,7 +73,7 @@ def refine(
     """
     workspace, names = Workspace(), {p.attribute for p in parts}
     first = targets.drift / len(targets) ** 0.5
-    for step, (t, camera, background, target) in enumerate(targets.draw(source, frames), 1):
+    for step, (t, camera, background, target) in enumerate(ahead(targets.draw(source, frames)), 1):
         now, chain = shown(t)
         off = lambda image, target=target: np.ascontiguousarray(image - target)  # noqa: E731
         derivative = derivatives(workspace, now, camera, off, names, background)

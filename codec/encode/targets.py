@@ -18,6 +18,7 @@ from gscodec.render.sensitivity import GREY, arrays_of, sensitivity_cameras
 from gscodec.render.workspace import Workspace
 
 CACHE_BYTES = 1 << 30  # of pictures
+DRIFT, DRIFT_MOST = 0.03, 1.0  # toward pictures of the capture: times the root of their pixels per Gaussian; at most
 
 Colour = tuple[float, float, float]
 Target = tuple[int, Camera, Colour, np.ndarray]  # frame, camera, background, [H, W, 3] f32 picture over it
@@ -65,21 +66,20 @@ class PictureTargets:
 
     def __init__(self, capture: Capture, calibration: Calibration, first_frame: int, count: int, gaussians: int):
         self._capture, self._calibration, self._first, self._count = capture, calibration, first_frame, count
-        pixels = sum(c.width * c.height for c in calibration.cameras if c.split == "train")
-        self.drift = min(1.0, 0.03 * (pixels / max(gaussians, 1)) ** 0.5)
+        self._trained = [i for i, c in enumerate(calibration.cameras) if c.split == "train"]
+        pixels = sum(calibration.cameras[i].width * calibration.cameras[i].height for i in self._trained)
+        self.drift = min(DRIFT_MOST, DRIFT * (pixels / max(gaussians, 1)) ** 0.5)
 
     def __len__(self) -> int:
         return self._count
 
     def draw(self, source: Callable[[int], Gaussians], frames: int) -> Iterator[Target]:
         """As of `DrawnTargets`; what the source looks like is not asked."""
-        cameras = self._calibration.cameras
-        trained = [i for i, c in enumerate(cameras) if c.split == "train"]
-        largest = max(4 * c.width * c.height for c in cameras)
+        largest = max(4 * c.width * c.height for c in self._calibration.cameras)
         read = lru_cache(max(1, CACHE_BYTES // largest))(self._read)
         random, order = np.random.default_rng(0), [[] for _ in range(frames)]
         for t in _turns(random, frames, len(self)):
-            order[t] = order[t] or random.permutation(trained).tolist()
+            order[t] = order[t] or random.permutation(self._trained).tolist()
             i = order[t].pop()
             view, camera = read(i, t)
             background = tuple(random.uniform(0, 1, 3).tolist())
