@@ -3,7 +3,8 @@
 usage: python bench/run.py [statue] [statue40] [lumberjack] [demo]
 
 All but `demo` need the data folder that the environment variable GSCODEC_DATA names (lumberjack/ and splats/statue.ply
-in it, tools/animate_splat.py beside it); without it they are left out with a word.
+in it, tools/animate_splat.py beside it); without it they are left out with a word. `demo` also draws
+bench/charts/demo.png.
 """
 
 from __future__ import annotations
@@ -16,7 +17,14 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
+
 from gscodec.bench.machine import RESULTS, ROOT, write_result
+from gscodec.capture import composite, open_capture
+from gscodec.decode import open_stream
+from gscodec.render.png import write_png
+from gscodec.render.sensitivity import GREY, arrays_of
+from gscodec.render.workspace import Workspace
 
 GSCODEC = [sys.executable, "-c", "from gscodec.cli import main; main()"]
 
@@ -69,8 +77,22 @@ def lumberjack(data: Path, folder: Path) -> dict:
 
 
 def demo(_: Path | None, folder: Path) -> dict:
-    """The bundled example of `make demo`."""
-    return measure("demo", ROOT / "examples" / "lumberjack", folder)
+    """The bundled example of `make demo`, and the picture of it."""
+    source = ROOT / "examples" / "lumberjack"
+    result = measure("demo", source, folder)
+    write_png(ROOT / "bench" / "charts" / "demo.png", beside(folder / "demo.gsv", source, (0, 10, 19)))
+    return result
+
+
+def beside(stream: Path, source: Path, frames: tuple[int, ...]) -> np.ndarray:
+    """[H, W, 3] u8: the first test view of the capture and the same of the stream, frame beside frame."""
+    capture, decoded = open_capture(source), open_stream(stream)
+    camera = capture.indices("test")[0]
+    views = [capture.view(camera, t) for t in frames]
+    drawn = [Workspace().draw(arrays_of(decoded.frame(t)), capture.cameras[camera], GREY) for t in frames]
+    rows, columns = (np.flatnonzero(np.any([v.alpha for v in views], (0, 1 + axis))) for axis in (1, 0))
+    part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return np.hstack([picture[part] for v, d in zip(views, drawn, strict=True) for picture in (composite(v, GREY), d)])
 
 
 CASES = {"demo": demo, "statue": statue, "statue40": statue40, "lumberjack": lumberjack}
