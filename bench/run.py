@@ -20,11 +20,11 @@ from pathlib import Path
 import numpy as np
 
 from gscodec.bench.machine import RESULTS, ROOT, write_result
-from gscodec.capture import composite, open_capture
+from gscodec.capture import View, composite, cropped, open_capture
 from gscodec.decode import open_stream
+from gscodec.metrics.evaluate import BACKGROUND
+from gscodec.render.image import render_image
 from gscodec.render.png import write_png
-from gscodec.render.sensitivity import GREY, arrays_of
-from gscodec.render.workspace import Workspace
 
 GSCODEC = [sys.executable, "-c", "from gscodec.cli import main; main()"]
 
@@ -87,12 +87,13 @@ def demo(_: Path | None, folder: Path) -> dict:
 def beside(stream: Path, source: Path, frames: tuple[int, ...]) -> np.ndarray:
     """[H, W, 3] u8: the first test view of the capture and the same of the stream, frame beside frame."""
     capture, decoded = open_capture(source), open_stream(stream)
-    camera = capture.indices("test")[0]
-    views = [capture.view(camera, t) for t in frames]
-    drawn = [Workspace().draw(arrays_of(decoded.frame(t)), capture.cameras[camera], GREY) for t in frames]
-    rows, columns = (np.flatnonzero(np.any([v.alpha for v in views], (0, 1 + axis))) for axis in (1, 0))
-    part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    return np.hstack([picture[part] for v, d in zip(views, drawn, strict=True) for picture in (composite(v, GREY), d)])
+    test, pictures = capture.indices("test")[0], []
+    views = [capture.view(test, t) for t in frames]
+    covered = np.max([v.alpha for v in views], 0)
+    for t, view in zip(frames, views, strict=True):
+        reference, camera = cropped(View(composite(view, BACKGROUND), covered), capture.cameras[test])
+        pictures += [reference.rgb, render_image(decoded.frame(t), camera, BACKGROUND)]
+    return np.hstack(pictures)
 
 
 CASES = {"demo": demo, "statue": statue, "statue40": statue40, "lumberjack": lumberjack}

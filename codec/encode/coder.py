@@ -108,11 +108,13 @@ class GroupCoder:
     def _refining(self, group: Group, first_frame: int) -> dict:
         """By what a group is refined: `views` and `pictures` of `code_group`."""
         pictured = self._capture is not None and group.calibration is not None
-        if not pictured:
+        if pictured:
+            usual = min(SEEN * len(self._capture.indices("train")), FRAME_PICTURES)
+        else:
             usual = FRAME_VIEWS if len(group) > 1 and len(group.frames[0]) <= FEW else 0
-            return {"views": usual * len(group) if self._refine is None else self._refine}
-        trained = sum(c.split == "train" for c in group.calibration.cameras)
-        views = min(SEEN * trained, FRAME_PICTURES) * len(group) if self._refine is None else self._refine
+        views = usual * len(group) if self._refine is None else self._refine
+        if not pictured:
+            return {"views": views}
         given = self._capture, group.calibration, first_frame, views, len(group.frames[0])
         return {"views": views, "pictures": PictureTargets(*given)}
 

@@ -66,8 +66,8 @@ class PictureTargets:
 
     def __init__(self, capture: Capture, calibration: Calibration, first_frame: int, count: int, gaussians: int):
         self._capture, self._calibration, self._first, self._count = capture, calibration, first_frame, count
-        self._trained = [i for i, c in enumerate(calibration.cameras) if c.split == "train"]
-        pixels = sum(calibration.cameras[i].width * calibration.cameras[i].height for i in self._trained)
+        self._trained = capture.indices("train")
+        pixels = sum(capture.cameras[i].width * capture.cameras[i].height for i in self._trained)
         self.drift = min(DRIFT_MOST, DRIFT * (pixels / max(gaussians, 1)) ** 0.5)
 
     def __len__(self) -> int:

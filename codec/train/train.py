@@ -56,7 +56,7 @@ def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
     Raises:
         CaptureError: nothing to start from.
     """
-    cameras = [i for i, c in enumerate(capture.cameras) if c.split == "train"]
+    cameras = capture.indices("train")
     if not cameras:
         raise CaptureError(f"{capture.name}: no training camera, expected at least one with split 'train'")
     views = []

@@ -45,7 +45,7 @@ class Views:
 
     def __init__(self, capture, seed: int):
         self.capture = capture
-        self.train_cameras = [i for i, c in enumerate(capture.cameras) if c.split == "train"]
+        self.train_cameras = capture.indices("train")
         self.exposure = Exposure(len(capture.cameras), self.train_cameras)
         self.extrinsics = Extrinsics(len(capture.cameras), self.train_cameras)
         self._seed = seed
