@@ -18,11 +18,13 @@ from unittest.mock import patch
 
 import numpy as np
 
-from gscodec.bench import train
-from gscodec.bench.machine import ROOT, update_entries
+from bench import train
+from bench.machine import ROOT, update_entries
 from gscodec.capture import Capture
 from gscodec.errors import UsageError
-from gscodec.train import changes, finetune, motion
+from gscodec.train import change_detection as changes
+from gscodec.train import finetune
+from gscodec.train import tracking as motion
 from gscodec.train import train as recipe
 
 WHOLE = "whole recipe"

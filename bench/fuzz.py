@@ -15,7 +15,7 @@ import re
 import subprocess
 import sys
 
-from gscodec.bench.machine import RESULTS, ROOT, write_result
+from bench.machine import RESULTS, ROOT, write_result
 
 FUZZ = ROOT / "codec" / "native" / "fuzz"
 TARGETS = ("demux", "group", "units")

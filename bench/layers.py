@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.machine import RESULTS, write_result
 from gscodec import _native
-from gscodec.bench.machine import RESULTS, write_result
-from gscodec.encode.group import code_group
-from gscodec.gaussians import Gaussians, Group
+from gscodec.encode.intra_group import code_group
 from gscodec.metrics.codec_cameras import codec_cameras
 from gscodec.metrics.image import psnr
+from gscodec.model.gaussians import Gaussians, Group
 from gscodec.render.image import render_image
 from gscodec.splats import read_splat
 

@@ -26,9 +26,9 @@ import threading
 import time
 from pathlib import Path
 
-from gscodec.bench.browser import Browser, Browsers
-from gscodec.bench.machine import RESULTS, ROOT, write_result
-from gscodec.bench.run import animated, gscodec
+from bench.browser import Browser, Browsers
+from bench.machine import RESULTS, ROOT, write_result
+from bench.run import animated, gscodec
 from gscodec.player.server import Server
 
 SIZE = "512x512"

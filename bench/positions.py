@@ -15,8 +15,8 @@ from pathlib import Path
 import DracoPy
 import numpy as np
 
+from bench.machine import write_result
 from gscodec import _native
-from gscodec.bench.machine import write_result
 from gscodec.splats import open_sequence
 
 BITS = (9, 10, 11, 12, 13, 14)

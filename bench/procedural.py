@@ -12,8 +12,8 @@ from functools import cache
 
 import numpy as np
 
-from gscodec.camera import Camera, look_at
 from gscodec.capture import Capture, View
+from gscodec.model.camera import Camera, look_at
 
 SAMPLES = 3  # rays along each side of a pixel
 FOCAL = 1.9  # widths

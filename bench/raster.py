@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.bench.scenes import DISTANCE, UP, capsule, capsule_camera, file_scene
-from gscodec.camera import Camera
+from bench.scenes import DISTANCE, UP, capsule, capsule_camera, file_scene
 from gscodec.errors import UsageError
-from gscodec.gaussians import Gaussians
+from gscodec.model.camera import Camera
+from gscodec.model.gaussians import Gaussians
 from gscodec.render.image import render_image, render_rgba
 from gscodec.render.step import render_loss
 from gscodec.render.workspace import PARAMETERS, Workspace, simd_levels

@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from bench.machine import RESULTS, write_result
 from gscodec import _native
-from gscodec.bench.machine import RESULTS, write_result
 from gscodec.bitstream.quantization import steps_for, subject_radius
 from gscodec.capture import open_capture
-from gscodec.encode.group import group_integers
+from gscodec.encode.intra_group import group_integers
+from gscodec.train.entropy_model import CanonicalRate
 from gscodec.train.model import from_gaussians
-from gscodec.train.rate import CanonicalRate
 from gscodec.train.settings import train_settings
 from gscodec.train.train import train_groups
 

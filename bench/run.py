@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.bench.machine import RESULTS, ROOT, write_result
+from bench.machine import RESULTS, ROOT, write_result
 from gscodec.capture import View, composite, cropped, open_capture
 from gscodec.decode import open_stream
 from gscodec.metrics.evaluate import BACKGROUND

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.camera import Camera, look_at
 from gscodec.errors import UsageError
-from gscodec.gaussians import Gaussians
+from gscodec.model.camera import Camera, look_at
+from gscodec.model.gaussians import Gaussians
 from gscodec.render.movie import orbit_camera
 
 RADIUS, HEIGHT = 0.25, 1.8  # metres
@@ -52,7 +52,7 @@ def file_scene(name: str, data: Path, work: Path, width: int, height: int) -> tu
     Raises:
         UsageError: the files are missing.
     """
-    from gscodec.bench.sequences import open_case
+    from bench.sequences import open_case
     from gscodec.splats import open_sequence
 
     if name == "lumberjack":

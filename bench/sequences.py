@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from gscodec.errors import UsageError
-from gscodec.gaussians import GaussianSequence, Group
+from gscodec.model.gaussians import GaussianSequence, Group
 from gscodec.splats import open_sequence
 
 FRAMES = 20

@@ -11,10 +11,10 @@ import numpy as np
 
 from gscodec import _native
 from gscodec.bitstream.quantization import subject_radius
-from gscodec.camera import Camera
-from gscodec.encode.group import code_group
+from gscodec.encode.intra_group import code_group
 from gscodec.encode.stack import stack_group
-from gscodec.gaussians import Group
+from gscodec.model.camera import Camera
+from gscodec.model.gaussians import Group
 
 WITHIN = 1e-3
 KEYFRAME = ("group_header", "positions", "channels")

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.bench import train
-from gscodec.bench.machine import update_entries
-from gscodec.bench.procedural import Scene
-from gscodec.bench.stress_scenes import SCENES
-from gscodec.gaussians import Gaussians, Group
+from bench import train
+from bench.machine import update_entries
+from bench.procedural import Scene
+from bench.stress_scenes import SCENES
+from gscodec.model.gaussians import Gaussians, Group
 
 PRESET = "fast"
 BUDGET = {"gaussians_max": 3750, "initial_points": 2000}  # for pictures of 128 x 128

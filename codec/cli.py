@@ -17,10 +17,10 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from gscodec import __version__
-from gscodec.errors import GscodecError, UsageError
-from gscodec.frames import frame_range
-from gscodec.gaussians import GOP
+from . import __version__
+from .errors import GscodecError, UsageError
+from .frame_range import frame_range
+from .model.gaussians import GOP
 
 app = typer.Typer(
     help="Streaming volumetric video: captures and Gaussian sequences to one small playable file.",
@@ -89,9 +89,9 @@ def encode(
     report: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the report there.")] = None,
 ) -> None:
     """Capture or Gaussian sequence to a stream. A second run resumes; Ctrl-C leaves a playable file."""
-    from gscodec.commands import encode_input
-    from gscodec.encode.encode import EncodeSettings
-    from gscodec.progress import Bar
+    from .commands import encode_input
+    from .encode.encode import EncodeSettings
+    from .progress import Bar
 
     with Bar() as bar:
         settings = EncodeSettings(quality, _bits(bitrate), keep_all, random_access, layers, refine)
@@ -131,8 +131,8 @@ def train(
     quality: Quality = 50.0,
 ) -> None:
     """Capture to one .ply per frame, the first half of encode."""
-    from gscodec.commands import train_to_folder
-    from gscodec.progress import Bar
+    from .commands import train_to_folder
+    from .progress import Bar
 
     with Bar() as bar:
         options = {"preset": preset, "frames": frames, "gop": gop, "random_access": random_access, "quality": quality}
@@ -147,8 +147,8 @@ def decode(
     drc: Annotated[bool, typer.Option("--drc", help="Only the points, as Draco files.")] = False,
 ) -> None:
     """Stream to one standard 3DGS .ply per frame."""
-    from gscodec.decode import open_stream
-    from gscodec.splats import write_sequence, write_splat
+    from .decode import open_stream
+    from .splats import write_sequence, write_splat
 
     s = open_stream(stream)
     _warn_if_cut(s)
@@ -170,9 +170,9 @@ def render(
     frames: Frames = None,
 ) -> None:
     """Render a stream on the CPU to a video or images."""
-    from gscodec.decode import open_stream
-    from gscodec.progress import Bar
-    from gscodec.render.movie import render_stream
+    from .decode import open_stream
+    from .progress import Bar
+    from .render.movie import render_stream
 
     s = open_stream(stream)
     _warn_if_cut(s)
@@ -201,8 +201,8 @@ def info(
     maps: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the attribute maps as 16-bit images.")] = None,
 ) -> None:
     """What is in a file: groups, bits by attribute and unit."""
-    from gscodec.decode import open_stream
-    from gscodec.decode.report import describe, write_maps
+    from .decode import open_stream
+    from .decode.report import describe, write_maps
 
     s = open_stream(stream)
     _warn_if_cut(s)
@@ -237,8 +237,8 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """PSNR, SSIM, VMAF and temporal stability against a capture or the splats that were encoded."""
-    from gscodec.commands import evaluate_stream
-    from gscodec.progress import Bar
+    from .commands import evaluate_stream
+    from .progress import Bar
 
     with Bar() as bar:
         result = evaluate_stream(stream, seq, split=split, frames=frames, bar=bar)
@@ -283,7 +283,7 @@ def bench_raster(
     as_json: Json = False,
 ) -> None:
     """Speed of the rasterizer and of a training step, by scene, size, instruction set and threads."""
-    from gscodec.commands import bench_raster as measure
+    from .commands import bench_raster as measure
 
     def line(e: dict) -> str:
         return (
@@ -305,7 +305,7 @@ def bench_rd(
     as_json: Json = False,
 ) -> None:
     """Size against quality of gscodec and its peers, with BD-rates."""
-    from gscodec.commands import bench_rd as measure
+    from .commands import bench_rd as measure
 
     def line(e: dict) -> str:
         return (
@@ -336,7 +336,7 @@ def bench_train(
     as_json: Json = False,
 ) -> None:
     """Quality against time and size of training, ours and every frame alone."""
-    from gscodec.commands import bench_train as measure
+    from .commands import bench_train as measure
 
     def line(e: dict) -> str:
         size = "-" if e["kb_per_frame"] is None else f"{e['kb_per_frame']:.2f} kB/frame"
@@ -363,7 +363,7 @@ def bench_ablation(
     as_json: Json = False,
 ) -> None:
     """Training without one of its losses and tools at a time."""
-    from gscodec.commands import bench_ablation as measure
+    from .commands import bench_ablation as measure
 
     def line(e: dict) -> str:
         return (
@@ -383,7 +383,7 @@ def bench_stress(
     as_json: Json = False,
 ) -> None:
     """Training on small captures of what breaks 4D methods; fails if one does worse than bench/stress.py states."""
-    from gscodec.commands import bench_stress as measure
+    from .commands import bench_stress as measure
 
     def line(e: dict) -> str:
         if "psnr_fg" not in e or e["psnr_fg"] is None:
@@ -403,7 +403,7 @@ def chart(
     charts: Annotated[Path, typer.Argument(help="Folder for the charts.")] = Path("bench/charts"),
 ) -> None:
     """Charts (.svg and .png) of all results that have one."""
-    from gscodec.metrics.charts import draw_charts
+    from .metrics.charts import draw_charts
 
     for path in draw_charts(results, charts):
         _out.print(str(path))

@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.camera import Camera
-from gscodec.encode.encode import REFINE, EncodeReport, EncodeSettings, encode_groups, stream_config
-from gscodec.errors import UsageError, require
-from gscodec.frames import frame_range
-from gscodec.gaussians import GaussianSequence, Group
-from gscodec.part_file import part_file
-from gscodec.progress import Bar
+from .atomic_write import part_file
+from .encode.encode import REFINE, EncodeReport, EncodeSettings, encode_groups, stream_config
+from .errors import UsageError, require
+from .frame_range import frame_range
+from .model.camera import Camera
+from .model.gaussians import GaussianSequence, Group
+from .progress import Bar
 
 AXES = ("x", "y", "z")
 
@@ -42,7 +42,7 @@ def encode_input(
     Raises:
         UsageError, CaptureError: see the message.
     """
-    from gscodec.splats import detect_input
+    from .splats import detect_input
 
     if gop < 1:
         raise UsageError(f"--gop {gop} is out of range, expected at least 1 frame in a group")
@@ -88,7 +88,7 @@ def _encode_splats(source, out, settings, frames, gop, bar) -> EncodeReport:
 
 
 def _open_splats(source: Path, gop: int, bar: Bar) -> GaussianSequence:
-    from gscodec.splats import open_sequence
+    from .splats import open_sequence
 
     sequence = open_sequence(source, gop=gop)
     words = {
@@ -120,8 +120,8 @@ def _restrict(sequence: GaussianSequence, frames: str | None) -> GaussianSequenc
 
 def _encode_capture(source, out, settings, preset, frames, gop, cluster, bar) -> EncodeReport:
     require("torch", "training a capture")
-    from gscodec.train.settings import train_settings
-    from gscodec.train.train import Checkpoint, train_groups
+    from .train.settings import train_settings
+    from .train.train import Checkpoint, train_groups
 
     capture = _open_capture(source, frames)
     recipe = train_settings(preset, gop=gop, quality=settings.quality)
@@ -129,7 +129,7 @@ def _encode_capture(source, out, settings, preset, frames, gop, cluster, bar) ->
 
     def groups(_, first_frame: int) -> Iterator[Group]:
         if cluster:
-            from gscodec.train.cluster import cluster_groups
+            from .train.ray_jobs import cluster_groups
 
             opened = partial(_open_capture, source.resolve(), frames)
             yield from cluster_groups(
@@ -181,7 +181,7 @@ def _encode_capture(source, out, settings, preset, frames, gop, cluster, bar) ->
 
 
 def _open_capture(source: Path, frames: str | None):
-    from gscodec.capture import open_capture
+    from .capture import open_capture
 
     capture = open_capture(source)
     if frames is None:
@@ -213,9 +213,9 @@ def train_to_folder(
     What an earlier run with the same settings left unfinished goes on where it stopped.
     """
     require("torch", "training a capture")
-    from gscodec.splats import SequenceWriter
-    from gscodec.train.settings import train_settings
-    from gscodec.train.train import Checkpoint, train_groups
+    from .splats import SequenceWriter
+    from .train.settings import train_settings
+    from .train.train import Checkpoint, train_groups
 
     capture = _open_capture(source, frames)
     recipe = train_settings(preset, gop=gop, quality=quality)
@@ -246,10 +246,10 @@ def evaluate_stream(stream_path: Path, source: Path, *, split: str, frames: str 
 
     `prefixes` has the figures of its first layers.
     """
-    from gscodec.decode import open_stream
-    from gscodec.decode.report import describe
-    from gscodec.metrics.evaluate import evaluate_capture, evaluate_splats
-    from gscodec.splats import detect_input, open_sequence
+    from .decode import open_stream
+    from .decode.report import describe
+    from .metrics.evaluate import evaluate_capture, evaluate_splats
+    from .splats import detect_input, open_sequence
 
     whole = open_stream(stream_path)
     on_progress = lambda done, total: bar.update("eval", done, total)  # noqa: E731
@@ -290,9 +290,10 @@ def bench_raster(
         UsageError: an unknown scene or instruction set, a number that is none, or torch is missing.
     """
     require("torch", "measuring training steps")
-    from gscodec.bench.machine import write_result
-    from gscodec.bench.raster import SCENES, run
-    from gscodec.render.workspace import simd_levels
+    from bench.machine import write_result
+    from bench.raster import SCENES, run
+
+    from .render.workspace import simd_levels
 
     chosen = {
         "scenes": _names("--scenes", scenes, SCENES) or list(SCENES),
@@ -316,8 +317,8 @@ def bench_rd(codecs: str | None, sequences: str | None, *, data: Path | None, wo
     Raises:
         UsageError: an unknown codec or sequence, or no data folder.
     """
-    from gscodec.bench.rd import CODECS, measure, update
-    from gscodec.bench.sequences import SEQUENCES
+    from bench.rd import CODECS, measure, update
+    from bench.sequences import SEQUENCES
 
     if data is None:
         raise UsageError("bench rd needs the data folder, set --data or GSCODEC_DATA")
@@ -338,7 +339,7 @@ def bench_train(
         UsageError: an unknown capture or recipe, or no data folder.
     """
     require("torch", "measuring training")
-    from gscodec.bench.train import CASES, RECIPES, measure, update
+    from bench.train import CASES, RECIPES, measure, update
 
     if data is None:
         raise UsageError("bench train needs the data folder, set --data or GSCODEC_DATA")
@@ -357,7 +358,7 @@ def bench_ablation(
         UsageError: an unknown capture or variant, or the capture is not in the data folder.
     """
     require("torch", "measuring training")
-    from gscodec.bench.ablation import FRAMES, VARIANTS, measure
+    from bench.ablation import FRAMES, VARIANTS, measure
 
     names = _names("--variant", variants, VARIANTS)
     for name in _names("--capture", capture, FRAMES):
@@ -371,8 +372,8 @@ def bench_stress(cases: str | None, *, out: Path) -> Iterator[dict]:
         UsageError: an unknown case.
     """
     require("torch", "measuring training")
-    from gscodec.bench.stress import measure
-    from gscodec.bench.stress_scenes import SCENES
+    from bench.stress import measure
+    from bench.stress_scenes import SCENES
 
     yield from measure(_names("--case", cases, SCENES) or list(SCENES), out)
 

@@ -37,7 +37,7 @@ def server(gsv):
 
 @pytest.fixture(scope="module")
 def browsers():
-    from gscodec.bench.browser import Browsers, find_chromium
+    from bench.browser import Browsers, find_chromium
 
     if find_chromium() is None:
         if os.environ.get("CI"):
@@ -56,7 +56,7 @@ def browser(browsers):
 @pytest.fixture(scope="module")
 def gl_browser(browsers):
     """With WebGL2 in software, as Chromium has it where there is no GPU and it is told to."""
-    from gscodec.bench.browser import SOFTWARE_GL
+    from bench.browser import SOFTWARE_GL
 
     return browsers.start(*SOFTWARE_GL)
 

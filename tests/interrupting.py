@@ -15,9 +15,10 @@ import numpy as np
 import scipy.spatial  # noqa: F401
 import torch._dynamo  # noqa: F401  (what an optimizer imports; here it is imported once, not in every process)
 
-from gscodec import _native, part_file, progress
-from gscodec.bench.procedural import Scene
-from gscodec.bench.stress_scenes import walking
+from bench.procedural import Scene
+from bench.stress_scenes import walking
+from gscodec import _native, progress
+from gscodec import atomic_write as part_file
 from gscodec.cli import main
 from gscodec.encode import encode, writer
 from gscodec.render import sensitivity

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from synthetic import blob, moved
 
-from gscodec.camera import Camera, look_at
-from gscodec.gaussians import GaussianSequence, Group
+from gscodec.model.camera import Camera, look_at
+from gscodec.model.gaussians import GaussianSequence, Group
 from gscodec.player.server import parse_range
 
 FPS, GROUPS, LENGTH = 30, 5, 6

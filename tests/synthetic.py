@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from gscodec.encode.canonical import quat_multiply
-from gscodec.encode.motion import rotvec_to_matrix, rotvec_to_quat
-from gscodec.gaussians import Gaussians, GaussianSequence, Group
+from gscodec.encode.axis_order import quat_multiply
+from gscodec.encode.node_fit import rotvec_to_matrix, rotvec_to_quat
+from gscodec.model.gaussians import Gaussians, GaussianSequence, Group
 
 
 def blob(n: int, seed: int = 0, sh_count: int = 0) -> Gaussians:

@@ -12,9 +12,9 @@ pytest.importorskip("imageio_ffmpeg")
 pytest.importorskip("DracoPy")
 pytest.importorskip("zstandard")
 
-from gscodec.bench.baselines import BASELINES
-from gscodec.bench.baselines.grid import grid_order
-from gscodec.bench.rd import OURS, bd_rates, measure, update
+from bench.baselines import BASELINES
+from bench.baselines.grid import grid_order
+from bench.rd import OURS, bd_rates, measure, update
 from gscodec.metrics.charts import draw_charts
 from gscodec.splats import write_splat
 

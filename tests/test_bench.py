@@ -7,10 +7,10 @@ import pytest
 
 pytest.importorskip("torch")
 
-from gscodec.bench.machine import ROOT, write_result
-from gscodec.bench.raster import measure, run
-from gscodec.bench.scenes import capsule, capsule_camera
-from gscodec.bench.train import held_out
+from bench.machine import ROOT, write_result
+from bench.raster import measure, run
+from bench.scenes import capsule, capsule_camera
+from bench.train import held_out
 from gscodec.capture import open_capture
 from gscodec.errors import UsageError
 from gscodec.metrics.charts import draw_charts
@@ -81,7 +81,7 @@ def test_ablation_shows_what_each_tool_is_worth(tmp_path):
 
 def test_ablation_takes_out_what_is_there():
     pytest.importorskip("torch")
-    from gscodec.bench.ablation import VARIANTS
+    from bench.ablation import VARIANTS
 
     assert [n for n, v in VARIANTS.items() for where, name, _ in v.patches if not hasattr(where, name)] == []
 

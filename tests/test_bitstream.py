@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from gscodec import _native
-from gscodec.bitstream import attributes
 from gscodec.bitstream.levels import LEVELS, smallest_level
 from gscodec.decode import Stream, open_stream
 from gscodec.errors import BitstreamError, LimitError
+from gscodec.model import attributes
 
 CAMERA = {"name": "cam00", "K": [[500, 0, 320], [0, 510, 240], [0, 0, 1]], "viewmat": np.eye(4)}
 CONFIG = {

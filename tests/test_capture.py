@@ -11,12 +11,12 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from gscodec.camera import Camera, look_at
 from gscodec.capture import View, composite, find_capture, open_capture
 from gscodec.capture.images import read_image, resize_area
 from gscodec.capture.undistort import undistortion
 from gscodec.capture.video import Video
 from gscodec.errors import CaptureError, UsageError, require
+from gscodec.model.camera import Camera, look_at
 
 W, H = 24, 16
 GL = np.diag([1.0, -1, -1, 1])

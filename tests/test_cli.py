@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from synthetic import turning
 
-from gscodec.gaussians import GaussianSequence, Group
+from gscodec.model.gaussians import GaussianSequence, Group
 from gscodec.splats import write_sequence
 
 

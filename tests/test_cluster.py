@@ -9,7 +9,7 @@ from interrupting import write_capture
 from gscodec.capture import open_capture
 from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
 from gscodec.errors import CaptureError, UsageError
-from gscodec.train.cluster import cluster_groups
+from gscodec.train.ray_jobs import cluster_groups
 from gscodec.train.settings import TrainSettings
 from gscodec.train.train import train_groups
 

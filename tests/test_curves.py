@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from gscodec.encode import curves
-from gscodec.encode.curves import Curve
+from gscodec.encode import companding as curves
+from gscodec.encode.companding import Curve
 
 
 @pytest.fixture

@@ -13,16 +13,16 @@ from gscodec.bitstream.color import correlate, decorrelate
 from gscodec.bitstream.quantization import steps_for, subject_radius
 from gscodec.bitstream.transform import dct_basis
 from gscodec.decode import Stream, open_stream
-from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply
+from gscodec.encode.axis_order import canonical_axes, quat_conjugate, quat_multiply
 from gscodec.encode.channels import shifts_of
 from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
-from gscodec.encode.group import code_group, group_integers
-from gscodec.encode.motion import carry, choose_nodes
+from gscodec.encode.intra_group import code_group, group_integers
+from gscodec.encode.node_fit import carry, choose_nodes
+from gscodec.encode.rotation_residuals import LEVER_UNIT, SHARE, code_turns, fit_levers, in_form, widths
 from gscodec.encode.stack import stack_group
-from gscodec.encode.turns import LEVER_UNIT, SHARE, code_turns, fit_levers, in_form, widths
 from gscodec.encode.writer import StreamWriter
 from gscodec.errors import BitstreamError, CaptureError, UsageError
-from gscodec.gaussians import Gaussians, Group, Nodes
+from gscodec.model.gaussians import Gaussians, Group, Nodes
 
 
 def write(sequence, out, quality=50.0, **settings):

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
+import bench
 import gscodec
-import gscodec.bench
 import gscodec.player
 
 ROOT = Path(gscodec.__file__).parent
-FOLDERS = {"bench": Path(gscodec.bench.__file__).parent, "player": Path(gscodec.player.__file__).parent}
+FOLDERS = {"bench": Path(bench.__file__).parent, "player": Path(gscodec.player.__file__).parent}
 BASE = {"errors", "gaussians", "camera", "frames", "sampling", "part_file", "_native"}
 ALLOWED = {
     "bench": BASE | {"bitstream", "capture", "decode", "encode", "metrics", "player", "render", "splats", "train"},

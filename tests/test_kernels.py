@@ -4,7 +4,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from gscodec.bench.baselines.hashgrid import HashGrid  # noqa: E402
+from bench.baselines.hashgrid import HashGrid  # noqa: E402
 from gscodec.errors import UsageError  # noqa: E402
 from gscodec.train.model import BETAS, EPS, Model  # noqa: E402
 from gscodec.train.ssim import image_loss, image_loss_reference  # noqa: E402

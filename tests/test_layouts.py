@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_capture import H, W, pixels, write_image
 
-from gscodec.camera import look_at
 from gscodec.capture import find_capture, open_capture
 from gscodec.errors import CaptureError
+from gscodec.model.camera import look_at
 
 NAMES = ("cam0", "cam2", "cam10")  # in the order of their numbers
 FRAMES = 2

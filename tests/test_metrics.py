@@ -8,10 +8,8 @@ import warnings
 import numpy as np
 import pytest
 
-from gscodec.camera import Camera
 from gscodec.capture import Capture, View
 from gscodec.errors import UsageError
-from gscodec.gaussians import Gaussians, GaussianSequence, Group
 from gscodec.metrics import (
     TemporalMeter,
     VmafMeter,
@@ -27,6 +25,8 @@ from gscodec.metrics import (
     ssim,
 )
 from gscodec.metrics import vmaf as vmaf_module
+from gscodec.model.camera import Camera
+from gscodec.model.gaussians import Gaussians, GaussianSequence, Group
 
 # what scripts read (README, bench)
 KEYS = {"frames", "gaussians", "bytes", "kb_per_frame", "bits_per_gaussian_frame", "psnr", "psnr_fg", "ssim", "vmaf"}

@@ -7,9 +7,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from gscodec.camera import Camera, look_at  # noqa: E402
 from gscodec.errors import LimitError, UsageError  # noqa: E402
-from gscodec.gaussians import Gaussians  # noqa: E402
+from gscodec.model.camera import Camera, look_at  # noqa: E402
+from gscodec.model.gaussians import Gaussians  # noqa: E402
 from gscodec.render.image import render_image, render_rgba  # noqa: E402
 from gscodec.render.rasterize import rasterize  # noqa: E402
 from gscodec.render.reference import rasterize_reference  # noqa: E402

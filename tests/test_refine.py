@@ -7,14 +7,14 @@ import pytest
 from synthetic import blob, moved
 
 from gscodec import _native
-from gscodec.camera import Calibration
 from gscodec.capture import Capture, View
+from gscodec.encode.adaptive_rounding import Moving
 from gscodec.encode.coder import GroupCoder
-from gscodec.encode.group import group_integers
-from gscodec.encode.refine import Moving
-from gscodec.gaussians import Gaussians, GaussianSequence, Group
+from gscodec.encode.intra_group import group_integers
 from gscodec.metrics.codec_cameras import codec_cameras
 from gscodec.metrics.evaluate import evaluate_splats
+from gscodec.model.camera import Calibration
+from gscodec.model.gaussians import Gaussians, GaussianSequence, Group
 from gscodec.render.sensitivity import arrays_of
 from gscodec.render.workspace import Workspace
 

@@ -7,17 +7,10 @@ import numpy as np
 import pytest
 from synthetic import gaussians
 
-from gscodec.camera import Camera
 from gscodec.errors import CaptureError, UsageError
-from gscodec.gaussians import Gaussians, GaussianSequence, Group, Nodes
-from gscodec.splats import (
-    SequenceWriter,
-    detect_input,
-    open_sequence,
-    read_splat,
-    write_sequence,
-    write_splat,
-)
+from gscodec.model.camera import Camera
+from gscodec.model.gaussians import Gaussians, GaussianSequence, Group, Nodes
+from gscodec.splats import SequenceWriter, detect_input, open_sequence, read_splat, write_sequence, write_splat
 from gscodec.splats.tracking import match, relate
 
 FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")

@@ -14,11 +14,8 @@ from hypothesis import strategies as st
 from synthetic import assert_close, gaussians
 
 from gscodec.errors import CaptureError, UsageError
-from gscodec.gaussians import Gaussians
-from gscodec.splats import (
-    read_splat,
-    write_splat,
-)
+from gscodec.model.gaussians import Gaussians
+from gscodec.splats import read_splat, write_splat
 from gscodec.splats.codebook import codebook, palette
 from gscodec.splats.files import splat_size
 

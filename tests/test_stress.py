@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from gscodec.bench.stress import compare
-from gscodec.bench.stress_scenes import SCENES, cut, walking
+from bench.stress import compare
+from bench.stress_scenes import SCENES, cut, walking
 from gscodec.render import sensitivity
 
 TINY = {"keyframe_steps": 100, "motion_steps": 20, "finetune_steps": 8, "gaussians_max": 300, "initial_points": 200}

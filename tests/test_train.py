@@ -7,32 +7,32 @@ import pytest
 import torch
 from synthetic import blob, turning
 
+from bench.train import coded
 from gscodec import _native
-from gscodec.bench.train import coded
 from gscodec.bitstream.quantization import steps_for, subject_radius
-from gscodec.camera import Camera, look_at
 from gscodec.capture.capture import Capture
 from gscodec.capture.images import View
-from gscodec.encode.group import code_group, group_integers
+from gscodec.encode.intra_group import code_group, group_integers
 from gscodec.errors import CaptureError, UsageError
-from gscodec.gaussians import GaussianSequence, Group, concatenate
 from gscodec.metrics.image import psnr
+from gscodec.model.camera import Camera, look_at
+from gscodec.model.gaussians import GaussianSequence, Group, concatenate
 from gscodec.render.image import render_image, render_rgba
 from gscodec.train.calibration import Extrinsics
-from gscodec.train.carve import carve, meeting_point, project
-from gscodec.train.changes import Changes
-from gscodec.train.cluster import train_segment
+from gscodec.train.change_detection import Changes
+from gscodec.train.deformation_graph import NodeGraph, Pose, quat_to_matrix, rotvec_to_quat
+from gscodec.train.entropy_model import CanonicalRate, laplace_bits
 from gscodec.train.finetune import GroupModel
-from gscodec.train.graph import NodeGraph, Pose, quat_to_matrix, rotvec_to_quat
 from gscodec.train.keyframe import Statistics, grow, prune, train_keyframe
-from gscodec.train.lost import whereabouts
 from gscodec.train.model import from_gaussians
-from gscodec.train.motion import Tracker
-from gscodec.train.rate import CanonicalRate, laplace_bits
+from gscodec.train.plane_sweep import shell, sweep
+from gscodec.train.ray_jobs import train_segment
+from gscodec.train.relocalization import whereabouts
 from gscodec.train.settings import TrainSettings, train_settings
-from gscodec.train.sweep import shell, sweep
+from gscodec.train.tracking import Tracker
 from gscodec.train.train import Checkpoint, initial_model, segments, train_groups
 from gscodec.train.views import Views
+from gscodec.train.visual_hull import carve, meeting_point, project
 
 SIZE = 64
 TINY = TrainSettings(

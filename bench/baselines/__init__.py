@@ -10,9 +10,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 
-from gscodec.bench.baselines import draco, gsav, sog, spz, svt_av1, videogs, x265_anchor, zstd
-from gscodec.bench.baselines.maps import order_of
-from gscodec.gaussians import Gaussians
+from bench.baselines import draco, gsav, sog, spz, svt_av1, videogs, x265_anchor, zstd
+from bench.baselines.maps import order_of
+from gscodec.model.gaussians import Gaussians
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gscodec.bench.baselines.grid import morton_order
+from bench.baselines.grid import morton_order
 from gscodec.errors import require
-from gscodec.gaussians import Gaussians
+from gscodec.model.gaussians import Gaussians
 
 SETTINGS = {f"{p}/{a} bit": {"position": p, "attribute": a} for p, a in ((11, 5), (12, 6), (13, 7), (14, 8), (16, 8))}
 ATTRIBUTES = ("quats", "log_scales", "logit_opacities", "sh0", "shN")

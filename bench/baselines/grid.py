@@ -13,7 +13,7 @@ from itertools import permutations
 import numpy as np
 
 from gscodec.errors import require
-from gscodec.gaussians import Gaussians
+from gscodec.model.gaussians import Gaussians
 
 PERMUTATIONS = np.array(list(permutations(range(4))))  # [24, 4]
 SHRINK, RADIUS_MIN = 0.93, 1.0

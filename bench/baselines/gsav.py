@@ -11,10 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gscodec.bench.baselines.ffmpeg import VP9, decode_videos, encode_videos
-from gscodec.bench.baselines.grid import morton_order, side_of
-from gscodec.bench.baselines.zstd import compress, decompress
-from gscodec.gaussians import Gaussians
+from bench.baselines.ffmpeg import VP9, decode_videos, encode_videos
+from bench.baselines.grid import morton_order, side_of
+from bench.baselines.zstd import compress, decompress
+from gscodec.model.gaussians import Gaussians
 
 SETTINGS = {f"snap {s}": {"snap": s} for s in (0, 1, 2, 4, 8, 16)}
 CHANNELS, WIDE = 14, 4  # channels, and how many of them lie side by side

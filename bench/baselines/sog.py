@@ -6,8 +6,8 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from gscodec.bench.baselines.splat_transform import convert
-from gscodec.gaussians import Gaussians
+from bench.baselines.splat_transform import convert
+from gscodec.model.gaussians import Gaussians
 from gscodec.splats import read_splat
 
 SETTINGS = {"default": {}}

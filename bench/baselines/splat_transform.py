@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gscodec.errors import UsageError
-from gscodec.gaussians import Gaussians
+from gscodec.model.gaussians import Gaussians
 from gscodec.splats import write_splat
 
 

@@ -13,9 +13,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from gscodec.bench.baselines.splat_transform import convert
-from gscodec.bench.baselines.zstd import decompress
-from gscodec.gaussians import SH_COUNTS, Gaussians
+from bench.baselines.splat_transform import convert
+from bench.baselines.zstd import decompress
+from gscodec.model.gaussians import SH_COUNTS, Gaussians
 from gscodec.splats.compressed_ply import logit
 from gscodec.splats.smallest_three import join_smallest_three
 

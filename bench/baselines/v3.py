@@ -17,10 +17,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gscodec.bench.baselines.hashgrid import HashGrid
+from bench.baselines.hashgrid import HashGrid
 from gscodec.bitstream.quantization import subject_radius
 from gscodec.render.workspace import Workspace
-from gscodec.train.graph import quat_multiply, rotvec_to_quat
+from gscodec.train.deformation_graph import quat_multiply, rotvec_to_quat
 from gscodec.train.keyframe import RATES, train_keyframe
 from gscodec.train.model import Model
 from gscodec.train.settings import TrainSettings

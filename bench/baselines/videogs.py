@@ -13,8 +13,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gscodec.bench.baselines.ffmpeg import X264, decode_videos, encode_videos
-from gscodec.gaussians import Gaussians
+from bench.baselines.ffmpeg import X264, decode_videos, encode_videos
+from gscodec.model.gaussians import Gaussians
 from gscodec.splats.compressed_ply import logit, sigmoid
 
 SETTINGS = {f"qp {qp}": {"qp": qp} for qp in (8, 12, 15, 18, 20, 25, 35, 45, 51)}

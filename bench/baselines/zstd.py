@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gscodec.errors import require
-from gscodec.gaussians import Gaussians
+from gscodec.model.gaussians import Gaussians
 
 SETTINGS = {f"{b} bit": {"bits": b} for b in (4, 5, 6, 7, 8)}
 LEVEL = 19

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gscodec import _native
-from gscodec.errors import LimitError
+from .. import _native
+from ..errors import LimitError
 
 
 @dataclass(frozen=True)

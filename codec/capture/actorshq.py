@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.camera import Camera
-from gscodec.capture.capture import Capture
-from gscodec.capture.rig import Feed, assemble, numbered, pinhole, rigid, usable
-from gscodec.errors import CaptureError, require
+from ..errors import CaptureError, require
+from ..model.camera import Camera
+from .capture import Capture
+from .rig import Feed, assemble, numbered, pinhole, rigid, usable
 
 NUMBERS = ("w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
 FPS = 25.0

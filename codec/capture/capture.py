@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gscodec.camera import Camera
-from gscodec.capture.images import View, resize_area
-from gscodec.errors import UsageError
+from ..errors import UsageError
+from ..model.camera import Camera
+from .images import View, resize_area
 
 MARGIN = 24  # pixels of background kept around the subject
 

@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.camera import Camera
-from gscodec.capture.capture import Capture
-from gscodec.capture.images import SUFFIXES
-from gscodec.capture.rig import Feed, assemble, by_number, numbered, pinhole, rigid, usable
-from gscodec.errors import CaptureError
+from ..errors import CaptureError
+from ..model.camera import Camera
+from .capture import Capture
+from .images import SUFFIXES
+from .rig import Feed, assemble, by_number, numbered, pinhole, rigid, usable
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
 # number and name of the camera model -> which parameter is fx, fy, cx, cy, k1, k2, p1, p2 (None: 0)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gscodec.capture.actorshq import open_actorshq
-from gscodec.capture.capture import Capture
-from gscodec.capture.colmap import find_model, open_colmap
-from gscodec.capture.easyvolcap import open_easyvolcap
-from gscodec.capture.n3dv import open_n3dv
-from gscodec.capture.qualisys import open_qualisys
-from gscodec.capture.transforms import open_transforms
-from gscodec.errors import CaptureError
+from ..errors import CaptureError
+from .actorshq import open_actorshq
+from .capture import Capture
+from .colmap import find_model, open_colmap
+from .easyvolcap import open_easyvolcap
+from .n3dv import open_n3dv
+from .qualisys import open_qualisys
+from .transforms import open_transforms
 
 
 def _transforms(path: Path) -> list[tuple[Path, str]]:

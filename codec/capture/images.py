@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.errors import CaptureError, require
+from ..errors import CaptureError, require
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr", ".tif", ".tiff")  # what a name without one is tried with
 

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.camera import Camera
-from gscodec.capture.capture import Capture
-from gscodec.capture.rig import VIDEOS, Feed, assemble, numbered, pinhole, rigid, usable
-from gscodec.capture.video import Video
-from gscodec.errors import CaptureError
+from ..errors import CaptureError
+from ..model.camera import Camera
+from .capture import Capture
+from .rig import VIDEOS, Feed, assemble, numbered, pinhole, rigid, usable
+from .video import Video
 
 
 def open_n3dv(poses: Path) -> Capture:

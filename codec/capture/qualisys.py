@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.camera import Camera
-from gscodec.capture.capture import Capture
-from gscodec.capture.rig import Feed, assemble, find_video, numbered, pinhole, rigid, usable
-from gscodec.capture.video import Video
-from gscodec.errors import CaptureError
+from ..errors import CaptureError
+from ..model.camera import Camera
+from .capture import Capture
+from .rig import Feed, assemble, find_video, numbered, pinhole, rigid, usable
+from .video import Video
 
 UNIT = 64  # calibration units per pixel
 DISTORTION = (

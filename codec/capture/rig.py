@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.camera import Camera
-from gscodec.capture.capture import Capture
-from gscodec.capture.images import SUFFIXES, View, image_size, read_image, read_mask
-from gscodec.capture.undistort import undistortion
-from gscodec.capture.video import Video
-from gscodec.errors import CaptureError
+from ..errors import CaptureError
+from ..model.camera import Camera
+from .capture import Capture
+from .images import SUFFIXES, View, image_size, read_image, read_mask
+from .undistort import undistortion
+from .video import Video
 
 FPS = 30.0  # where nothing says it
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv")

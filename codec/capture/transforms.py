@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.camera import Camera
-from gscodec.capture.capture import Capture
-from gscodec.capture.images import SUFFIXES, image_size
-from gscodec.capture.rig import FPS, Feed, assemble, pinhole, usable
-from gscodec.errors import CaptureError
+from ..errors import CaptureError
+from ..model.camera import Camera
+from .capture import Capture
+from .images import SUFFIXES, image_size
+from .rig import FPS, Feed, assemble, pinhole, usable
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")  # OpenCV's order
 

@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from gscodec.camera import Camera
-from gscodec.capture.images import View, resample
-from gscodec.errors import require
+from ..errors import require
+from ..model.camera import Camera
+from .images import View, resample
 
 
 def _shifted(K: np.ndarray, by: float) -> np.ndarray:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.errors import CaptureError, require
+from ..errors import CaptureError, require
 
 SKIP = 48  # frames that are decoded and dropped rather than seeking, about two GOPs of a camera
 KEEP = 4  # decoded frames that stay in memory, per camera

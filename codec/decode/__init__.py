@@ -1,5 +1,5 @@
 """Bytes -> GaussianSequence: the thin Python face of the native decoder."""
 
-from gscodec.decode.stream import Stream, open_stream
+from .stream import Stream, open_stream
 
 __all__ = ["Stream", "open_stream"]

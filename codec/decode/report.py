@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.decode.stream import Stream
-from gscodec.render.png import write_png
+from ..render.png import write_png
+from .stream import Stream
 
 
 def describe(stream: Stream) -> dict:

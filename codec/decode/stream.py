@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec import _native
-from gscodec.camera import Camera
-from gscodec.errors import BitstreamError, LimitError
-from gscodec.gaussians import Gaussians, GaussianSequence, Group
+from .. import _native
+from ..errors import BitstreamError, LimitError
+from ..model.camera import Camera
+from ..model.gaussians import Gaussians, GaussianSequence, Group
 
 GROUPS_HELD = 3  # decoded groups in memory: the one that plays, the next, and the one to which they refer
 

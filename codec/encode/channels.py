@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gscodec.encode import curves as curved
-from gscodec.encode import rdo
+from . import companding as curved
+from . import rdo
 
 SHIFTED = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
 

@@ -11,15 +11,15 @@ from functools import cached_property
 
 import numpy as np
 
-from gscodec import _native
-from gscodec.camera import Camera
-from gscodec.capture import Capture
-from gscodec.encode.group import Coded, code_group
-from gscodec.encode.plan import FEW
-from gscodec.encode.predicted import predict_group
-from gscodec.encode.targets import PictureTargets
-from gscodec.errors import CaptureError
-from gscodec.gaussians import Group
+from .. import _native
+from ..capture import Capture
+from ..errors import CaptureError
+from ..model.camera import Camera
+from ..model.gaussians import Group
+from .inter_group import predict_group
+from .intra_group import Coded, code_group
+from .quantization_plan import FEW
+from .refinement_views import PictureTargets
 
 FRAME_VIEWS = 10  # by which a group of few Gaussians is refined, if nobody says
 SEEN, FRAME_PICTURES = 4, 80  # where there are pictures, so often each of them, so many of a frame at most

@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.bitstream.levels import smallest_level
-from gscodec.camera import Camera
-from gscodec.capture import Capture
-from gscodec.encode.coder import CodedGroup, GroupCoder
-from gscodec.encode.rate import RateControl
-from gscodec.encode.writer import StreamWriter
-from gscodec.errors import UsageError
-from gscodec.gaussians import Group
+from ..bitstream.levels import smallest_level
+from ..capture import Capture
+from ..errors import UsageError
+from ..model.camera import Camera
+from ..model.gaussians import Group
+from .coder import CodedGroup, GroupCoder
+from .rate_control import RateControl
+from .writer import StreamWriter
 
 LAYERS_MAX = 16  # spec 4
 REFINE = 100  # views, of splats of one frame

@@ -11,8 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from gscodec.bitstream.quantization import QUALITY_DEFAULT, error_for
-from gscodec.bitstream.transform import dct_basis
+from ..bitstream.quantization import QUALITY_DEFAULT, error_for
+from ..bitstream.transform import dct_basis
 
 BIT_PRICE = 0.05  # of a bit, in units of the picture's error per Gaussian
 TRAINED = 0.6  # of that where gscodec has trained the group: test views of stage and lumberjack say so

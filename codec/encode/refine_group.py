@@ -12,16 +12,16 @@ from itertools import product
 
 import numpy as np
 
-from gscodec import _native
-from gscodec.bitstream.color import decorrelate
-from gscodec.bitstream.transform import dct_basis
-from gscodec.encode import curves as curved
-from gscodec.encode import rdo
-from gscodec.encode.channels import coded_values, curves_of, shifts_of
-from gscodec.encode.refine import Moving, refine, with_values
-from gscodec.encode.stack import Stack
-from gscodec.encode.targets import DrawnTargets, PictureTargets
-from gscodec.gaussians import Gaussians
+from .. import _native
+from ..bitstream.color import decorrelate
+from ..bitstream.transform import dct_basis
+from ..model.gaussians import Gaussians
+from . import companding as curved
+from . import rdo
+from .adaptive_rounding import Moving, refine, with_values
+from .channels import coded_values, curves_of, shifts_of
+from .refinement_views import DrawnTargets, PictureTargets
+from .stack import Stack
 
 CANONICAL = ("logit_opacities", "sh0", "shN")
 OVER_TIME = ("means", "log_scales", *CANONICAL)

@@ -7,10 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
-from gscodec.bitstream.color import decorrelate
-from gscodec.encode.canonical import quat_multiply
-from gscodec.encode.parallel import each_frame
-from gscodec.gaussians import Gaussians, Group
+from ..bitstream.color import decorrelate
+from ..model.gaussians import Gaussians, Group
+from .axis_order import quat_multiply
+from .parallel import each_frame
 
 
 @dataclass(frozen=True)

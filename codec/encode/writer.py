@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec import _native
-from gscodec.errors import BitstreamError
-from gscodec.part_file import part_file, read_arrays, write_arrays
+from .. import _native
+from ..atomic_write import part_file, read_arrays, write_arrays
+from ..errors import BitstreamError
 
 
 class StreamWriter:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gscodec.errors import UsageError, require
+from ..errors import UsageError, require
 
 POINTS_MIN = 4
 

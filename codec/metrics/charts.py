@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from gscodec.errors import UsageError, require
-from gscodec.metrics.ablation_chart import ablation_chart
-from gscodec.metrics.rd_chart import frames_chart, size_chart, time_chart
-from gscodec.metrics.speed_chart import speed_chart
-from gscodec.metrics.train_chart import train_chart
+from ..errors import UsageError, require
+from .ablation_chart import ablation_chart
+from .rd_chart import frames_chart, size_chart, time_chart
+from .speed_chart import speed_chart
+from .train_chart import train_chart
 
 CHARTS = {  # result file without .json -> chart -> function(result) that returns a matplotlib Figure
     "ablation": {"ablation": ablation_chart},

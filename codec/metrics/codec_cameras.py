@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gscodec.camera import Camera, cameras_around
-from gscodec.errors import UsageError
-from gscodec.gaussians import Gaussians
+from ..errors import UsageError
+from ..model.camera import Camera, cameras_around
+from ..model.gaussians import Gaussians
 
 COUNT = 16
 

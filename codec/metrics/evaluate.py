@@ -11,14 +11,14 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from gscodec.camera import Camera
-from gscodec.capture import Capture, View, composite
-from gscodec.errors import UsageError
-from gscodec.gaussians import Gaussians, GaussianSequence
-from gscodec.metrics.codec_cameras import codec_cameras
-from gscodec.metrics.image import foreground, haze, psnr, ssim
-from gscodec.metrics.stability import TemporalMeter
-from gscodec.metrics.vmaf import VmafMeter
+from ..capture import Capture, View, composite
+from ..errors import UsageError
+from ..model.camera import Camera
+from ..model.gaussians import Gaussians, GaussianSequence
+from .codec_cameras import codec_cameras
+from .image import foreground, haze, psnr, ssim
+from .stability import TemporalMeter
+from .vmaf import VmafMeter
 
 BACKGROUND = (0.5, 0.5, 0.5)
 FG_ALPHA = 0.02  # of a rendered reference: the foreground of codec_psnr_fg
@@ -104,7 +104,7 @@ def evaluate_capture(
 
 def _compare(g: Gaussians, camera: Camera, view: View, temporal: TemporalMeter, vmaf: VmafMeter | None) -> dict:
     """The figures of one image; the meters remember it."""
-    from gscodec.render.image import render_image
+    from ..render.image import render_image
 
     reference, image = composite(view, BACKGROUND), render_image(g, camera, background=BACKGROUND)
     inside = None if view.alpha is None else foreground(view.alpha)
@@ -165,7 +165,7 @@ def evaluate_splats(
 
 def _draw(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """[H, W, 3] u8 over the background, and alpha [H, W] f32."""
-    from gscodec.render.image import render_rgba
+    from ..render.image import render_rgba
 
     rgba = render_rgba(gaussians, camera)  # premultiplied
     image = rgba[..., :3] + np.asarray(BACKGROUND, np.float32) * (1 - rgba[..., 3:])

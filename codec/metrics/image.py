@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gscodec.errors import UsageError, require
+from ..errors import UsageError, require
 
 PSNR_MAX = 100.0  # of equal images, so that means and JSON stay finite
 GROW = 8  # px by which the foreground is dilated

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gscodec.metrics.bd_rate import rising
+from .bd_rate import rising
 
 OURS = "gscodec"
 LOOK = {  # codec -> (name on the chart, colour)

@@ -11,7 +11,7 @@ from collections import deque
 
 import numpy as np
 
-from gscodec.metrics.image import psnr_of_mse
+from .image import psnr_of_mse
 
 WINDOW = 5  # frames
 STILL = 2  # 8-bit levels

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.errors import UsageError, require
+from ..errors import UsageError, require
 
 MODEL = "version=vmaf_v0.6.1"
 MARGIN = 16  # px around the subject

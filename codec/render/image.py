@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gscodec.camera import Camera
-from gscodec.gaussians import Gaussians
-from gscodec.render.workspace import PARAMETERS, Workspace
+from ..model.camera import Camera
+from ..model.gaussians import Gaussians
+from .workspace import PARAMETERS, Workspace
 
 _shared: list[Workspace] = []  # one workspace for callers that bring none
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.camera import Camera, look_at
-from gscodec.errors import UsageError, require
-from gscodec.gaussians import Gaussians
-from gscodec.render.image import render_image
-from gscodec.render.png import write_png
+from ..errors import UsageError, require
+from ..model.camera import Camera, look_at
+from ..model.gaussians import Gaussians
+from .image import render_image
+from .png import write_png
 
 ORBIT_SECONDS = 8.0  # one turn
 FIELD_OF_VIEW = 40.0  # degrees, orbit camera

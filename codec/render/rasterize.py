@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import torch
 
-from gscodec.camera import Camera
-from gscodec.render.workspace import Region, Workspace, call, rgb
+from ..model.camera import Camera
+from .workspace import Region, Workspace, call, rgb
 
 
 @dataclass

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import torch
 
-from gscodec.camera import Camera
+from ..model.camera import Camera
 
 # The normative constants; the same as in native/raster/src/constants.rs.
 LOW_PASS = 0.3  # px^2

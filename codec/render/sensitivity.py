@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gscodec.bitstream.color import STEP_WEIGHTS, TO_RGB, decorrelate
-from gscodec.bitstream.quantization import Steps, error_for, subject_radius
-from gscodec.camera import Camera, cameras_around
-from gscodec.gaussians import Gaussians
-from gscodec.render.workspace import PARAMETERS, Workspace, call
+from ..bitstream.color import STEP_WEIGHTS, TO_RGB, decorrelate
+from ..bitstream.quantization import Steps, error_for, subject_radius
+from ..model.camera import Camera, cameras_around
+from ..model.gaussians import Gaussians
+from .workspace import PARAMETERS, Workspace, call
 
 VIEWS, SIZE = 24, 512
 GREY = (0.5, 0.5, 0.5)

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gscodec.camera import Camera
-from gscodec.errors import UsageError
-from gscodec.render.workspace import PARAMETERS, STATISTICS, Region, Workspace, call, rgb, view
+from ..errors import UsageError
+from ..model.camera import Camera
+from .workspace import PARAMETERS, STATISTICS, Region, Workspace, call, rgb, view
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gscodec import _native
-from gscodec.camera import Camera
-from gscodec.errors import LimitError, UsageError
+from .. import _native
+from ..errors import LimitError, UsageError
+from ..model.camera import Camera
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 STATISTICS = ("grad2d", "max_weight", "sum_weight")

@@ -1,8 +1,8 @@
 """Gaussian splats on disk: one file per format, and folders of them as sequences."""
 
-from gscodec.splats.files import read_splat, write_splat
-from gscodec.splats.sequence import SplatSequence, detect_input, open_sequence
-from gscodec.splats.sequence_writer import SequenceWriter, write_sequence
+from .files import read_splat, write_splat
+from .sequence import SplatSequence, detect_input, open_sequence
+from .sequence_writer import SequenceWriter, write_sequence
 
 __all__ = [
     "SequenceWriter",

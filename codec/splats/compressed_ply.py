@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.errors import CaptureError
-from gscodec.gaussians import SH_C0, Gaussians
-from gscodec.splats.ply import join_rest, sh_count, split_rest, stack
-from gscodec.splats.ply_table import read_table, write_table
-from gscodec.splats.smallest_three import join_smallest_three, split_smallest_three
+from ..errors import CaptureError
+from ..model.gaussians import SH_C0, Gaussians
+from .ply import join_rest, sh_count, split_rest, stack
+from .ply_table import read_table, write_table
+from .smallest_three import join_smallest_three, split_smallest_three
 
 CHUNK = 256
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")

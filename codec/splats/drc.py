@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.errors import CaptureError, require
-from gscodec.gaussians import Gaussians
-from gscodec.part_file import part_file
+from ..atomic_write import part_file
+from ..errors import CaptureError, require
+from ..model.gaussians import Gaussians
 
 BITS, LEVEL = 16, 10  # quantization of an axis; effort
 OPACITY, LIGHT = 4.0, 1.0  # logit; coefficient of the colour

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.errors import CaptureError, UsageError
-from gscodec.gaussians import Gaussians
-from gscodec.splats.compressed_ply import gaussians_of_compressed, is_compressed, write_compressed_ply
-from gscodec.splats.drc import read_drc, write_drc
-from gscodec.splats.ply import FIELDS, gaussians_of, sh_count, stack, write_ply
-from gscodec.splats.ply_table import read_header, read_table
-from gscodec.splats.sog import SH_BANDS, read_sog, read_sog_meta, write_sog
+from ..errors import CaptureError, UsageError
+from ..model.gaussians import Gaussians
+from .compressed_ply import gaussians_of_compressed, is_compressed, write_compressed_ply
+from .drc import read_drc, write_drc
+from .ply import FIELDS, gaussians_of, sh_count, stack, write_ply
+from .ply_table import read_header, read_table
+from .sog import SH_BANDS, read_sog, read_sog_meta, write_sog
 
 ENDINGS = (".ply", ".compressed.ply", ".sog", ".drc")
 EXPECTED = ".ply (3DGS or SuperSplat compressed), .sog or an unpacked SOG folder (meta.json), .drc (points only)"

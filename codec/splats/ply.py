@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.errors import CaptureError
-from gscodec.gaussians import SH_COUNTS, Gaussians
-from gscodec.splats.ply_table import read_table, write_table
+from ..errors import CaptureError
+from ..model.gaussians import SH_COUNTS, Gaussians
+from .ply_table import read_table, write_table
 
 FIELDS = {
     "means": ("x", "y", "z"),

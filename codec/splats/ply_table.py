@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.errors import CaptureError
-from gscodec.part_file import part_file
+from ..atomic_write import part_file
+from ..errors import CaptureError
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",

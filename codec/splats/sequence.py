@@ -18,12 +18,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.camera import Camera
-from gscodec.capture.detect import LOOKED_FOR, find_capture
-from gscodec.errors import CaptureError, UsageError
-from gscodec.gaussians import GOP, Gaussians, GaussianSequence, Group, Nodes
-from gscodec.splats.files import EXPECTED, is_splat, read_means, read_splat, splat_size
-from gscodec.splats.tracking import relate
+from ..capture.detect import LOOKED_FOR, find_capture
+from ..errors import CaptureError, UsageError
+from ..model.camera import Camera
+from ..model.gaussians import GOP, Gaussians, GaussianSequence, Group, Nodes
+from .files import EXPECTED, is_splat, read_means, read_splat, splat_size
+from .tracking import relate
 
 FPS = 30.0  # of folders that do not say
 KEEP = 4  # frames in memory

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.camera import Camera
-from gscodec.gaussians import GaussianSequence, Group
-from gscodec.part_file import part_file
-from gscodec.splats.ply import write_ply
+from ..atomic_write import part_file
+from ..model.camera import Camera
+from ..model.gaussians import GaussianSequence, Group
+from .ply import write_ply
 
 HIDDEN = -30.0  # logit opacity that no renderer shows
 NAME = "sequence.json"

@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.errors import CaptureError, require
-from gscodec.gaussians import SH_COUNTS, Gaussians
-from gscodec.part_file import part_file
-from gscodec.splats.codebook import codebook, palette
-from gscodec.splats.compressed_ply import logit, sigmoid
-from gscodec.splats.smallest_three import join_smallest_three, split_smallest_three
+from ..atomic_write import part_file
+from ..errors import CaptureError, require
+from ..model.gaussians import SH_COUNTS, Gaussians
+from .codebook import codebook, palette
+from .compressed_ply import logit, sigmoid
+from .smallest_three import join_smallest_three, split_smallest_three
 
 PALETTE_WIDTH = 64  # SH palette entries per row of its map
 PALETTE_MAX = 1 << 16

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gscodec.errors import require
+from ..errors import require
 
 FAR_BELOW = 0.1  # median displacement of tracked Gaussians over that of random pairs, at most
 ROUGH = 1.5  # roughness from which a displacement field is no motion any more

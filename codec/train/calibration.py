@@ -12,10 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from gscodec import _native
-from gscodec.camera import Camera
-from gscodec.gaussians import SH_C0, Gaussians
-from gscodec.train.model import BETAS, EPS
+from .. import _native
+from ..model.camera import Camera
+from ..model.gaussians import SH_C0, Gaussians
+from .model import BETAS, EPS
 
 
 class _Learned:

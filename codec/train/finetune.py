@@ -17,17 +17,17 @@ from dataclasses import fields
 import numpy as np
 import torch
 
-from gscodec.bitstream.color import STEP_WEIGHTS
-from gscodec.bitstream.quantization import Steps, trajectory_step
-from gscodec.bitstream.transform import dct_basis
-from gscodec.gaussians import Gaussians, Group, Nodes
-from gscodec.render.workspace import Workspace
-from gscodec.train import keyframe
-from gscodec.train.graph import NodeGraph, Pose, quat_conjugate, quat_multiply, quat_to_rotvec
-from gscodec.train.model import HIDDEN, NAMES, Model
-from gscodec.train.rate import CanonicalRate, laplace_bits
-from gscodec.train.settings import TrainSettings
-from gscodec.train.views import Views, compare
+from ..bitstream.color import STEP_WEIGHTS
+from ..bitstream.quantization import Steps, trajectory_step
+from ..bitstream.transform import dct_basis
+from ..model.gaussians import Gaussians, Group, Nodes
+from ..render.workspace import Workspace
+from . import keyframe
+from .deformation_graph import NodeGraph, Pose, quat_conjugate, quat_multiply, quat_to_rotvec
+from .entropy_model import CanonicalRate, laplace_bits
+from .model import HIDDEN, NAMES, Model
+from .settings import TrainSettings
+from .views import Views, compare
 
 # attribute -> temporal frequencies that a group of so many frames may use, a longer one more in proportion; what is not
 # listed is constant in a group

@@ -12,10 +12,10 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from gscodec.render.workspace import Workspace
-from gscodec.train.model import Model
-from gscodec.train.settings import TrainSettings
-from gscodec.train.views import Views, compare, look
+from ..render.workspace import Workspace
+from .model import Model
+from .settings import TrainSettings
+from .views import Views, compare, look
 
 RATES = {"quats": 2e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 5e-3, "shN": 1.5e-3}
 MEANS_RATE = (1.6e-3, 1.6e-5)  # start, end, times the radius of the subject

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import torch
 
-from gscodec import _native
-from gscodec.gaussians import SH_C0, Gaussians
+from .. import _native
+from ..model.gaussians import SH_C0, Gaussians
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 BETAS = (0.9, 0.99)  # short schedules: a second moment that forgets in 100 steps

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gscodec.errors import UsageError
-from gscodec.gaussians import GOP
+from ..errors import UsageError
+from ..model.gaussians import GOP
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import torch
 
-from gscodec import _native
-from gscodec.errors import UsageError
+from .. import _native
+from ..errors import UsageError
 
 
 def image_loss(

@@ -14,20 +14,20 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gscodec.bitstream.quantization import Steps, steps_for, subject_radius
-from gscodec.errors import CaptureError
-from gscodec.gaussians import Group
-from gscodec.part_file import read_arrays, write_arrays
-from gscodec.render.sensitivity import measured_steps
-from gscodec.train.carve import carve, random_box
-from gscodec.train.finetune import GroupModel, finetune
-from gscodec.train.graph import Pose
-from gscodec.train.keyframe import train_keyframe
-from gscodec.train.model import NAMES, Model, from_points
-from gscodec.train.motion import Tracker
-from gscodec.train.settings import TrainSettings
-from gscodec.train.sweep import shell, sweep
-from gscodec.train.views import Views
+from ..atomic_write import read_arrays, write_arrays
+from ..bitstream.quantization import Steps, steps_for, subject_radius
+from ..errors import CaptureError
+from ..model.gaussians import Group
+from ..render.sensitivity import measured_steps
+from .deformation_graph import Pose
+from .finetune import GroupModel, finetune
+from .keyframe import train_keyframe
+from .model import NAMES, Model, from_points
+from .plane_sweep import shell, sweep
+from .settings import TrainSettings
+from .tracking import Tracker
+from .views import Views
+from .visual_hull import carve, random_box
 
 CUT_FLOOR = 0.004  # image loss that no frame is cut for: clean pictures fit far better than they need to
 STIRRED = 0.15  # share of the Gaussians that begin to change in one frame, for which a group ends

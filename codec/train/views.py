@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gscodec.camera import Calibration, Camera
-from gscodec.capture import View, cropped
-from gscodec.render.step import RenderLoss, Workspace, render_loss
-from gscodec.train.calibration import Exposure, Extrinsics
-from gscodec.train.settings import TrainSettings
+from ..capture import View, cropped
+from ..model.camera import Calibration, Camera
+from ..render.step import RenderLoss, Workspace, render_loss
+from .calibration import Exposure, Extrinsics
+from .settings import TrainSettings
 
 CACHE_BYTES = 2 << 30  # of decoded targets
 

@@ -1,6 +1,6 @@
 """Frame ranges as users write them."""
 
-from gscodec.errors import UsageError
+from .errors import UsageError
 
 
 def frame_range(text: str | None, count: int) -> range:

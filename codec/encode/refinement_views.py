@@ -11,11 +11,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from gscodec.camera import Calibration, Camera
-from gscodec.capture import Capture, View, blend, cropped
-from gscodec.gaussians import Gaussians
-from gscodec.render.sensitivity import GREY, arrays_of, sensitivity_cameras
-from gscodec.render.workspace import Workspace
+from ..capture import Capture, View, blend, cropped
+from ..model.camera import Calibration, Camera
+from ..model.gaussians import Gaussians
+from ..render.sensitivity import GREY, arrays_of, sensitivity_cameras
+from ..render.workspace import Workspace
 
 CACHE_BYTES = 1 << 30  # of pictures
 DRIFT, DRIFT_MOST = 0.03, 1.0  # toward pictures of the capture: times the root of their pixels per Gaussian; at most

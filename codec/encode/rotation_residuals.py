@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gscodec import _native
-from gscodec.encode import rdo
-from gscodec.encode.canonical import quat_conjugate, quat_multiply
+from .. import _native
+from . import rdo
+from .axis_order import quat_conjugate, quat_multiply
 
 LEVER_UNIT = 32  # of the bitstream
 FARTHEST = 64.0  # octaves

@@ -12,12 +12,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gscodec.bitstream.color import correlate
-from gscodec.encode.parallel import ahead
-from gscodec.encode.targets import DrawnTargets, PictureTargets
-from gscodec.gaussians import Gaussians
-from gscodec.render.sensitivity import derivatives
-from gscodec.render.workspace import Workspace
+from ..bitstream.color import correlate
+from ..model.gaussians import Gaussians
+from ..render.sensitivity import derivatives
+from ..render.workspace import Workspace
+from .parallel import ahead
+from .refinement_views import DrawnTargets, PictureTargets
 
 BETAS = (0.9, 0.99)
 EPS = 1e-6  # of the squared differences' sum, by a step: what changes less stays (its square may be 0 in f32)

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gscodec.bitstream.quantization import Steps, error_for, steps_for, subject_radius
-from gscodec.camera import Camera
-from gscodec.encode import curves as curved
-from gscodec.encode import rdo
-from gscodec.encode.stack import Stack, canonical_appearance
-from gscodec.encode.turns import fit_levers, widths
-from gscodec.render.sensitivity import VIEWS, Importance, coarsest, measure, steps_for_error
+from ..bitstream.quantization import Steps, error_for, steps_for, subject_radius
+from ..model.camera import Camera
+from ..render.sensitivity import VIEWS, Importance, coarsest, measure, steps_for_error
+from . import companding as curved
+from . import rdo
+from .rotation_residuals import fit_levers, widths
+from .stack import Stack, canonical_appearance
 
 LEVEL_RANGE = (3, 97)  # percentiles of log sensitivity between which layers are even
 LEAST_LEVEL = 1e-4  # of the mean sensitivity

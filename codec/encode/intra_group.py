@@ -11,22 +11,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gscodec import _native
-from gscodec.bitstream.quantization import trajectory_step
-from gscodec.camera import Camera
-from gscodec.encode import curves as curved
-from gscodec.encode import rdo
-from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
-from gscodec.encode.channels import SHIFTED, dequantize_channels, quantize_channels
-from gscodec.encode.motion import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes
-from gscodec.encode.plan import Plan, along_curves, plan_group
-from gscodec.encode.refine_group import refine_group, refine_still
-from gscodec.encode.stack import Stack, align_axes, canonical_appearance, stack_group
-from gscodec.encode.targets import DrawnTargets, PictureTargets, targets_of
-from gscodec.encode.turns import code_turns, in_form
-from gscodec.gaussians import Group
-from gscodec.gaussians import Nodes as GivenNodes
-from gscodec.render.sensitivity import Importance
+from .. import _native
+from ..bitstream.quantization import trajectory_step
+from ..model.camera import Camera
+from ..model.gaussians import Group
+from ..model.gaussians import Nodes as GivenNodes
+from ..render.sensitivity import Importance
+from . import companding as curved
+from . import rdo
+from .axis_order import canonical_axes, quat_conjugate, quat_multiply, rotate
+from .channels import SHIFTED, dequantize_channels, quantize_channels
+from .node_fit import NEIGHBORS, NodeMotion, Nodes, carry, choose_nodes, given_nodes
+from .quantization_plan import Plan, along_curves, plan_group
+from .refine_group import refine_group, refine_still
+from .refinement_views import DrawnTargets, PictureTargets, targets_of
+from .rotation_residuals import code_turns, in_form
+from .stack import Stack, align_axes, canonical_appearance, stack_group
 
 GRID_BITS_MAX = 21
 

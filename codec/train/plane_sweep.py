@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gscodec.camera import fibonacci_directions
-from gscodec.train.carve import colors_of, meeting_point, project
+from ..model.camera import fibonacci_directions
+from .visual_hull import colors_of, meeting_point, project
 
 WIDTH = 256  # pixels of the pictures that are compared
 PLANES = 96  # evenly in 1/depth

@@ -9,10 +9,10 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable, Iterator
 
-from gscodec.errors import UsageError, require
-from gscodec.gaussians import Group
-from gscodec.train.settings import TrainSettings
-from gscodec.train.train import segments, train_groups
+from ..errors import UsageError, require
+from ..model.gaussians import Group
+from .settings import TrainSettings
+from .train import segments, train_groups
 
 CPUS = 2  # of a job, and its threads: segments side by side pay better than more threads in one
 RETRIES = 5  # of a segment whose worker died

@@ -12,10 +12,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gscodec import _native
-from gscodec.bitstream.color import STEP_WEIGHTS, TO_YCOCG
-from gscodec.bitstream.quantization import Steps
-from gscodec.train.graph import quat_conjugate, quat_multiply
+from .. import _native
+from ..bitstream.color import STEP_WEIGHTS, TO_YCOCG
+from ..bitstream.quantization import Steps
+from .deformation_graph import quat_conjugate, quat_multiply
 
 NEAR, WINDOW = 4, 32  # contexts: so many nearest among so many before (spec 7.3)
 GRID_MOST = 2**20  # steps along an axis: far floaters make them coarser

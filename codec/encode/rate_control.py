@@ -9,8 +9,8 @@ from __future__ import annotations
 import copy
 import math
 
-from gscodec.encode.coder import CodedGroup, GroupCoder
-from gscodec.gaussians import Group
+from ..model.gaussians import Group
+from .coder import CodedGroup, GroupCoder
 
 SLOPE = 0.036  # of log size against quality, on statue and on trained captures
 TOLERANCE = 0.02  # of a group's size

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gscodec import _native
-from gscodec.bitstream.quantization import trajectory_step
-from gscodec.bitstream.transform import dct_basis
-from gscodec.encode import rdo
-from gscodec.encode.parallel import each_frame
-from gscodec.gaussians import Nodes as GivenNodes
-from gscodec.sampling import farthest_points
+from .. import _native
+from ..bitstream.quantization import trajectory_step
+from ..bitstream.transform import dct_basis
+from ..farthest_point_sampling import farthest_points
+from ..model.gaussians import Nodes as GivenNodes
+from . import rdo
+from .parallel import each_frame
 
 NEIGHBORS = 4  # nodes that a Gaussian blends
 NODE_COUNTS = (1, 16, 64, 256, 1024)

@@ -21,16 +21,16 @@ from dataclasses import fields, replace
 import numpy as np
 import torch
 
-from gscodec.bitstream.quantization import subject_radius
-from gscodec.render.workspace import Workspace
-from gscodec.train.births import LEAST, born, wrong_pixels
-from gscodec.train.changes import Changes
-from gscodec.train.graph import NodeGraph, Pose, quat_conjugate, quat_multiply, rotvec_to_quat
-from gscodec.train.keyframe import PRUNE_OPACITY, Statistics, rotate
-from gscodec.train.lost import whereabouts
-from gscodec.train.model import HIDDEN, NAMES, Model
-from gscodec.train.settings import TrainSettings
-from gscodec.train.views import Views, compare, look
+from ..bitstream.quantization import subject_radius
+from ..render.workspace import Workspace
+from .change_detection import Changes
+from .deformation_graph import NodeGraph, Pose, quat_conjugate, quat_multiply, rotvec_to_quat
+from .densification import LEAST, born, wrong_pixels
+from .keyframe import PRUNE_OPACITY, Statistics, rotate
+from .model import HIDDEN, NAMES, Model
+from .relocalization import whereabouts
+from .settings import TrainSettings
+from .views import Views, compare, look
 
 ROUNDS = 4  # at most, of `motion_steps` each: as many as a frame needs to come near the loss of the one before
 PAYS, LOSS_FLOOR = 1.2, 0.001  # what is near

@@ -12,21 +12,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from gscodec import _native
-from gscodec.bitstream.quantization import error_for
-from gscodec.camera import Camera
-from gscodec.encode import curves as curved
-from gscodec.encode import rdo
-from gscodec.encode.canonical import canonical_axes, quat_conjugate, quat_multiply, rotate
-from gscodec.encode.channels import curves_of, dequantize_channels, shifts_of
-from gscodec.encode.group import Coded, Grid, motion_integers
-from gscodec.encode.motion import NodeMotion, Nodes, carry, choose_nodes, given_nodes
-from gscodec.encode.plan import PRUNE, layer_of, measure_stack
-from gscodec.encode.refine_group import refine_group
-from gscodec.encode.stack import Stack, align_axes, canonical_appearance, stack_group
-from gscodec.encode.targets import PictureTargets, targets_of
-from gscodec.encode.turns import code_turns, in_form
-from gscodec.gaussians import Group
+from .. import _native
+from ..bitstream.quantization import error_for
+from ..model.camera import Camera
+from ..model.gaussians import Group
+from . import companding as curved
+from . import rdo
+from .axis_order import canonical_axes, quat_conjugate, quat_multiply, rotate
+from .channels import curves_of, dequantize_channels, shifts_of
+from .intra_group import Coded, Grid, motion_integers
+from .node_fit import NodeMotion, Nodes, carry, choose_nodes, given_nodes
+from .quantization_plan import PRUNE, layer_of, measure_stack
+from .refine_group import refine_group
+from .refinement_views import PictureTargets, targets_of
+from .rotation_residuals import code_turns, in_form
+from .stack import Stack, align_axes, canonical_appearance, stack_group
 
 REBIRTH = 8.0  # times PRUNE: what the reference left out must matter so much more to come back
 ROUNDS = 3  # of carrying births back

@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gscodec.render.image import render_image
-from gscodec.sampling import farthest_points
-from gscodec.train.births import GREY, sweep_wrong, wrong_pixels
-from gscodec.train.model import HIDDEN, Model
+from ..farthest_point_sampling import farthest_points
+from ..render.image import render_image
+from .densification import GREY, sweep_wrong, wrong_pixels
+from .model import HIDDEN, Model
 
 LOST = 1.002  # times the error without them; what is hidden makes none
 POINTS = 1000

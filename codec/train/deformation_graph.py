@@ -14,8 +14,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 
-from gscodec import _native
-from gscodec.sampling import farthest_points
+from .. import _native
+from ..farthest_point_sampling import farthest_points
 
 NODES = 256  # 1000 track as well
 STILL_SHARE = 0.25  # of the nodes, for what does not move yet, if that is as large a share of the Gaussians

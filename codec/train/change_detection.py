@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gscodec.capture import blend
-from gscodec.train.carve import project
+from ..capture import blend
+from .visual_hull import project
 
 WIDTH = 256  # pixels of the pictures that are compared: noise averages out
 THRESHOLD = 6.0  # grey levels, after a mean over 3 x 3; sensors and path tracers stay below

@@ -12,10 +12,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gscodec.capture import blend
-from gscodec.render.image import render_image
-from gscodec.render.workspace import Workspace
-from gscodec.train.keyframe import (
+from ..capture import blend
+from ..render.image import render_image
+from ..render.workspace import Workspace
+from .keyframe import (
     MEANS_RATE,
     PRUNE_OPACITY,
     PRUNE_WEIGHT,
@@ -24,9 +24,9 @@ from gscodec.train.keyframe import (
     Statistics,
     random_offset,
 )
-from gscodec.train.model import NAMES, Model, from_points
-from gscodec.train.sweep import sweep
-from gscodec.train.views import compare
+from .model import NAMES, Model, from_points
+from .plane_sweep import sweep
+from .views import compare
 
 LOUD = 2.0  # times the calm pull
 LEAST = 8  # fewer are not worth a unit in the stream
