@@ -19,7 +19,8 @@ from gscodec import _native
 from gscodec.encode.intra_group import code_group
 from gscodec.metrics.codec_cameras import codec_cameras
 from gscodec.metrics.image import psnr
-from gscodec.model.gaussians import Gaussians, Group
+from gscodec.model.gaussian_sequence import DenseGroup
+from gscodec.model.gaussians import Gaussians
 from gscodec.render.image import render_image
 from gscodec.splats import read_splat
 
@@ -38,7 +39,7 @@ def main() -> None:
 
     rows = []
     for layers in range(1, 5):
-        payload, units = _native.encode_group(code_group(Group([original]), 50, layers=layers).integers)
+        payload, units = _native.encode_group(code_group(DenseGroup([original]), 50, layers=layers).integers)
         for k in range(1, layers + 1):
             g = Gaussians(**_native.DecodedGroup(payload, LEVEL, layers=k).frame(0))
             size = sum(u["bytes"] for u in units if u["layer"] < k)

@@ -23,7 +23,8 @@ from gscodec.encode.encode import REFINE, EncodeSettings, encode_groups, stream_
 from gscodec.errors import UsageError
 from gscodec.metrics import bd_rate, evaluate_splats, rising
 from gscodec.metrics.bd_rate import shared_psnr
-from gscodec.model.gaussians import Gaussians, GaussianSequence, Group
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.model.gaussians import Gaussians
 
 OURS = "gscodec"
 QUALITIES = (20, 30, 40, 50, 60, 70, 80, 90, 100)
@@ -69,7 +70,7 @@ def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[
         }
 
 
-def _ours(sequence: GaussianSequence, groups: list[Group], setting: dict) -> Coded:
+def _ours(sequence: GaussianSequence, groups: list[DenseGroup], setting: dict) -> Coded:
     """(bytes, frames, seconds of encoding, of decoding, frame -> Gaussians)."""
     first, longest = groups[0].frames[0], max(map(len, groups))
     with tempfile.TemporaryDirectory() as folder:
@@ -99,7 +100,7 @@ def _timed_decoding(decode: Callable[[], list[Gaussians]]) -> tuple[list[Gaussia
     return decoded, float(np.median(seconds))
 
 
-def _peer(baseline: Baseline, groups: list[Group], picked: list[int], setting: dict) -> Coded:
+def _peer(baseline: Baseline, groups: list[DenseGroup], picked: list[int], setting: dict) -> Coded:
     """The same of a peer; frames that are coded alone are those of `picked`."""
     shown = [[group.visible(t) for t in range(len(group))] for group in groups]
     numbers = range(sum(map(len, shown)))

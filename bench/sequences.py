@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from gscodec.errors import UsageError
-from gscodec.model.gaussians import GaussianSequence, Group
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.splats import open_sequence
 
 FRAMES = 20
@@ -66,7 +66,7 @@ def _lumberjack(data: Path, folder: Path) -> None:
         writer.add(_lasting(group))
 
 
-def _lasting(group: Group) -> Group:
+def _lasting(group: DenseGroup) -> DenseGroup:
     """Those of the Gaussians of the only group that live in all of its frames."""
     if group.lifetimes is None:
         return group

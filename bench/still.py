@@ -14,13 +14,13 @@ from gscodec.bitstream.quantization import subject_radius
 from gscodec.encode.intra_group import code_group
 from gscodec.encode.stack import stack_group
 from gscodec.model.camera import Camera
-from gscodec.model.gaussians import Group
+from gscodec.model.gaussian_sequence import DenseGroup
 
 WITHIN = 1e-3
 KEYFRAME = ("group_header", "positions", "channels")
 
 
-def still_share(group: Group, quality: float, cameras: list[Camera]) -> tuple[float, float]:
+def still_share(group: DenseGroup, quality: float, cameras: list[Camera]) -> tuple[float, float]:
     """(share of the Gaussians that do not move, their share of the bytes behind the keyframe), 0 to 1 each."""
     coded = code_group(group, quality, cameras=cameras)
     means = stack_group(group).means[:, coded.source]

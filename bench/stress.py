@@ -19,7 +19,8 @@ from bench import train
 from bench.machine import update_entries
 from bench.procedural import Scene
 from bench.stress_scenes import SCENES
-from gscodec.model.gaussians import Gaussians, Group
+from gscodec.model.gaussian_sequence import DenseGroup
+from gscodec.model.gaussians import Gaussians
 
 PRESET = "fast"
 BUDGET = {"gaussians_max": 3750, "initial_points": 2000}  # for pictures of 128 x 128
@@ -82,7 +83,7 @@ def compare(name: str, scene: Scene, **budget) -> dict:
     alone, alone_seconds = train.every_frame_alone(capture, chosen, settings)
     part = train.part(capture, chosen)
     theirs = train.evaluate(part, alone)
-    alone_size, _, _ = train.coded(part, [Group([g]) for g in alone], settings)
+    alone_size, _, _ = train.coded(part, [DenseGroup([g]) for g in alone], settings)
     there = [t for t in range(capture.frame_count) if _subject(capture, t)]
     both = [(t, i) for i, t in enumerate(chosen) if t in there]
     loss = [theirs["per_frame"][i]["psnr_fg"] - ours["per_frame"][t]["psnr_fg"] for t, i in both]

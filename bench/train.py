@@ -23,7 +23,8 @@ from bench.machine import update_entries
 from bench.still import still_share
 from gscodec.capture import Capture
 from gscodec.errors import UsageError
-from gscodec.model.gaussians import Gaussians, Group
+from gscodec.model.gaussian_sequence import DenseGroup
+from gscodec.model.gaussians import Gaussians
 
 RECIPES = ("gscodec", "alone", "v3")
 V3_PACKING = {"qp": 25, "raw": True}  # its default, in the better of its two forms
@@ -127,7 +128,7 @@ def _ours(capture: Capture, frames: range, settings) -> Iterator[tuple]:
 def _alone(capture: Capture, frames: range, settings) -> Iterator[tuple]:
     models, seconds = every_frame_alone(capture, frames, settings)
     yield "alone", seconds, None, models
-    size, decoded, more = coded(part(capture, frames), [Group([g]) for g in models], settings)
+    size, decoded, more = coded(part(capture, frames), [DenseGroup([g]) for g in models], settings)
     yield "alone-coded", seconds + more, size, decoded
 
 
@@ -146,7 +147,7 @@ def _v3(capture: Capture, frames: range, settings) -> Iterator[tuple]:
     yield "v3-coded", time.perf_counter() - start, size, decoded
 
 
-def sequence(capture: Capture, settings) -> tuple[list[Group], float]:
+def sequence(capture: Capture, settings) -> tuple[list[DenseGroup], float]:
     """Our training; its groups and the seconds it took."""
     from gscodec.train.train import train_groups
 
@@ -154,12 +155,12 @@ def sequence(capture: Capture, settings) -> tuple[list[Group], float]:
     return list(train_groups(capture, settings)), time.perf_counter() - start
 
 
-def shown(groups: list[Group]) -> list[Gaussians]:
+def shown(groups: list[DenseGroup]) -> list[Gaussians]:
     """Frame by frame the Gaussians that live."""
     return [group.visible(t) for group in groups for t in range(len(group))]
 
 
-def coded(capture: Capture, groups: list[Group], settings) -> tuple[int, list[Gaussians], float]:
+def coded(capture: Capture, groups: list[DenseGroup], settings) -> tuple[int, list[Gaussians], float]:
     """Bytes of the stream that these groups make, its frames decoded, and the seconds that coding took."""
     from gscodec.decode import open_stream
     from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config

@@ -13,7 +13,7 @@ import numpy as np
 from synthetic import blob, moved
 
 from gscodec.model.camera import Camera, look_at
-from gscodec.model.gaussians import GaussianSequence, Group
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.player.server import parse_range
 
 FPS, GROUPS, LENGTH = 30, 5, 6
@@ -26,7 +26,7 @@ def sequence(n=400, sh_count=0) -> GaussianSequence:
         frames = [moved(still, [0, 0.05 * t, 0], [0.01 * t, 0, 0]) for t in range(k * LENGTH, (k + 1) * LENGTH)]
         life = np.tile(np.array([0, LENGTH], np.int32), (n, 1))
         life[: n // 4, 1] = LENGTH // 2
-        groups.append(Group(frames, life if k % 2 else None))
+        groups.append(DenseGroup(frames, life if k % 2 else None))
     return GaussianSequence(FPS, groups)
 
 

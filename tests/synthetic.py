@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from gscodec.encode.axis_order import quat_multiply
-from gscodec.encode.node_fit import rotvec_to_matrix, rotvec_to_quat
-from gscodec.model.gaussians import Gaussians, GaussianSequence, Group
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.model.gaussians import Gaussians
+from gscodec.model.rotations import quat_multiply, quat_to_matrix, rotvec_to_quat
 
 
 def blob(n: int, seed: int = 0, sh_count: int = 0) -> Gaussians:
@@ -25,7 +25,7 @@ def blob(n: int, seed: int = 0, sh_count: int = 0) -> Gaussians:
 
 def moved(g: Gaussians, rotvec: np.ndarray, shift: np.ndarray) -> Gaussians:
     """`g` turned about the origin and shifted."""
-    R = rotvec_to_matrix(np.asarray(rotvec, float))
+    R = quat_to_matrix(rotvec_to_quat(np.asarray(rotvec, float)))
     q = quat_multiply(np.broadcast_to(rotvec_to_quat(np.asarray(rotvec, float)), g.quats.shape), g.quats.astype(float))
     return Gaussians(
         (g.means @ R.T + shift).astype(np.float32),
@@ -46,7 +46,7 @@ def turning(n: int = 300, frames: int = 6, sh_count: int = 0, lifetimes: bool = 
         life = np.tile(np.array([0, frames], np.int32), (n, 1))
         life[: n // 4, 0] = frames // 2
         life[n // 4 : n // 2, 1] = frames // 2
-    return GaussianSequence(25.0, [Group(group, life)])
+    return GaussianSequence(25.0, [DenseGroup(group, life)])
 
 
 def covariances(g: Gaussians) -> np.ndarray:
@@ -64,7 +64,7 @@ def covariances(g: Gaussians) -> np.ndarray:
     return M @ M.transpose(0, 2, 1)
 
 
-def to_npz(path, group: Group) -> None:
+def to_npz(path, group: DenseGroup) -> None:
     """A group in half precision; what holds over the group is stored once."""
     frames = [group.frames[t] for t in range(len(group))]
     np.savez_compressed(
@@ -86,7 +86,7 @@ def from_npz(path) -> GaussianSequence:
         none = np.zeros((len(means), 0, 3), np.float32)
         g = Gaussians(means, quats, a["log_scales"], a["logit_opacities"], sh0, none)
         frames.append(g.validate(str(path)))
-    return GaussianSequence(30.0, [Group(frames)])
+    return GaussianSequence(30.0, [DenseGroup(frames)])
 
 
 def gaussians(n, k=0, seed=0):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from synthetic import turning
 
-from gscodec.model.gaussians import GaussianSequence, Group
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.splats import write_sequence
 
 
@@ -75,7 +75,7 @@ def test_info_writes_two_dimensional_maps(folder, tmp_path):
 
 def test_eval_gives_the_quality_of_every_prefix(tmp_path):
     frames, same = turning(300, frames=6).groups[0].frames, np.arange(300, dtype=np.int32)
-    groups = [Group(frames[t : t + 2], parents=same if t else None) for t in (0, 2, 4)]
+    groups = [DenseGroup(frames[t : t + 2], parents=same if t else None) for t in (0, 2, 4)]
     write_sequence(GaussianSequence(25, groups), tmp_path / "plys")
     done = run("encode", tmp_path / "plys", tmp_path / "l.gsv", "--layers", "3", "--random-access", "4")
     assert done.returncode == 0, done.stderr
@@ -154,7 +154,7 @@ def test_untracked_frames_are_said_to_be(tmp_path):
     from synthetic import blob
 
     frames = [blob(40 + 7 * t, seed=t) for t in range(3)]
-    write_sequence(GaussianSequence(30, [Group([f]) for f in frames]), tmp_path / "plys")
+    write_sequence(GaussianSequence(30, [DenseGroup([f]) for f in frames]), tmp_path / "plys")
     (tmp_path / "plys" / "sequence.json").unlink()
     result = run("encode", tmp_path / "plys", tmp_path / "o.gsv", "--keep-all")
     assert "independent" in result.stderr

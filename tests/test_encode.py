@@ -11,9 +11,7 @@ from synthetic import blob, covariances, turning
 from gscodec import _native
 from gscodec.bitstream.color import correlate, decorrelate
 from gscodec.bitstream.quantization import steps_for, subject_radius
-from gscodec.bitstream.transform import dct_basis
 from gscodec.decode import Stream, open_stream
-from gscodec.encode.axis_order import canonical_axes, quat_conjugate, quat_multiply
 from gscodec.encode.channels import shifts_of
 from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
 from gscodec.encode.intra_group import code_group, group_integers
@@ -22,7 +20,10 @@ from gscodec.encode.rotation_residuals import LEVER_UNIT, SHARE, code_turns, fit
 from gscodec.encode.stack import stack_group
 from gscodec.encode.writer import StreamWriter
 from gscodec.errors import BitstreamError, CaptureError, UsageError
-from gscodec.model.gaussians import Gaussians, Group, Nodes
+from gscodec.model.gaussian_sequence import DenseGroup
+from gscodec.model.gaussians import Gaussians
+from gscodec.model.rotations import quat_conjugate, quat_multiply
+from gscodec.model.temporal_transform import dct_basis
 
 
 def write(sequence, out, quality=50.0, **settings):
@@ -52,7 +53,7 @@ def test_canonical_form_keeps_the_covariance_and_sorts_the_axes():
 
 
 def test_turns_come_back_and_errors_do_not_add_up():
-    group = code_group(Group([blob(3000)]), 60, keep_all=True, layers=2)
+    group = code_group(DenseGroup([blob(3000)]), 60, keep_all=True, layers=2)
     step = np.array([2e-3, 1e-3, 3e-3])
     channel = {"steps": step, "levers": np.zeros((3, 3))}
     ends = np.cumsum([0, *group.integers["layers"]])
@@ -155,7 +156,7 @@ def test_what_nobody_sees_is_dropped_unless_all_is_to_be_kept(tmp_path):
     faint = g.logit_opacities.copy()
     faint[:30] = -9
     g = Gaussians(g.means, g.quats, g.log_scales, faint, g.sh0, g.shN)
-    group = Group([g])
+    group = DenseGroup([g])
     assert len(group_integers(group, 50)["positions"]) <= 70
     assert len(group_integers(group, 50, keep_all=True)["positions"]) == 100
 
@@ -181,7 +182,7 @@ def test_a_trainers_nodes_carry_newcomers_from_where_these_rest():
     turn[:3, 12:] = turn[3, 12:]
     lifetimes = np.stack([np.where(young, 3, 0), np.full(n, frames)], 1).astype(np.int32)
     nodes = Nodes(*(a.astype(np.float32) for a in (rest[seeds], turn, moves, rest)))
-    with_nodes = group_integers(Group(group.frames, lifetimes, nodes), 50, keep_all=True)
+    with_nodes = group_integers(DenseGroup(group.frames, lifetimes, nodes), 50, keep_all=True)
     assert (with_nodes["positions"][:, 0].max() * with_nodes["grid_step"]) > 4, "at their place of rest"
     left = {n: t["coefficients"] for n, t in with_nodes["trajectories"].items()}
     assert all(len(c) == 1 for c in left.values()), "only what rounding has left of the canonical, nothing over time"
@@ -191,7 +192,7 @@ def test_a_trainers_nodes_carry_newcomers_from_where_these_rest():
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_tiny_groups(tmp_path, count):
     g = blob(5).take(np.arange(count))
-    sequence = turning().with_groups([Group([g, g, g]), Group([g])])
+    sequence = turning().with_groups([DenseGroup([g, g, g]), DenseGroup([g])])
     write(sequence, tmp_path / "a.gsv", keep_all=True)
     stream = open_stream(tmp_path / "a.gsv")
     assert [len(stream.frame(t)) for t in range(4)] == [count] * 4
@@ -207,15 +208,15 @@ def test_frames_in_any_order_are_the_same(tmp_path):
         np.testing.assert_array_equal(stream.frame(t).means, straight[t].means)
 
 
-def changing(frames=6) -> list[Group]:
+def changing(frames=6) -> list[DenseGroup]:
     """Two groups of a turning body: in the second, 40 Gaussians have gone and 40 are new."""
     whole = turning(400, frames=2 * frames).groups[0]
     take = lambda t, index: whole.frames[t].take(index)  # noqa: E731
     first, second = np.arange(360), np.arange(400)[::-1][:360]
     parents = np.where(second < 360, second, -1).astype(np.int32)
     return [
-        Group([take(t, first) for t in range(frames)]),
-        Group([take(frames + t, second) for t in range(frames)], parents=parents),
+        DenseGroup([take(t, first) for t in range(frames)]),
+        DenseGroup([take(frames + t, second) for t in range(frames)], parents=parents),
     ]
 
 
@@ -250,7 +251,7 @@ def test_a_predicted_group_costs_less_and_keeps_the_content(tmp_path, layers):
 def test_layers_have_the_steps_of_their_sensitivity():
     g = blob(3000)
     faint = replace(g, logit_opacities=(g.logit_opacities - 4 * (np.arange(3000) % 2)).astype(np.float32))
-    group = Group([faint])
+    group = DenseGroup([faint])
     integers = group_integers(group, 80, keep_all=True, layers=3)
     shifts, layer = shifts_of(integers), np.repeat(np.arange(3), integers["layers"])
     assert all(s.min() == 0 for s in shifts.values())
@@ -274,7 +275,7 @@ def test_a_group_that_refers_to_a_damaged_one_is_named(tmp_path):
 def test_random_access_bounds_the_prediction(tmp_path):
     group = turning(60, frames=4).groups[0]
     same = np.arange(60, dtype=np.int32)
-    groups = [group] + [Group(group.frames, parents=same)] * 4
+    groups = [group] + [DenseGroup(group.frames, parents=same)] * 4
     for random_access, syncs in ((12, "SPPSP"), (5, "SSSSS"), (0, "SSSSS"), (100, "SPPPP")):
         write(turning().with_groups(groups), tmp_path / "a.gsv", random_access=random_access)
         stream = open_stream(tmp_path / "a.gsv")
@@ -286,7 +287,7 @@ def test_random_access_bounds_the_prediction(tmp_path):
 def test_parents_that_do_not_fit_are_refused(tmp_path, parents):
     group = turning(60, frames=2).groups[0]
     with pytest.raises(CaptureError, match="parents of a group"):
-        write(turning().with_groups([group, Group(group.frames, parents=parents)]), tmp_path / "a.gsv")
+        write(turning().with_groups([group, DenseGroup(group.frames, parents=parents)]), tmp_path / "a.gsv")
 
 
 def test_ctrl_c_leaves_a_playable_file_and_a_second_run_goes_on(tmp_path):
@@ -321,7 +322,7 @@ def test_ctrl_c_leaves_a_playable_file_and_a_second_run_goes_on(tmp_path):
 
 def test_other_settings_do_not_resume(tmp_path):
     config = stream_config(fps=25, sh_degree=0, gaussians=100, frames=6)
-    payload, _ = _native.encode_group(group_integers(Group([blob(5)]), 50))
+    payload, _ = _native.encode_group(group_integers(DenseGroup([blob(5)]), 50))
     for fingerprint, found in (({"q": 1}, 0), ({"q": 1}, 1), ({"q": 2}, 0)):
         writer = StreamWriter(tmp_path / "a.gsv", config, fingerprint)
         assert writer.groups == found

@@ -26,7 +26,8 @@ from gscodec.metrics import (
 )
 from gscodec.metrics import vmaf as vmaf_module
 from gscodec.model.camera import Camera
-from gscodec.model.gaussians import Gaussians, GaussianSequence, Group
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.model.gaussians import Gaussians
 
 # what scripts read (README, bench)
 KEYS = {"frames", "gaussians", "bytes", "kb_per_frame", "bits_per_gaussian_frame", "psnr", "psnr_fg", "ssim", "vmaf"}
@@ -292,7 +293,7 @@ def test_evaluate_capture_without_such_cameras():
 
 @pytest.mark.usefixtures("stub")
 def test_evaluate_splats():
-    sequence = GaussianSequence(30, [Group([gaussians(level=100)] * 3)])
+    sequence = GaussianSequence(30, [DenseGroup([gaussians(level=100)] * 3)])
     report = evaluate_splats(lambda t: gaussians(100, level=110), sequence, frames=[0, 2], size=3000)
     assert set(report) >= KEYS
     json.dumps(report, allow_nan=False)
@@ -306,7 +307,7 @@ def test_evaluate_splats():
 @pytest.mark.usefixtures("stub")
 @pytest.mark.parametrize("frames", [[3], [-1], []])
 def test_evaluate_splats_outside_the_sequence(frames):
-    sequence = GaussianSequence(30, [Group([gaussians()] * 3)])
+    sequence = GaussianSequence(30, [DenseGroup([gaussians()] * 3)])
     with pytest.raises(UsageError, match="to evaluate, the sequence has 0 to 2"):
         evaluate_splats(lambda t: gaussians(), sequence, frames)
 

@@ -14,14 +14,15 @@ from gscodec.encode.intra_group import group_integers
 from gscodec.metrics.codec_cameras import codec_cameras
 from gscodec.metrics.evaluate import evaluate_splats
 from gscodec.model.camera import Calibration
-from gscodec.model.gaussians import Gaussians, GaussianSequence, Group
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.model.gaussians import Gaussians
 from gscodec.render.sensitivity import arrays_of
 from gscodec.render.workspace import Workspace
 
 
 def test_a_refined_frame_is_nearer(monkeypatch):
     monkeypatch.setattr("gscodec.encode.curves.LEAST", 1000)
-    group = Group([blob(1500, sh_count=3)])
+    group = DenseGroup([blob(1500, sh_count=3)])
     sequence = GaussianSequence(30.0, [group])
     found = []
     for views in (0, 20):
@@ -45,7 +46,7 @@ def test_what_no_view_shows_does_not_move():
 
 
 def test_positions_and_order_stay():
-    group = Group([blob(1200)])
+    group = DenseGroup([blob(1200)])
     plain, refined = (group_integers(group, 70, views=n) for n in (0, 3))
     assert np.array_equal(plain["positions"], refined["positions"])
     assert plain["shifts"] == refined["shifts"]
@@ -60,7 +61,7 @@ def test_refined_groups_are_nearer(monkeypatch, curves_from):
     for start in (0, 5):
         frames = [moved(still, [0, 0.04 * t, 0], [0.02 * t, 0, 0]) for t in range(start, start + 5)]
         frames = [replace(f, sh0=f.sh0 * np.float32(np.cos(0.3 * t))) for t, f in enumerate(frames, start)]
-        groups.append(Group(frames, life, parents=np.arange(1500) if start else None))
+        groups.append(DenseGroup(frames, life, parents=np.arange(1500) if start else None))
     found = []
     for views in (0, 40):
         coder = GroupCoder(keep_all=True, layers=2, random_access=60, refine=views)
@@ -102,10 +103,10 @@ def test_a_trained_group_comes_nearer_to_its_pictures(frames):
     found = []
     for told in (None, calibration):
         coder = GroupCoder(keep_all=True, layers=1, random_access=60, refine=80, capture=capture)
-        coded = coder.code(Group(model, calibration=told), 50, 0)
+        coded = coder.code(DenseGroup(model, calibration=told), 50, 0)
         decoded = _native.DecodedGroup(coded.payload, 1)
         shown = lambda t, d=decoded: Gaussians(**d.frame(t))  # noqa: E731
-        near = evaluate_splats(shown, GaussianSequence(30.0, [Group(truth)]))["codec_psnr"]
+        near = evaluate_splats(shown, GaussianSequence(30.0, [DenseGroup(truth)]))["codec_psnr"]
         found.append((len(coded.payload), near))
     (plain, before), (refined, after) = found
     assert after > before + 0.5

@@ -9,7 +9,8 @@ from synthetic import gaussians
 
 from gscodec.errors import CaptureError, UsageError
 from gscodec.model.camera import Camera
-from gscodec.model.gaussians import Gaussians, GaussianSequence, Group, Nodes
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.model.gaussians import Gaussians
 from gscodec.splats import SequenceWriter, detect_input, open_sequence, read_splat, write_sequence, write_splat
 from gscodec.splats.tracking import match, relate
 
@@ -106,7 +107,7 @@ def stored_sequence():
     shapes = ((6, 3), (4, 6, 3), (4, 6, 3), (50, 3))
     nodes = Nodes(*(np.random.default_rng(0).normal(size=s).astype(np.float32) for s in shapes))
     camera = Camera("a", np.diag([9.0, 9, 1]), np.eye(4), 32, 24, split="test")
-    groups = [Group([moved(g, t) for t in range(4)], lifetimes, nodes), Group([gaussians(40, 3, 9)])]
+    groups = [DenseGroup([moved(g, t) for t in range(4)], lifetimes, nodes), DenseGroup([gaussians(40, 3, 9)])]
     return GaussianSequence(25, groups, [camera])
 
 

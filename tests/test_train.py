@@ -16,7 +16,8 @@ from gscodec.encode.intra_group import code_group, group_integers
 from gscodec.errors import CaptureError, UsageError
 from gscodec.metrics.image import psnr
 from gscodec.model.camera import Camera, look_at
-from gscodec.model.gaussians import GaussianSequence, Group, concatenate
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.model.gaussians import concatenate
 from gscodec.render.image import render_image, render_rgba
 from gscodec.train.calibration import Extrinsics
 from gscodec.train.change_detection import Changes
@@ -195,7 +196,7 @@ def glossy(gloss: float) -> GaussianSequence:
     """Two frames of the turning blob, whose colours change by `gloss` with the direction."""
     group = turning(300, frames=2).groups[0]
     frames = [dataclasses.replace(g, shN=np.full((300, 3, 3), gloss, np.float32)) for g in group.frames]
-    return GaussianSequence(25.0, [Group(frames)])
+    return GaussianSequence(25.0, [DenseGroup(frames)])
 
 
 @pytest.mark.parametrize(("gloss", "kept"), [(0.0, 0), (0.3, 3)])
@@ -299,7 +300,7 @@ def test_masks_say_where_nothing_is():
         for g, x in ((blob(100), -0.7), (blob(100, seed=1), 0.7))
     )
     whole, none = concatenate([left, right]), left.take(np.zeros(0, int))
-    capture = capture_of(GaussianSequence(25.0, [Group([g]) for g in (whole, left, none, none)]))
+    capture = capture_of(GaussianSequence(25.0, [DenseGroup([g]) for g in (whole, left, none, none)]))
     tracker = Tracker.start(from_gaussians(whole), Views(capture, 0), TINY, 0.01, range(4))
     models, poses = [tracker.model], [tracker.pose]
     for frame in (1, 2, 3):
@@ -317,7 +318,7 @@ def test_masks_say_where_nothing_is():
 def test_light_that_comes_on_ends_a_group_and_not_the_subject():
     dark = blob(200)
     lit = dataclasses.replace(dark, sh0=dark.sh0 + 0.6)
-    capture = capture_of(GaussianSequence(25.0, [Group([g]) for g in (dark,) * 5 + (lit,) * 2]))
+    capture = capture_of(GaussianSequence(25.0, [DenseGroup([g]) for g in (dark,) * 5 + (lit,) * 2]))
     first, second = train_groups(capture, dataclasses.replace(TINY, gop=8))
     assert (len(first), len(second)) == (5, 2)
     assert second.parents is not None
@@ -389,7 +390,7 @@ def test_rate_of_one_gaussian_is_finite():
 
 def coded_bits(rate, model, quality):
     """Bits of each attribute's channels at the steps of `rate`."""
-    group = code_group(Group([model.gaussians()]), quality, keep_all=True, layers=1)
+    group = code_group(DenseGroup([model.gaussians()]), quality, keep_all=True, layers=1)
     for name, x in rate.channels(model.params).items():
         integers = np.rint(x.numpy()[group.source].T).astype(np.int32)
         group.integers["channels"][name]["values"] = integers - np.median(integers, 1, keepdims=True).astype(np.int32)

@@ -18,7 +18,8 @@ import numpy as np
 from .. import _native
 from ..errors import BitstreamError, LimitError
 from ..model.camera import Camera
-from ..model.gaussians import Gaussians, GaussianSequence, Group
+from ..model.gaussian_sequence import DenseGroup, GaussianSequence
+from ..model.gaussians import Gaussians
 
 GROUPS_HELD = 3  # decoded groups in memory: the one that plays, the next, and the one to which they refer
 
@@ -162,13 +163,13 @@ class _Groups(Sequence):
     def __len__(self) -> int:
         return len(self.stream.groups)
 
-    def __getitem__(self, i: int) -> Group:
+    def __getitem__(self, i: int) -> DenseGroup:
         group = self.stream.group(i)
         if group.visible(0) is None:
-            return Group(_Frames(self.stream, i))
+            return DenseGroup(_Frames(self.stream, i))
         shown = np.stack([group.visible(t) for t in range(group.frames)])  # [T, N], one run of frames each
         start = shown.argmax(0)
-        return Group(_Frames(self.stream, i), np.stack([start, start + shown.sum(0)], 1).astype(np.int32))
+        return DenseGroup(_Frames(self.stream, i), np.stack([start, start + shown.sum(0)], 1).astype(np.int32))
 
 
 class _Frames(Sequence):

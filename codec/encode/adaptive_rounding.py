@@ -1,92 +1,132 @@
-"""Refinement: integers move to where the picture is nearest to the source, given all other integers.
+"""Stage refine: adaptive rounding. After quantization, integers move by one where that lowers the rendered error by
+more than their bits cost.
 
-Rounding each value on its own leaves errors that another could make up for. The decoded frame is drawn and compared
-with what it is to look like (targets.py); the gradient of the squared difference moves what lies under the integers,
-and passes straight through the rounding (Bengio et al. 2013). Integers that others are decoded by stay: positions,
-nodes, rotations.
+Rounding each value on its own leaves errors that another value could make up for. The decoded frame is drawn and
+compared with a target picture; the gradient of the squared difference moves the latent under each integer, straight through the
+rounding (Bengio et al. 2013). Integers that others are decoded from stay: positions, nodes, rotations. Of a single
+frame, sizes move too, and its rotations are coded again; of a predicted group, only trajectories move.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
-from ..bitstream.color import correlate
+from .. import _native
+from ..bitstream.color import correlate, decorrelate
 from ..model.gaussians import Gaussians
 from ..render.sensitivity import derivatives
 from ..render.workspace import Workspace
-from .parallel import ahead
-from .refinement_views import DrawnTargets, PictureTargets
+from ..threads import prefetched
+from .quantize import Quantized, ReferenceGroup, with_rotations
+from .refinement_views import Target
+from .rounding_variables import CanonicalVariable, TrajectoryVariable, trajectory_variable
+from .settings import EncodeSettings
 
-BETAS = (0.9, 0.99)
-EPS = 1e-6  # of the squared differences' sum, by a step: what changes less stays (its square may be 0 in f32)
-INSIDE = 0.02  # quantization steps: so far from where it would change, at least, starts what is under an integer
+MOVING_CANONICAL = ("logit_opacities", "sh0", "shN")  # rotations follow from sizes, and everything from positions
+MOVING_STILL = ("log_scales", *MOVING_CANONICAL)
+MOVING_OVER_TIME = ("means", "log_scales", *MOVING_CANONICAL)
+HIDDEN = -30.0  # logit of an opacity that no renderer shows
 
 
-class Moving:
-    """Integers of one attribute and what lies under them, in quantization steps, arrays of one shape.
+class AdaptiveRounding:
+    """The quantizer of one group: it is handed to whoever has pictures of the group.
 
     Args:
-        latents: what was quantized. integers: to what.
-        margins: how much farther than half a step above, and below, an integer still is the better one (`rdo.margins`).
-
-    Attributes:
-        change: of the integers since the start: -1, 0 or 1.
+        quantized: the group. reference: what it is predicted from.
     """
 
-    def __init__(self, attribute: str, latents: np.ndarray, integers: np.ndarray, margins: tuple):
-        up, down = margins
-        self.attribute, self._integers, self._margins = attribute, integers, margins
-        self._under = np.clip(latents, integers - 0.5 - down + INSIDE, integers + 0.5 + up - INSIDE).astype(np.float32)
-        self._first, self._second = (np.zeros_like(self._under) for _ in range(2))
-        self.change = np.zeros(self._under.shape, np.int8)
+    def __init__(self, quantized: Quantized, settings: EncodeSettings, reference: ReferenceGroup | None = None):
+        self._quantized, self._settings, self._reference = quantized, settings, reference
+        self._still = quantized.form.frames == 1 and reference is None
+        canonical = MOVING_STILL if self._still else MOVING_CANONICAL if reference is None else ()
+        moving = [n for n in canonical if n in quantized.integers.channels]
+        self._variables: list[CanonicalVariable | TrajectoryVariable] = [
+            trajectory_variable(n, quantized, settings)
+            for n in MOVING_OVER_TIME
+            if n in quantized.integers.trajectories
+        ] + [CanonicalVariable(n, quantized, settings) for n in moving]
 
     @property
-    def integers(self) -> np.ndarray:
-        """As they are now."""
-        return self._integers + self.change
+    def frames(self) -> int:
+        """Frames of the group."""
+        return self._quantized.form.frames
 
-    def follow(self, derivative: np.ndarray, rate: float, step: int) -> None:
-        """Adam's `step` (from 1) along the derivative by the integers."""
-        self._first += (1 - BETAS[0]) * (derivative - self._first)
-        self._second += (1 - BETAS[1]) * (derivative * derivative - self._second)
-        size = np.sqrt(self._second / (1 - BETAS[1] ** step)) + EPS
-        self._under -= rate * self._first / (1 - BETAS[0] ** step) / size
-        off, (up, down) = self._under - self._integers, self._margins
-        self.change = (off > 0.5 + up).astype(np.int8) - (-off > 0.5 + down)
+    @property
+    def gaussians(self) -> int:
+        """Gaussians of the group."""
+        return len(self._quantized.form.rest)
+
+    def source(self, t: int) -> Gaussians:
+        """Frame `t` of the group before it was quantized, in the order of the integers."""
+        return self._shown(self._quantized.form.frame(t), t)
+
+    def follow(self, targets: Iterable[Target], count: int, rate: float) -> None:
+        """One step of Adam for each target.
+
+        Args:
+            targets: `count` of them: (frame, camera, background, picture [H, W, 3] f32, 0 to 1).
+            rate: quantization steps that the first target moves a latent; it falls to 0 linearly.
+        """
+        workspace, names = Workspace(), {v.attribute for v in self._variables}
+        for step, (t, camera, background, picture) in enumerate(prefetched(targets), 1):
+            off = lambda image, picture=picture: np.ascontiguousarray(image - picture)  # noqa: E731
+            derivative = derivatives(workspace, self.frame(t), camera, off, names, background)
+            for v in self._variables:
+                v.follow(v.by_integers(derivative[v.attribute], t), rate * (1 - (step - 1) / count), step)
+
+    def frame(self, t: int) -> Gaussians:
+        """Frame `t` as decoded with the integers as they are now."""
+        before, values = self._before[t]
+        now = {n: v.copy() for n, v in values.items()}
+        for v in self._variables:
+            v.add(now[v.attribute], t)
+        return self._shown(_with_values(before, now), t)
+
+    def quantized(self) -> Quantized:
+        """The group with the integers as they are now."""
+        q = self._quantized
+        channels, trajectories = dict(q.integers.channels), dict(q.integers.trajectories)
+        for v in self._variables:
+            v.put(channels, trajectories)
+        q = replace(q, integers=replace(q.integers, channels=channels, trajectories=trajectories))
+        return with_rotations(q, self._settings.rdo) if self._still else q
+
+    @cached_property
+    def _before(self) -> list[tuple[Gaussians, dict[str, np.ndarray]]]:
+        """Each frame as decoded at the start, as Gaussians and as coded values. Rotations of a single frame, which are
+        coded again, are those of the source."""
+        reference = self._reference.decoded if self._reference else None
+        decoded = _native.DecodedGroup.reconstruct(self._quantized.integers, reference)
+        frames = [Gaussians(**decoded.frame(t)) for t in range(self.frames)]
+        if self._still:
+            frames = [replace(frames[0], quats=self._quantized.form.coded_rotations)]
+        return [(g, _coded_values(g)) for g in frames]
+
+    def _shown(self, g: Gaussians, t: int) -> Gaussians:
+        """The same with an opacity that shows nothing, where frame `t` is outside of a lifetime."""
+        life = self._quantized.form.lifetimes
+        if life is None:
+            return g
+        shown = (life[:, 0] <= t) & (t < life[:, 1])
+        return replace(g, logit_opacities=np.where(shown, g.logit_opacities, np.float32(HIDDEN)))
 
 
-def refine(
-    parts: list[Moving],
-    targets: DrawnTargets | PictureTargets,
-    source: Callable[[int], Gaussians],
-    shown: Callable[[int], tuple[Gaussians, list[Callable]]],
-    frames: int = 1,
-) -> None:
-    """Moves the integers of `parts`, one step for each of `targets`.
-
-    Args:
-        source: frame -> Gaussians as they are to look.
-        shown: frame -> the same as they look with the integers as they are now, and for each of `parts` what makes the
-            derivative by its integers of that by its attribute ([N, C]).
-    """
-    workspace, names = Workspace(), {p.attribute for p in parts}
-    first = targets.drift / len(targets) ** 0.5
-    for step, (t, camera, background, target) in enumerate(ahead(targets.draw(source, frames)), 1):
-        now, chain = shown(t)
-        off = lambda image, target=target: np.ascontiguousarray(image - target)  # noqa: E731
-        derivative = derivatives(workspace, now, camera, off, names, background)
-        rate = first * (1 - (step - 1) / len(targets))
-        for part, by_integers in zip(parts, chain, strict=True):
-            part.follow(by_integers(derivative[part.attribute]), rate, step)
+Refine = Callable[[AdaptiveRounding], None]
 
 
-def with_values(g: Gaussians, values: dict[str, np.ndarray]) -> Gaussians:
-    """`g` with other values, attribute -> [N, C] as they are coded: colours decorrelated."""
-    means, shN = values.get("means", g.means), g.shN
-    if "shN" in values:
-        shN = correlate(values["shN"].reshape(shN.shape))
-    return Gaussians(
-        means, g.quats, values["log_scales"], values["logit_opacities"][:, 0], correlate(values["sh0"]), shN
-    )
+def _coded_values(g: Gaussians) -> dict[str, np.ndarray]:
+    """[N, C] of the attributes that move, colours decorrelated."""
+    values = {"means": g.means, "log_scales": g.log_scales, "logit_opacities": g.logit_opacities[:, None]}
+    values["sh0"] = decorrelate(g.sh0)
+    return values | ({"shN": decorrelate(g.shN).reshape(len(g), -1)} if g.sh_degree else {})
+
+
+def _with_values(g: Gaussians, values: dict[str, np.ndarray]) -> Gaussians:
+    """Inverse of `_coded_values`, with the rotations of `g`."""
+    shN = correlate(values["shN"].reshape(g.shN.shape)) if "shN" in values else g.shN
+    opacities, sh0 = values["logit_opacities"][:, 0], correlate(values["sh0"])
+    return Gaussians(values["means"], g.quats, values["log_scales"], opacities, sh0, shN)

@@ -1,34 +1,44 @@
-"""Groups -> payloads: each independent, or predicted from the last independent one where that is cheaper.
+"""Groups -> payloads: measure, plan, quantize, refine, pack; independent, or predicted where that is cheaper.
 
-The coder remembers the last independent group as it was coded, and where the Gaussians of the groups since came from;
-`state` is that memory as arrays, from which a later run goes on as if it had never stopped.
+A group is predicted from the last independent one. `CoderState` holds what that takes, and where the Gaussians of the
+groups since came from; it is returned with each group and never changed, so that a group can be tried more than once.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
 
 from .. import _native
-from ..capture import Capture
+from ..bitstream.quantized_group import QuantizedGroup
 from ..errors import CaptureError
 from ..model.camera import Camera
-from ..model.gaussians import Group
-from .inter_group import predict_group
-from .intra_group import Coded, code_group
-from .quantization_plan import FEW
-from .refinement_views import PictureTargets
+from ..model.parametric_group import ParametricGroup
+from ..render.sensitivity import Importance, sensitivity_cameras
+from .adaptive_rounding import AdaptiveRounding
+from .coded_form import CodedForm, coded_form
+from .companding import Curve
+from .measure import measure_group
+from .quantization_plan import Known, Parameters, plan_group
+from .quantize import Quantized, ReferenceGroup, grid_of, quantize
+from .refinement_views import drawn_views
+from .settings import EncodeSettings
 
-FRAME_VIEWS = 10  # by which a group of few Gaussians is refined, if nobody says
-SEEN, FRAME_PICTURES = 4, 80  # where there are pictures, so often each of them, so many of a frame at most
-DOUBT = 0.7  # a predicted group of more than so many bytes a frame of its reference is coded both ways
+# Refines a group that begins at a frame of the capture by the pictures that it was trained on.
+RefineByPictures = Callable[[ParametricGroup, int, AdaptiveRounding], None]
 
 
-@dataclass
+@dataclass(frozen=True)
 class CodedGroup:
-    """Payload of a group, the bytes of its units, and whether it is independent."""
+    """A group in bytes.
+
+    Attributes:
+        payload: of the group. units: its units with their bytes.
+        gaussians: that are coded. independent: it refers to no other group.
+    """
 
     payload: bytes
     units: list[dict]
@@ -37,111 +47,187 @@ class CodedGroup:
 
 
 @dataclass(frozen=True)
-class _Payload:
-    data: bytes
+class CoderState:
+    """What the next group may be predicted from.
+
+    Attributes:
+        payload: of the last independent group.
+        rest: [n, 3] f64, rotations [n, 4] f32, axis_order [n, 3], axis_rotation [n, 4]: its form (`CodedForm`).
+        trajectory_steps: attribute -> step of a value in one frame; node_step: world units.
+        frames: of it and of the groups since. back: groups since, itself included.
+        lineage: [N] of each Gaussian of the group before, its index among the integers of the independent group; -1.
+    """
+
+    payload: bytes
+    rest: np.ndarray
+    rotations: np.ndarray
+    axis_order: np.ndarray
+    axis_rotation: np.ndarray
+    trajectory_steps: dict[str, float]
+    node_step: float
+    frames: int
+    back: int
+    lineage: np.ndarray
 
     @cached_property
     def decoded(self):
-        """`_native.DecodedGroup`, made when the first group refers to it."""
-        return _native.DecodedGroup(self.data, len(_native.levels()))
+        """The independent group as `_native.DecodedGroup`."""
+        return _native.DecodedGroup(self.payload, len(_native.levels()))
+
+    @cached_property
+    def integers(self) -> QuantizedGroup:
+        """The integers of the independent group."""
+        return self.decoded.quantized()
+
+    @cached_property
+    def known(self) -> Known:
+        """Parameters of the independent group, and the layer of each of its Gaussians."""
+        q = self.integers
+        names = ("means", *q.channels)
+        shifts = np.zeros((len(q.layers), len(names)), int) if q.shifts is None else q.shifts.astype(int)
+        curves = {n: [Curve.of(row) for row in c.companding] for n, c in q.channels.items() if c.companding is not None}
+        parameters = Parameters(
+            grid_of(q),
+            {n: c.steps for n, c in q.channels.items()},
+            dict(zip(names, shifts.T, strict=True)),
+            curves,
+            q.scale_exponents,
+            self.trajectory_steps,
+            self.node_step,
+        )
+        return Known(parameters, np.repeat(np.arange(len(q.layers)), q.layers))
+
+    def after(self, group: ParametricGroup, lineage: np.ndarray) -> CoderState:
+        """The state behind one more predicted group."""
+        return replace(self, frames=self.frames + len(group), back=self.back + 1, lineage=lineage)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Everything as arrays: what a later run goes on from."""
+        plain = [f.name for f in fields(self) if f.name not in ("payload", "trajectory_steps")]
+        arrays = {n: np.asarray(getattr(self, n)) for n in plain}
+        steps = {f"trajectory_steps.{n}": np.asarray(v) for n, v in self.trajectory_steps.items()}
+        return {"payload": np.frombuffer(self.payload, np.uint8), **arrays, **steps}
+
+    @staticmethod
+    def from_arrays(arrays: dict[str, np.ndarray]) -> CoderState | None:
+        """Inverse of `to_arrays`; None where there is no state."""
+        if "payload" not in arrays:
+            return None
+        steps = {n.partition(".")[2]: float(v) for n, v in arrays.items() if n.startswith("trajectory_steps.")}
+        plain = ("rest", "rotations", "axis_order", "axis_rotation", "lineage")
+        numbers = {
+            "frames": int(arrays["frames"]),
+            "back": int(arrays["back"]),
+            "node_step": float(arrays["node_step"]),
+        }
+        arrays_of = {n: arrays[n] for n in plain}
+        return CoderState(payload=arrays["payload"].tobytes(), trajectory_steps=steps, **numbers, **arrays_of)
 
 
 @dataclass(frozen=True)
-class _Reference:
-    coded: Coded
-    payload: _Payload
-    frames: int  # of it and of the groups since
-    back: int  # groups since, itself included
-    index: np.ndarray  # of each Gaussian of the group before: which one it is in the reference, -1: none
-
-
 class GroupCoder:
-    """Codes groups in their order. A shallow copy is a coder of its own, for trying.
+    """Codes groups.
 
-    Args:
-        keep_all, layers: as in `code_group`. refine: as in `EncodeSettings`.
-        cameras: of the capture, if there was one. capture: whose pictures groups are refined by, if they can be had.
-        random_access: frames from one independent group to the next at most; 0 or 1: every group is independent.
+    Attributes:
+        settings: of the encoder.
+        fps: frames a second of the stream.
+        cameras: of the capture, if there was one; sensitivity is measured from them too.
+        refine_by_pictures: of a capture, if its pictures can be had.
     """
 
-    def __init__(
-        self,
-        *,
-        keep_all: bool,
-        layers: int | None,
-        random_access: int,
-        refine: int | None = None,
-        cameras: list[Camera] = (),
-        capture: Capture | None = None,
-    ):
-        self._options = {"keep_all": keep_all, "cameras": cameras}
-        self._layers, self._refine, self._capture = layers, refine, capture
-        self._random_access, self._reference = random_access, None
+    settings: EncodeSettings
+    fps: float = 30.0
+    cameras: tuple[Camera, ...] = ()
+    refine_by_pictures: RefineByPictures | None = None
 
-    def code(self, group: Group, quality: float, first_frame: int) -> CodedGroup:
-        """The next group, which begins at `first_frame` of the stream.
+    def measure(self, group: ParametricGroup) -> Importance:
+        """What `code` needs of a group at any quality."""
+        return measure_group(group, list(self.cameras), self.settings.plan)
+
+    def code(
+        self, state: CoderState | None, group: ParametricGroup, importance: Importance, quality: float, first_frame: int
+    ) -> tuple[CodedGroup, CoderState | None]:
+        """The next group, which begins at `first_frame` of the stream, and the state behind it.
 
         Raises:
             CaptureError: its parents do not fit the group before, or a picture cannot be read.
         """
-        parents, r, refining = self._parents(group), self._reference, self._refining(group, first_frame)
-        if parents is None or r.frames + len(group) > self._random_access:
-            return self._independent(group, quality, refining)
-        options = self._options | refining | {"decoded": r.payload.decoded}
-        integers = predict_group(group, parents, r.back, r.coded, quality=quality, **options)
-        payload, units = _native.encode_group(integers, r.payload.decoded)
-        if len(payload) > DOUBT * len(r.payload.data):
-            other = self._independent(group, quality, refining)
-            if len(other.payload) <= len(payload):
+        lineage = _lineage(group, state)
+        if lineage is None or state.frames + len(group) > self.settings.random_access:
+            return self._independent(state, group, importance, quality, first_frame)
+        reference = ReferenceGroup(state.integers, state.decoded, state.back)
+        form = coded_form(group, lineage, state)
+        own = importance.with_axes(form.axis_order)
+        plan = plan_group(form, own, quality, self.settings, state.known)
+        coded, _ = self._packed(quantize(form, plan, self.settings.rdo, reference), group, first_frame, reference)
+        if len(coded.payload) > self.settings.doubt * len(state.payload):
+            other = self._independent(state, group, importance, quality, first_frame)
+            if len(other[0].payload) <= len(coded.payload):
                 return other
-        self._reference = replace(r, frames=r.frames + len(group), back=r.back + 1, index=parents)
-        return CodedGroup(payload, units, len(integers["positions"]), False)
+        return coded, state.after(group, lineage)
 
-    def _independent(self, group: Group, quality: float, refining: dict) -> CodedGroup:
-        coded = code_group(group, quality, layers=self._layers, **self._options, **refining)
-        payload, units = _native.encode_group(coded.integers)
-        if self._random_access > len(group):
-            index = np.arange(len(group.frames[0]))
-            self._reference = _Reference(coded, _Payload(payload), len(group), 1, index)
-        return CodedGroup(payload, units, len(coded.source), True)
+    def _independent(self, state, group, importance, quality, first_frame) -> tuple[CodedGroup, CoderState | None]:
+        form = coded_form(group, np.full(len(group.canonical), -1))
+        plan = plan_group(form, importance.with_axes(form.axis_order), quality, self.settings)
+        coded, quantized = self._packed(quantize(form, plan, self.settings.rdo), group, first_frame)
+        if self.settings.random_access <= len(group):
+            return coded, state
+        return coded, _state_of(quantized, coded.payload)
 
-    def _refining(self, group: Group, first_frame: int) -> dict:
-        """By what a group is refined: `views` and `pictures` of `code_group`."""
-        pictured = self._capture is not None and group.calibration is not None
-        if pictured:
-            usual = min(SEEN * len(self._capture.indices("train")), FRAME_PICTURES)
-        else:
-            usual = FRAME_VIEWS if len(group) > 1 and len(group.frames[0]) <= FEW else 0
-        views = usual * len(group) if self._refine is None else self._refine
-        if not pictured:
-            return {"views": views}
-        given = self._capture, group.calibration, first_frame, views, len(group.frames[0])
-        return {"views": views, "pictures": PictureTargets(*given)}
+    def _packed(
+        self, quantized: Quantized, group: ParametricGroup, first_frame: int, reference: ReferenceGroup | None = None
+    ) -> tuple[CodedGroup, Quantized]:
+        """Stages refine and pack."""
+        quantized = self._refined(quantized, group, first_frame, reference)
+        payload, units = _native.encode_group(quantized.integers, reference.decoded if reference else None)
+        return CodedGroup(payload, units, len(quantized.integers), reference is None), quantized
 
-    def state(self) -> dict[str, np.ndarray]:
-        """What the next group may be predicted from; empty if from nothing."""
-        r = self._reference
-        if r is None:
-            return {}
-        numbers = {"frames": np.array(r.frames), "back": np.array(r.back)}
-        return {**numbers, "index": r.index, "payload": np.frombuffer(r.payload.data, np.uint8), **r.coded.state()}
+    def _refined(self, quantized, group, first_frame, reference) -> Quantized:
+        if self.settings.refine == 0 or not len(quantized.integers):
+            return quantized
+        rounding = AdaptiveRounding(quantized, self.settings, reference)
+        if self.refine_by_pictures is not None and group.calibration is not None:
+            self.refine_by_pictures(group, first_frame, rounding)
+            return rounding.quantized()
+        views = self._drawn_views(group)
+        if not views:
+            return quantized
+        form, rate = quantized.form, self.settings.rounding.drawn_rate / views**0.5
+        cameras = sensitivity_cameras(form.means[form.frames // 2], list(self.cameras), views)
+        rounding.follow(drawn_views(rounding.source, cameras, form.frames), views, rate)
+        return rounding.quantized()
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Goes on behind the groups after which another coder had this `state`."""
-        if "payload" in state:
-            payload, numbers = _Payload(state["payload"].tobytes()), (int(state["frames"]), int(state["back"]))
-            self._reference = _Reference(Coded.restored(state), payload, *numbers, state["index"])
+    def _drawn_views(self, group: ParametricGroup) -> int:
+        """By how many drawn views a group of splats is refined."""
+        s = self.settings
+        if s.refine is not None:
+            return s.refine
+        return s.rounding.frame_views * len(group) if len(group) > 1 and len(group.canonical) <= s.plan.few else 0
 
-    def _parents(self, group: Group) -> np.ndarray | None:
-        """[N] int, which Gaussian of the reference each one is, -1: none; None: nothing is known."""
-        if group.parents is None or self._reference is None:
-            return None
-        parents, before = np.asarray(group.parents), self._reference.index
-        count = len(group.frames[0])
-        known = parents[parents >= 0] if parents.shape == (count,) else parents
-        if parents.shape != (count,) or len(np.unique(known)) < len(known) or known.max(initial=-1) >= len(before):
-            raise CaptureError(
-                f"parents of a group: expected, for each of its {count} Gaussians, another one of the {len(before)} "
-                f"of the group before, or -1"
-            )
-        return np.where(parents >= 0, before[np.maximum(parents, 0)] if len(before) else -1, -1)
+
+def _state_of(quantized: Quantized, payload: bytes) -> CoderState:
+    """The state behind an independent group."""
+    form: CodedForm = quantized.form
+    parameters, frames = quantized.plan.parameters, form.frames
+    lineage = np.full(len(form.group.canonical), -1)
+    lineage[form.index] = np.arange(len(form.index))
+    own = form.rest, form.rotations, form.axis_order, form.axis_rotation
+    return CoderState(payload, *own, parameters.trajectory_steps, parameters.node_step, frames, 1, lineage)
+
+
+def _lineage(group: ParametricGroup, state: CoderState | None) -> np.ndarray | None:
+    """[N] int, which Gaussian of the independent group each one continues, -1: none; None: nothing is known.
+
+    Raises:
+        CaptureError: two Gaussians have the same parent, or one that is not there.
+    """
+    if group.parents is None or state is None:
+        return None
+    parents, before, count = np.asarray(group.parents), state.lineage, len(group.canonical)
+    known = parents[parents >= 0] if parents.shape == (count,) else parents
+    if parents.shape != (count,) or len(np.unique(known)) < len(known) or known.max(initial=-1) >= len(before):
+        raise CaptureError(
+            f"parents of a group: expected, for each of its {count} Gaussians, another one of the {len(before)} "
+            f"of the group before, or -1"
+        )
+    return np.where(parents >= 0, before[np.maximum(parents, 0)] if len(before) else -1, -1)

@@ -1,7 +1,7 @@
-"""Curves: sizes and opacities are coded along a line that rises where the picture hears them (spec 13.1).
+"""Companding: log_scales and logit_opacities are coded along a curve that is steep where the picture is insensitive.
 
-A thin axis is smaller than a pixel, an opacity is as good as 0 or 1: there the same error of the value shows less. With
-steps that widen as the measured sensitivity falls, integers tell no more than can be seen.
+A thin axis is smaller than a pixel, an opacity is nearly 0 or 1: there the same error of the value shows less. Steps
+that widen as the measured sensitivity falls spend no bits on it (spec 13.1).
 """
 
 from __future__ import annotations
@@ -10,30 +10,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..model.attributes import COMPANDED
+from .settings import CompandingSettings
+
 PIECES = 8  # of the bitstream
-CURVED = ("log_scales", "logit_opacities")
-LEAST = 16000  # Gaussians from which sensitivity by value is known well enough to save anything
-BINS, TAILS = 24, (0.2, 99.8)  # of the histogram, between these percentiles
-STEEPEST = 32.0  # relative to where the picture hears most
-DOUBT = 20  # a bin counts as so many more Gaussians of the mean sensitivity
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Pieces of `width` from `low` on, in coded values; piece j rises by 2^(slopes[j] / 16). `low` is its own value."""
+    """Piecewise linear: pieces of `width` from `low` on, in coded values; piece j has the slope 2^(slopes[j] / 16). The
+    value of `low` is `low`."""
 
     low: float
     width: float
     slopes: tuple[int, ...]
 
     def row(self) -> list[float]:
-        """The curve as the bitstream core takes it."""
+        """[10] low, width, slopes, as in QuantizedChannels."""
         return [self.low, self.width, *map(float, self.slopes)]
 
     @staticmethod
-    def of(row: list[float]) -> Curve:
+    def of(row: np.ndarray) -> Curve:
         """Inverse of `row`."""
-        return Curve(row[0], row[1], tuple(map(int, row[2:])))
+        return Curve(float(row[0]), float(row[1]), tuple(map(int, row[2:])))
 
     def coded(self, values: np.ndarray) -> np.ndarray:
         """Values -> what is quantized."""
@@ -64,45 +63,42 @@ class Curve:
         )
 
 
-def fit(values: np.ndarray, weights: np.ndarray) -> Curve:
+def fit(values: np.ndarray, weights: np.ndarray, settings: CompandingSettings) -> Curve:
     """The curve along which [N] values of [N] sensitivities are equally sensitive."""
-    low, high = np.percentile(values, TAILS)
+    bins = settings.bins
+    low, high = np.percentile(values, settings.tails)
     high = max(high, low + 1e-3)
-    edges = np.linspace(low, high, BINS + 1)
-    place = np.clip(np.searchsorted(edges, values) - 1, 0, BINS - 1)
-    mean = np.bincount(place, weights, BINS) + DOUBT * weights.mean()
-    mean /= np.bincount(place, minlength=BINS) + DOUBT
+    edges = np.linspace(low, high, bins + 1)
+    place = np.clip(np.searchsorted(edges, values) - 1, 0, bins - 1)
+    mean = np.bincount(place, weights, bins) + settings.prior * weights.mean()
+    mean /= np.bincount(place, minlength=bins) + settings.prior
     mean = np.convolve(np.pad(mean, 1, mode="edge"), (0.25, 0.5, 0.25), "valid")
-    heard = np.sqrt(np.maximum(mean / max(mean.max(), 1e-30), STEEPEST**-2))
-    coded = np.concatenate([[0], np.cumsum(heard) * (high - low) / BINS])
+    density = np.sqrt(np.maximum(mean / max(mean.max(), 1e-30), settings.steepest**-2))
+    coded = np.concatenate([[0], np.cumsum(density) * (high - low) / bins])
     knots = np.interp(np.linspace(0, coded[-1], PIECES + 1), coded, edges)
     width = np.float32(coded[-1] / PIECES)
     slopes = np.rint(16 * np.log2(np.diff(knots) / width)).clip(0, 255).astype(int)
     return Curve(float(np.float32(low)), float(width), tuple(slopes.tolist()))
 
 
-def fit_all(values: dict[str, np.ndarray], weights: dict[str, np.ndarray]) -> dict[str, list[Curve]]:
+def fit_all(values: dict, weights: dict, settings: CompandingSettings) -> dict[str, list[Curve]]:
     """attribute -> a curve for each channel of those that have curves; `values`, `weights`: attribute -> [N, C]."""
-    if len(values["log_scales"]) < LEAST:
+    if len(values["log_scales"]) < settings.least:
         return {}
-    return {n: [fit(v, w) for v, w in zip(values[n].T, weights[n].T, strict=True)] for n in CURVED}
+    pairs = {n: zip(values[n].T, weights[n].T, strict=True) for n in COMPANDED}
+    return {n: [fit(v, w, settings) for v, w in channels] for n, channels in pairs.items()}
 
 
-def along(values: np.ndarray, curves: list[Curve] | None) -> np.ndarray:
-    """[N, C] values as they are coded; without curves they are so already."""
+def compand(values: np.ndarray, curves: list[Curve] | None) -> np.ndarray:
+    """[N, C] values -> as they are coded; without curves they are so already."""
     return np.stack([c.coded(v) for v, c in zip(values.T, curves, strict=True)], 1) if curves else values
 
 
-def back(coded: np.ndarray, curves: list[Curve] | None) -> np.ndarray:
-    """Inverse of `along`."""
+def expand(coded: np.ndarray, curves: list[Curve] | None) -> np.ndarray:
+    """Inverse of `compand`."""
     return np.stack([c.values(v) for v, c in zip(coded.T, curves, strict=True)], 1) if curves else coded
 
 
-def rises(coded: np.ndarray, curves: list[Curve]) -> np.ndarray:
+def slopes(coded: np.ndarray, curves: list[Curve] | None) -> np.ndarray | float:
     """[N, C], how much larger steps of values are than those that are coded."""
-    return np.stack([c.rise(v) for v, c in zip(coded.T, curves, strict=True)], 1)
-
-
-def sensitivities(weights: dict[str, np.ndarray], values: dict[str, np.ndarray], curves: dict) -> dict[str, np.ndarray]:
-    """`weights` of coded values; `values`: attribute -> [N, C], coded."""
-    return weights | {n: weights[n] * rises(values[n], own) ** 2 for n, own in curves.items()}
+    return np.stack([c.rise(v) for v, c in zip(coded.T, curves, strict=True)], 1) if curves else 1.0

@@ -1,65 +1,25 @@
-"""GaussianSequence -> .gsv: the loop over groups, with progress, interruption and resume.
+"""ParametricGroups -> .gsv: the loop over groups, with progress, interruption and resume.
 
-Groups come one at a time from `groups` (a trainer yields them as they are done), are turned to integers, to bytes, and
-appended. A run that stops goes on where it stopped, to the same bytes.
+Groups come one at a time (a trainer yields them as they are done), are turned to integers, to bytes, and appended. A
+run that stops goes on where it stopped, to the same bytes.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from ..bitstream.levels import smallest_level
-from ..capture import Capture
-from ..errors import UsageError
 from ..model.camera import Camera
-from ..model.gaussians import Group
-from .coder import CodedGroup, GroupCoder
-from .rate_control import RateControl
+from ..model.parametric_group import ParametricGroup
+from .coder import CodedGroup, CoderState, GroupCoder, RefineByPictures
+from .rate_control import code_at_rate
+from .settings import EncodeSettings
 from .writer import StreamWriter
-
-LAYERS_MAX = 16  # spec 4
-REFINE = 100  # views, of splats of one frame
-
-
-@dataclass(frozen=True)
-class EncodeSettings:
-    """What the encoder is asked for.
-
-    Attributes:
-        quality: 0 (small) to 100 (fine); 50 is about 41 dB against the input.
-        bitrate: bits per second that the whole file is to have, instead of one quality; None: `quality` it is.
-        keep_all: also code Gaussians that are never visible.
-        random_access: frames from one independent group to the next at most; the groups between are predicted from it
-            where their parents are known and it is cheaper. 0 or 1: every group is independent.
-        layers: layers of importance in each group, each with its own steps; any first few decode alone. None: what is
-            smallest.
-        refine: views by which each group is refined; 0: none is. None: each picture of the capture that it was
-            trained on four times, at most 80 a frame; without one 10 drawn views a frame in groups of few Gaussians.
-    """
-
-    quality: float = 50.0
-    bitrate: float | None = None
-    keep_all: bool = False
-    random_access: int = 60
-    layers: int | None = None
-    refine: int | None = None
-
-    def __post_init__(self):
-        if not 0 <= self.quality <= 100:
-            raise UsageError(f"--quality {self.quality:g} is out of range, expected 0 (small) to 100 (fine)")
-        if self.bitrate is not None and not self.bitrate > 0:
-            raise UsageError(f"--bitrate {self.bitrate:g} is out of range, expected bits per second above 0")
-        if self.random_access < 0:
-            raise UsageError(f"--random-access {self.random_access} is out of range, expected 0 frames or more")
-        if self.layers is not None and not 1 <= self.layers <= LAYERS_MAX:
-            raise UsageError(f"--layers {self.layers} is out of range, expected 1 to {LAYERS_MAX}")
-        if self.refine is not None and self.refine < 0:
-            raise UsageError(f"--refine {self.refine} is out of range, expected 0 views or more")
 
 
 @dataclass
@@ -122,58 +82,46 @@ def stream_config(
     }
 
 
+@dataclass(frozen=True)
+class StreamOutput:
+    """Where a stream is written.
+
+    Attributes:
+        path: final path, OUT.gsv.
+        config: of `stream_config`.
+        fingerprint: whatever must be equal for a second run to go on with the groups of the first one (JSON-able).
+    """
+
+    path: Path
+    config: dict
+    fingerprint: dict = field(default_factory=dict)
+
+
 def encode_groups(
-    groups: Callable[[int, int], Iterable[Group]],
-    out: Path,
-    config: dict,
+    groups: Callable[[int, int], Iterable[ParametricGroup]],
+    output: StreamOutput,
     settings: EncodeSettings,
     *,
-    fingerprint: dict,
-    cameras: list[Camera] = (),
-    capture: Capture | None = None,
+    cameras: Sequence[Camera] = (),
+    refine_by_pictures: RefineByPictures | None = None,
     on_group: Callable[[EncodeReport], None] | None = None,
 ) -> EncodeReport:
-    """Writes `out` from the groups that `groups(done, frames)` yields: those after the `done` groups, `frames` frames,
-    that an earlier run left in the file.
+    """Writes a stream from the groups that `groups(done, frames)` yields: those after the `done` groups, `frames`
+    frames, that an earlier run left in the file.
 
     Args:
-        cameras: of splats, if known; from those for training, too, it is measured what the Gaussians matter.
-        capture: what the groups were trained on, frame by frame of the stream: its cameras count instead, and groups
-            that have a calibration are refined by its pictures.
+        cameras: from which the subject was captured, if known: sensitivity is measured from those for training.
+        refine_by_pictures: (group, first frame, quantizer) of a capture: the last stage of training, for groups that
+            have a calibration.
 
     Ctrl-C finishes the file with the groups done and returns with `interrupted` set; the next run goes on.
     """
-    writer = StreamWriter(out, config, fingerprint)
-    coder = GroupCoder(
-        keep_all=settings.keep_all,
-        layers=settings.layers,
-        refine=settings.refine,
-        random_access=settings.random_access,
-        cameras=[c for c in (capture.cameras if capture else cameras) if c.split == "train"],
-        capture=capture,
-    )
-    state = writer.state()
-    coder.restore(state)
-    quality = float(state.get("quality", settings.quality))
-    rate = RateControl(settings.bitrate, config["fps"], quality) if settings.bitrate else None
+    writer = StreamWriter(output.path, output.config, output.fingerprint)
+    trained = tuple(c for c in cameras if c.split == "train")
+    coder = GroupCoder(settings, float(output.config["fps"]), trained, refine_by_pictures)
     report = EncodeReport(seconds={"input": 0.0, "code": 0.0})
-    clock = time.perf_counter
     try:
-        mark = clock()
-        for group in groups(writer.groups, writer.frames):
-            report.seconds["input"] += clock() - mark
-            mark = clock()
-            if rate:
-                coder, coded = rate.code(coder, group, writer.frames, writer.bytes)
-            else:
-                coded = coder.code(group, settings.quality, writer.frames)
-            report.seconds["code"] += clock() - mark
-            state = coder.state() | ({"quality": np.array(rate.quality)} if rate else {})
-            writer.append(coded.payload, len(group), sync=coded.independent, state=state)
-            _account(report, writer, coded)
-            if on_group:
-                on_group(report)
-            mark = clock()
+        _code_all(groups(writer.groups, writer.frames), coder, writer, report, on_group)
     except KeyboardInterrupt:
         report.interrupted = True
     except BaseException:
@@ -182,8 +130,30 @@ def encode_groups(
     if writer.groups:
         writer.finish(keep_part=report.interrupted)
     report.frames, report.groups = writer.frames, writer.groups
-    report.bytes = Path(out).stat().st_size if writer.groups else 0
+    report.bytes = Path(output.path).stat().st_size if writer.groups else 0
     return report
+
+
+def _code_all(groups: Iterable[ParametricGroup], coder: GroupCoder, writer: StreamWriter, report, on_group) -> None:
+    """Codes and appends group after group, from the state in which an earlier run left the writer."""
+    arrays = writer.state()
+    state, quality = CoderState.from_arrays(arrays), float(arrays.get("quality", coder.settings.quality))
+    clock = time.perf_counter
+    mark = clock()
+    for group in groups:
+        report.seconds["input"] += clock() - mark
+        mark = clock()
+        if coder.settings.bitrate:
+            coded, state, quality = code_at_rate(coder, state, group, (writer.frames, writer.bytes, quality))
+        else:
+            coded, state = coder.code(state, group, coder.measure(group), quality, writer.frames)
+        report.seconds["code"] += clock() - mark
+        kept = {"quality": np.array(quality)} | (state.to_arrays() if state else {})
+        writer.append(coded.payload, len(group), sync=coded.independent, state=kept)
+        _account(report, writer, coded)
+        if on_group:
+            on_group(report)
+        mark = clock()
 
 
 def _account(report: EncodeReport, writer: StreamWriter, coded: CodedGroup) -> None:

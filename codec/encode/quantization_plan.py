@@ -1,167 +1,226 @@
-"""What a group is coded with, before anything is rounded: who is coded, in which layer, along what, with which steps.
+"""Stage plan: importance + quality -> which Gaussians are coded, in which layer, with which steps.
 
-Sensitivity is measured; who is not seen goes; curves and levers bend values to where errors show alike; layers gather
-Gaussians of like sensitivity; steps share out the error that the quality allows.
+Gaussians that no view shows go; companding and scale exponents bend values to where errors show alike; layers gather
+Gaussians of like sensitivity; steps share out the error that the quality allows (reverse water-filling). A predicted
+group keeps the parameters of its reference, and only its births choose a layer.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from ..bitstream.quantization import Steps, error_for, steps_for, subject_radius
-from ..model.camera import Camera
-from ..render.sensitivity import VIEWS, Importance, coarsest, measure, steps_for_error
-from . import companding as curved
-from . import rdo
-from .rotation_residuals import fit_levers, widths
-from .stack import Stack, canonical_appearance
+from ..bitstream.quantization import error_for, steps_for, subject_radius
+from ..model.attributes import BY_NAME, GRID_BITS_MAX
+from ..render.sensitivity import Importance, steps_for_error
+from . import companding, rdo
+from .coded_form import CodedForm
+from .rotation_residuals import fit_scale_exponents, step_factors
+from .settings import EncodeSettings, PlanSettings
 
-LEVEL_RANGE = (3, 97)  # percentiles of log sensitivity between which layers are even
-LEAST_LEVEL = 1e-4  # of the mean sensitivity
-STILL_LAYERS, STILL_LEAST = 4, 1000  # layers of a single frame of so many Gaussians
-FEW = 20_000  # Gaussians, for which there is time to look longer
-MORE_VIEWS = 48  # from which these, and a single frame, are measured
-SHIFT_MOST = 8  # doublings of a layer's step
-PRUNE = 0.3  # a Gaussian goes if the picture without it errs by less than this share of the error per coded Gaussian
+
+@dataclass(frozen=True)
+class Grid:
+    """The integer lattice of positions: origin [3] f32, world units; step, world units; bits of a coordinate."""
+
+    origin: np.ndarray
+    step: float
+    bits: int
+
+    @staticmethod
+    def around(means: np.ndarray, step: float, room: int = 0) -> Grid:
+        """The lattice that holds `means` [N, 3], and 2^room of it along each axis."""
+        low = means.min(0) if len(means) else np.zeros(3)
+        extent = float((means.max(0) - low).max()) if len(means) else 0.0
+        finest = extent / (2 ** (GRID_BITS_MAX - room) - 2)
+        step = float(np.float32(max(step, finest)))  # far floaters: coarser, not an error
+        return Grid(low.astype(np.float32), step, room + max(1, int(np.ceil(extent / step + 1)).bit_length()))
+
+    def to_integers(self, means: np.ndarray, shift: np.ndarray | int = 0) -> np.ndarray:
+        """[N, 3] world -> [N, 3] u32, multiples of 2^shift ([N])."""
+        unit = 2 ** np.broadcast_to(shift, len(means))[:, None]
+        q = np.rint((means - self.origin) / (self.step * unit))
+        return (np.clip(q, 0, 2**self.bits // unit - 1) * unit).astype(np.uint32)
+
+    def to_world(self, integers: np.ndarray) -> np.ndarray:
+        """[N, 3] u32 -> [N, 3] f64 world."""
+        return self.origin.astype(np.float64) + self.step * integers.astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """What a predicted group shares with its reference.
+
+    Attributes:
+        grid: lattice of positions.
+        steps: attribute -> [C] f32 of the first layer, of companded values; of quats times `step_factors`.
+        shifts: attribute -> [L] int, doublings of each layer's steps.
+        curves: attribute -> a curve for each channel, where it is companded.
+        scale_exponents: [3, 3] i32, of the steps of quats.
+        trajectory_steps: attribute -> step of a value in one frame.
+        node_step: of translations of nodes, world units.
+    """
+
+    grid: Grid
+    steps: dict[str, np.ndarray]
+    shifts: dict[str, np.ndarray]
+    curves: dict[str, list[companding.Curve]]
+    scale_exponents: np.ndarray
+    trajectory_steps: dict[str, float]
+    node_step: float
+
+    @property
+    def layers(self) -> int:
+        """How many layers there are."""
+        return len(self.shifts["means"])
 
 
 @dataclass(frozen=True)
 class Plan:
     """Attributes:
-    source, layer: [N] int, the Gaussians that are coded, and the layer of each.
-    layers: how many there are.
-    measured: of these Gaussians.
-    shifts: attribute -> [L] int, doublings of each layer's steps.
-    steps: attribute -> [C] f32, of the first layer; of quats times `widths` by the levers.
-    even: the same without layers, curves and levers, of quats by turns about the axes of the scene.
-    curves: attribute -> a curve for each channel. levers: [3, 3], of quats.
-    node_step: of translations of nodes, world units. price: of a bit.
+    index: [n] int, the Gaussians of the coded form that are coded.
+    layer: [n] int, the layer of each.
+    importance: of each. price: of a bit, in mean squared error.
+    parameters: see there.
     """
 
-    source: np.ndarray
+    index: np.ndarray
     layer: np.ndarray
-    layers: int
-    measured: Importance
-    shifts: dict[str, np.ndarray]
-    steps: dict[str, np.ndarray]
-    even: dict[str, np.ndarray]
-    curves: dict[str, list[curved.Curve]]
-    levers: np.ndarray
-    node_step: float
+    importance: Importance
     price: float
+    parameters: Parameters
 
     def ordered(self, order: np.ndarray) -> Plan:
-        """The same of the Gaussians at `order`."""
-        taken = self.source[order], self.layer[order], self.measured.take(order)
-        return replace(self, source=taken[0], layer=taken[1], measured=taken[2])
+        """The Gaussians at `order`."""
+        kept = self.index[order], self.layer[order], self.importance.take(order)
+        return Plan(*kept, self.price, self.parameters)
 
-    def own_shifts(self) -> dict[str, np.ndarray]:
-        """attribute -> [N] int, of each Gaussian."""
-        return {n: v[self.layer] for n, v in self.shifts.items()}
+
+@dataclass(frozen=True)
+class Known:
+    """Of a reference: its parameters, and the layer of each of its Gaussians."""
+
+    parameters: Parameters
+    layer: np.ndarray
 
 
 def plan_group(
-    s: Stack, quality: float, *, layers: int | None, keep_all: bool, trained: bool, cameras: list[Camera] = ()
+    form: CodedForm, importance: Importance, quality: float, settings: EncodeSettings, known: Known | None = None
 ) -> Plan:
-    """The plan of an independent group.
+    """The plan of a group.
 
     Args:
-        s: with its axes by falling scale. layers, keep_all, cameras: as in `code_group`.
-        trained: as in `rdo.bit_price`.
+        importance: of all Gaussians of `form`. known: of the reference, where the group is predicted.
     """
-    middle, count = len(s.means) // 2, s.means.shape[1]
-    measured, error = measure_stack(s, cameras), error_for(quality)
-    source = np.arange(count) if keep_all else np.flatnonzero(measured.removal >= PRUNE * error / max(count, 1))
-    s, measured, radius = s.take(source), measured.take(source), subject_radius(s.means[middle])
-    nominal, layers = steps_for(quality, radius), layers or _layers(s)
-    turning = replace(measured, weights=measured.weights | {"quats": measured.turns})
-    even = _steps(s, turning, error, nominal)
-    curves, levers, heard = _bent(s, middle, measured)
-    layer = layer_of(heard, layers)
-    room = {n: np.log2(coarsest(n, radius) / v.mean()) for n, v in even.items()}
-    shifts = layer_shifts(heard, layer, layers, room)
-    steps = _steps(s, heard, error, nominal, {n: v[layer] for n, v in shifts.items()}, curves, levers)
-    price = rdo.bit_price(error, len(source), trained)
-    fixed = (shifts, steps, even, curves, levers, nominal.node_translation, price)
-    return Plan(source, layer, layers, measured, *fixed)
+    error = error_for(quality)
+    index = _kept(form, importance, error, settings, predicted=known is not None)
+    form, importance = form.take(index), importance.take(index)
+    price = rdo.bit_price(error, len(index), form.group.rate_optimized, settings.rdo)
+    if known is None:
+        parameters, layer = _parameters(form, importance, quality, settings)
+    else:
+        parameters, born = known.parameters, form.lineage < 0
+        layer = known.layer[np.maximum(form.lineage, 0)] if len(known.layer) else np.zeros(len(index), int)
+        layer[born] = layer_of(importance.take(np.flatnonzero(born)), parameters.layers, settings.plan)
+    return Plan(index, layer, importance, price, parameters)
 
 
-def measure_stack(s: Stack, cameras: list[Camera] = ()) -> Importance:
-    """What each Gaussian of a group matters, from its first, middle and last frame."""
-    frames, count = s.means.shape[:2]
-    if not count:
-        sizes = {"means": 3, "quats": 3} | {n: v.shape[2] for n, v in s.appearance.items()}
-        return Importance({n: np.zeros((0, c)) for n, c in sizes.items()}, np.zeros((0, 3)), np.zeros(0))
-    shown = [s.frame(t) for t in sorted({0, frames // 2, frames - 1})]
-    return measure(shown, cameras, MORE_VIEWS if frames == 1 or count <= FEW else VIEWS)
+def _kept(
+    form: CodedForm, importance: Importance, error: float, settings: EncodeSettings, *, predicted: bool
+) -> np.ndarray:
+    """[n] int, Gaussians that are worth coding: survivors that show at all, births that matter."""
+    count, removal = len(form.rest), importance.removal
+    if settings.keep_all:
+        return np.arange(count)
+    least = settings.plan.prune * error / max(count, 1)
+    if not predicted:
+        return np.flatnonzero(removal >= least)
+    needed = np.where(form.group.parents >= 0, settings.plan.rebirth * least, least)  # left out before, or new
+    return np.flatnonzero(np.where(form.lineage >= 0, removal > 0, removal >= needed))
 
 
-def layer_of(measured: Importance, layers: int) -> np.ndarray:
+def _parameters(
+    form: CodedForm, importance: Importance, quality: float, settings: EncodeSettings
+) -> tuple[Parameters, np.ndarray]:
+    """Those of an independent group, and the layer of each Gaussian."""
+    error, radius = error_for(quality), subject_radius(form.rest)
+    nominal, layers = steps_for(quality, radius), settings.layers or _usual_layers(form, settings.plan)
+    over_time = importance.with_weights(quats=importance.scene_rotations)
+    even = _steps(form, over_time, error, nominal, radius)
+    curves, exponents, bent = _bent(form, importance, settings)
+    layer = layer_of(bent, layers, settings.plan)
+    room = {n: np.log2(_coarsest(n, radius) / v.mean()) for n, v in even.items()}
+    shifts = _layer_shifts(bent, layer, layers, room, settings.plan)
+    own = {n: v[layer] for n, v in shifts.items()}
+    steps = _steps(form, bent, error, nominal, radius, shifts=own, curves=curves, exponents=exponents)
+    grid = Grid.around(form.rest, float(steps["means"][0]), room=0 if form.group.nodes is None else 1)
+    shifts["means"] = np.minimum(shifts["means"], grid.bits - 1)
+    mean_step = {n: float(1 / np.sqrt((1 / v.astype(np.float64) ** 2).mean())) for n, v in even.items()}
+    return Parameters(grid, steps, shifts, curves, exponents, mean_step, nominal.node_translation), layer
+
+
+def layer_of(importance: Importance, layers: int, settings: PlanSettings) -> np.ndarray:
     """[N] int, layer of each Gaussian: equal ranges of the logarithm of sensitivity, the most sensitive in layer 0."""
-    if not len(measured.removal) or layers == 1:
-        return np.zeros(len(measured.removal), int)
-    appearance = [w / np.maximum(w.mean(0), 1e-30) for n, w in measured.weights.items() if n != "means"]
-    level = np.log2(np.concatenate(appearance, 1) + LEAST_LEVEL).mean(1)
-    edges = np.linspace(*np.percentile(level, LEVEL_RANGE), layers + 1)[1:-1]
+    if not len(importance.removal) or layers == 1:
+        return np.zeros(len(importance.removal), int)
+    appearance = [w / np.maximum(w.mean(0), 1e-30) for n, w in importance.weights.items() if n != "means"]
+    level = np.log2(np.concatenate(appearance, 1) + settings.least_sensitivity).mean(1)
+    edges = np.linspace(*np.percentile(level, settings.level_percentiles), layers + 1)[1:-1]
     return layers - 1 - np.searchsorted(edges, level)
 
 
-def layer_shifts(measured: Importance, layer: np.ndarray, layers: int, room: dict) -> dict[str, np.ndarray]:
-    """[L] int of each attribute: how often each layer's step is doubled, by its mean sensitivity; `room`: so often at
-    most, since the derivative says too little farther off."""
+def _layer_shifts(importance, layer, layers: int, room: dict, settings: PlanSettings) -> dict[str, np.ndarray]:
+    """[L] int of each attribute: how often each layer's step is doubled, by its mean sensitivity; at most `room` times,
+    since the derivative of the picture says too little farther off."""
     count = np.maximum(np.bincount(layer, minlength=layers), 1)
     shifts = {}
-    for n, w in measured.weights.items():
+    for n, w in importance.weights.items():
         own = (w / np.maximum(w.sum(0) / max(len(w), 1), 1e-30)).mean(1)
         mean = np.maximum(np.bincount(layer, own, minlength=layers) / count, 1e-9)
-        shifts[n] = np.clip(np.rint(0.5 * np.log2(mean.max() / mean)), 0, np.clip(room[n], 0, SHIFT_MOST)).astype(int)
+        most = np.clip(room[n], 0, settings.shift_most)
+        shifts[n] = np.clip(np.rint(0.5 * np.log2(mean.max() / mean)), 0, most).astype(int)
     return shifts
 
 
-def _bent(s: Stack, middle: int, measured: Importance) -> tuple[dict[str, list[curved.Curve]], np.ndarray, Importance]:
-    """Curves of attributes, levers of rotations, and the importance of what is coded along them."""
-    values = canonical_appearance(s)
-    curves = curved.fit_all(values, measured.weights)
-    weights = curved.sensitivities(measured.weights, along_curves(values, curves), curves)
-    levers = fit_levers(s.log_scales[middle], weights["quats"])
-    weights["quats"] = weights["quats"] * _relative(widths(s.log_scales[middle], levers))[0] ** 2
-    return curves, levers, replace(measured, weights=weights)
+def _bent(form: CodedForm, importance: Importance, settings: EncodeSettings):
+    """Companding curves, scale exponents of rotations, and the importance of values that are coded along both."""
+    curves = companding.fit_all(form.values, importance.weights, settings.companding)
+    weights = dict(importance.weights)
+    for n, own in curves.items():
+        weights[n] = weights[n] * companding.slopes(companding.compand(form.values[n], own), own) ** 2
+    sizes = form.values["log_scales"]
+    exponents = fit_scale_exponents(sizes, weights["quats"], settings.scale_exponents)
+    weights["quats"] = weights["quats"] * _relative(step_factors(sizes, exponents))[0] ** 2
+    return curves, exponents, importance.with_weights(**weights)
 
 
-def _relative(widths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[N, C] and [C]: widths relative to the geometric mean of each channel, and that."""
-    level = np.exp(np.log(widths).mean(0)) if len(widths) else np.ones(widths.shape[1])
-    return widths / level, level
+def _relative(factors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[N, C] and [C]: factors relative to the geometric mean of each channel, and that."""
+    level = np.exp(np.log(factors).mean(0)) if len(factors) else np.ones(factors.shape[1])
+    return factors / level, level
 
 
 def _steps(
-    s: Stack,
-    measured: Importance,
-    error: float,
-    nominal: Steps,
-    shifts: dict[str, np.ndarray] | None = None,
-    curves: dict | None = None,
-    levers: np.ndarray | None = None,
+    form: CodedForm, importance, error: float, nominal, radius: float, *, shifts=None, curves=None, exponents=None
 ) -> dict[str, np.ndarray]:
     """[C] f32 step of each channel of each attribute; those of a Gaussian are 2^shifts ([N] each) times that, of quats
-    times its `widths` by the levers. `measured` is that of `_bent`, where there are curves and levers."""
-    if not len(measured.removal):
-        return {n: np.full(w.shape[1], getattr(nominal, n), np.float32) for n, w in measured.weights.items()}
-    middle = s.only(len(s.means) // 2)
-    values = along_curves({n: v[0] for n, v in middle.appearance.items()}, curves or {})
-    width, level = _relative(widths(middle.log_scales[0], np.zeros((3, 3)) if levers is None else levers))
-    values |= {"means": middle.means[0], "quats": middle.quats[0, :, 1:] / width}
-    steps = steps_for_error(measured.weights, values, error, subject_radius(middle.means[0]), shifts)
+    times its `step_factors`. `importance` is that of `_bent`, where there are curves and exponents."""
+    weights = importance.weights
+    if not len(importance.removal):
+        return {n: np.full(w.shape[1], getattr(nominal, n), np.float32) for n, w in weights.items()}
+    values = {n: companding.compand(v, (curves or {}).get(n)) for n, v in form.values.items()}
+    factors = step_factors(form.values["log_scales"], np.zeros((3, 3)) if exponents is None else exponents)
+    factors, level = _relative(factors)
+    values |= {"means": form.rest, "quats": form.coded_rotations[:, 1:] / factors}
+    steps = steps_for_error(weights, {n: values[n] for n in weights}, error, radius, shifts)
     return steps | {"quats": steps["quats"] / level.astype(np.float32)}
 
 
-def along_curves(values: dict[str, np.ndarray], curves: dict[str, list[curved.Curve]]) -> dict[str, np.ndarray]:
-    """`values` (attribute -> [N, C]) as they are coded."""
-    return {n: curved.along(v, curves.get(n)) for n, v in values.items()}
+def _coarsest(attribute: str, radius: float) -> float:
+    return BY_NAME[attribute].coarsest_step * (radius if attribute == "means" else 1.0)
 
 
-def _layers(s: Stack) -> int:
+def _usual_layers(form: CodedForm, settings: PlanSettings) -> int:
     """Layers that make a group smallest: trajectories of a Gaussian miss their neighbours in other layers."""
-    return STILL_LAYERS if len(s.means) == 1 and s.means.shape[1] >= STILL_LEAST else 1
+    return settings.still_layers if form.frames == 1 and len(form.rest) >= settings.still_least else 1

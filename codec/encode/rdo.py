@@ -2,7 +2,7 @@
 
 All choices minimise error + price * bits, where the error is the picture's mean squared error by the measured
 sensitivities (render/sensitivity.py), and the price is the error that a bit saves where steps are right. Bits are
-estimates: code lengths given the neighbours' prediction for keyframes, a fixed table for trajectories.
+estimates: code lengths given the neighbours' prediction for canonical integers, a fixed table for trajectories.
 """
 
 from __future__ import annotations
@@ -11,100 +11,89 @@ from itertools import pairwise
 
 import numpy as np
 
+from .. import _native
 from ..bitstream.quantization import QUALITY_DEFAULT, error_for
-from ..bitstream.transform import dct_basis
+from .settings import RdoSettings
 
-BIT_PRICE = 0.05  # of a bit, in units of the picture's error per Gaussian
-TRAINED = 0.6  # of that where gscodec has trained the group: test views of stage and lumberjack say so
-FLOOR = 0.2  # share of the mean sensitivity that all have: few views say little of one, and errors that agree add up
-ZERO_BITS, NONZERO_BITS, LENGTH_BITS = (
-    0.5,
-    3.0,
-    0.7,
-)  # of a trajectory: coefficients 0 and +-1, one more temporal frequency
-RANGE = 15  # integers and predictions beyond are counted together
-NEAR, WINDOW = 4, 32  # contexts: so many nearest among so many before (spec 7.3)
-NEAR_WEIGHT = np.array([4, 3, 2, 2])
+RANGE = 15  # integers and predictions beyond are counted together; that of `_native.code_turns`
+NEAR_WEIGHT = np.array([4, 3, 2, 2])  # of the context's neighbours (spec 7.3)
+
+Layer = tuple[slice, np.ndarray]  # span of what a layer codes itself, [n, 4] neighbours of each, from its first
 
 
-def bit_price(error: float, count: int, trained: bool) -> float:
+def bit_price(error: float, count: int, rate_optimized: bool, settings: RdoSettings) -> float:
     """Mean squared error that one bit is worth in a group of `count` Gaussians whose target is `error`.
 
-    Where gscodec has `trained` the group, and hands over its nodes, a rate term has dropped what is not worth its bits
-    already: the finer the steps are, the less there is for a second look (lumberjack, quality 60: 4 % of the bytes).
+    Where training had a rate term, it has dropped what is not worth its bits already: the finer the steps are, the
+    less there is for a second look (lumberjack, quality 60: 4 % of the bytes).
     """
-    left = TRAINED * min(1.0, error / error_for(QUALITY_DEFAULT)) if trained else 1.0
-    return BIT_PRICE * left * error / max(count, 1)
+    left = settings.optimized_price * min(1.0, error / error_for(QUALITY_DEFAULT)) if rate_optimized else 1.0
+    return settings.bit_price * left * error / max(count, 1)
 
 
-def trajectory(values: np.ndarray, weights: np.ndarray, step: float, price: float) -> np.ndarray:
-    """DCT coefficients of [T, N, C] floats that are worth their bits: [K, C, N] i32, K >= 1.
+def quantize_trajectories(
+    c: np.ndarray, weights: np.ndarray, frames: int, price: float, settings: RdoSettings
+) -> np.ndarray:
+    """Integers for DCT coefficients that are worth their bits: [K', C, N] i32, 1 <= K' <= K.
 
     Args:
-        weights: [N, C] sensitivities. step: of the coefficients. price: of a bit.
+        c: [K, C, N] f32 coefficients in steps. frames: of the group.
+        weights: [N, C] sensitivities, of an error of one step in all frames. price: of a bit.
     """
-    frames, count, channels = values.shape
-    c = ((dct_basis(frames) / step).astype(np.float32) @ values.reshape(frames, -1)).reshape(values.shape)
-    # An error of one coefficient spreads over T frames.
-    worth = (weights * (step * step / frames / price)).astype(np.float32)  # bits per squared unit
-    least = np.sqrt((NONZERO_BITS - ZERO_BITS) / np.maximum(worth, 1e-12))
-    some = np.flatnonzero((np.abs(c) > np.maximum(least, 0.5)).any((0, 2)))
-    c, worth = c[:, some], worth[some]
+    zero, nonzero = settings.zero_bits, settings.nonzero_bits
+    worth = (weights.T / frames / price).astype(np.float32)  # [C, N] bits per squared step: an error spreads over T
+    least = np.sqrt((nonzero - zero) / np.maximum(worth, 1e-12))
+    some = np.flatnonzero((np.abs(c) > np.maximum(least, 0.5)).any((0, 1)))
+    c, worth = c[:, :, some], worth[:, some]
     q = np.rint(c)
-    gain = worth * q * (2 * c - q) - (NONZERO_BITS - ZERO_BITS) - 2 * np.log2(np.maximum(np.abs(q), 1))
+    gain = worth * q * (2 * c - q) - (nonzero - zero) - 2 * np.log2(np.maximum(np.abs(q), 1))
     q[gain <= 0] = 0
-    net = np.where(q != 0, gain, 0).sum(2) - channels * ZERO_BITS - LENGTH_BITS  # [T, n]
+    net = np.where(q != 0, gain, 0).sum(1) - c.shape[1] * zero - settings.length_bits  # [K, n]
     total = np.cumsum(net, 0)
-    length = np.where(total.max(0) > 0, total.argmax(0) + 1, 0)
-    q[np.arange(frames)[:, None] >= length] = 0
+    length = np.where(total.max(0, initial=0) > 0, total.argmax(0) + 1, 0) if len(some) else np.zeros(0, int)
+    q *= (np.arange(len(c))[:, None] < length)[:, None]
     used = max(1, length.max(initial=0))
-    out = np.zeros((used, channels, count), np.int32)
-    out[:, :, some] = q[:used].transpose(0, 2, 1)
+    out = np.zeros((used, c.shape[1], weights.shape[0]), np.int32)
+    out[:, :, some] = q[:used]
     return out
 
 
-def trajectory_margins(q: np.ndarray, weights: np.ndarray, step: float, frames: int, price: float) -> np.ndarray:
-    """[2, M, C], as of `margins`, of coefficients [M, C] of trajectories over so many frames, of sensitivities [M, C];
-    step, price: as in `trajectory`."""
-    bits = lambda q: np.where(q == 0, ZERO_BITS, NONZERO_BITS + 2 * np.log2(np.maximum(np.abs(q), 1)))  # noqa: E731
-    worth = np.maximum(weights * (step * step / frames / price), 1e-12)
-    return np.stack([np.clip((bits(q + d) - bits(q)) / (2 * worth), -0.4, 9) for d in (1, -1)]).astype(np.float32)
+def trajectory_thresholds(
+    q: np.ndarray, weights: np.ndarray, frames: int, price: float, settings: RdoSettings
+) -> np.ndarray:
+    """[2, M, C], as of `decision_thresholds`, of coefficients [M, C] of trajectories, of sensitivities [M, C] in steps;
+    frames, price: as in `quantize_trajectories`."""
+
+    def bits(q):
+        return np.where(q == 0, settings.zero_bits, settings.nonzero_bits + 2 * np.log2(np.maximum(np.abs(q), 1)))
+
+    worth = np.maximum(weights / frames / price, 1e-12)
+    found = [np.clip((bits(q + d) - bits(q)) / (2 * worth), *settings.threshold_range) for d in (1, -1)]
+    return np.stack(found).astype(np.float32)
 
 
-def layers_of(positions: np.ndarray, counts: list[int]) -> list[tuple[slice, np.ndarray]]:
-    """Of each layer of so many Gaussians its span, and its `neighbours` ([n, 4], counted from its first)."""
+def coded_layers(positions: np.ndarray, counts: list[int], births: list[int]) -> list[Layer]:
+    """What each layer codes itself: the last `births` of its `counts` Gaussians, in Morton order."""
     ends = np.cumsum([0, *counts])
-    spans = [slice(a, b) for a, b in pairwise(ends)]
-    return [(own, neighbours(positions[own])) for own in spans]
+    spans = [slice(b - born, b) for (_, b), born in zip(pairwise(ends), births, strict=True)]
+    return [(own, _native.context_neighbors(np.ascontiguousarray(positions[own]))) for own in spans]
 
 
-def neighbours(positions: np.ndarray) -> np.ndarray:
-    """[N, 4] the nearest in space among the 32 Gaussians before each, as contexts see them; itself where none is."""
-    p = positions.astype(np.float32)
-    index = np.arange(len(p))
-    distance = np.full((WINDOW, len(p)), np.inf, np.float32)
-    for back in range(1, min(WINDOW, len(p) - 1) + 1):
-        d = p[back:] - p[:-back]
-        distance[back - 1, back:] = np.einsum("nc,nc->n", d, d)
-    near = distance.argpartition(NEAR, 0)[:NEAR]
-    near = np.take_along_axis(near, np.take_along_axis(distance, near, 0).argsort(0, kind="stable"), 0)
-    return np.where(index - near - 1 >= 0, index - near - 1, index).T
-
-
-def keyframe(x: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float, passes: int = 2) -> np.ndarray:
+def quantize_canonical(
+    x: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float, settings: RdoSettings
+) -> np.ndarray:
     """Integers for `x` [N] floats in steps.
 
     Args:
-        weights: [N] sensitivities, of an error of one step. near: of `neighbours`.
-        price: of a bit.
+        weights: [N] sensitivities, of an error of one step. near: [N, 4] neighbours. price: of a bit.
     """
     q = np.rint(x)
     if not len(x):
         return q
-    bits_worth = worth(weights, price)
-    for _ in range(passes):
+    bits_worth = lambda_cost(weights, price, settings)
+    for _ in range(settings.passes):
         context = _contexts(q, near)
-        bits = _code_lengths(context, q)
+        bits = _code_lengths(context, q, settings)
         best, cost = q, np.full(len(x), np.inf)
         toward = np.sign(context - np.rint(x))
         for candidate in (np.rint(x), np.rint(x) + toward, np.rint(x) - np.sign(np.rint(x)), context, 0 * x):
@@ -116,40 +105,44 @@ def keyframe(x: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float,
     return q
 
 
-def margins(q: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float) -> tuple[np.ndarray, np.ndarray]:
-    """[N] how much farther than half a step above, and below, `q` ([N], of `keyframe`) still is the better integer,
-    in steps: what the next one costs more. Other arguments are those of `keyframe`."""
+def decision_thresholds(
+    q: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float, settings: RdoSettings
+) -> tuple[np.ndarray, np.ndarray]:
+    """[N] how much farther than half a step above, and below, `q` ([N]) still is the better integer, in steps: what the
+    next one costs more. Other arguments are those of `quantize_canonical`."""
     if not len(q):
         return q, q
     context = _contexts(q, near)
-    bits = _code_lengths(context, q)[context + RANGE]
+    bits = _code_lengths(context, q, settings)[context + RANGE]
     level = np.clip(q, -RANGE, RANGE).astype(int) + RANGE
     each = np.arange(len(q))
     more = (bits[each, np.clip(level + d, 0, 2 * RANGE)] - bits[each, level] for d in (1, -1))
-    up, down = (np.clip(m / (2 * worth(weights, price)), -0.4, 9) for m in more)
+    cost = 2 * lambda_cost(weights, price, settings)
+    up, down = (np.clip(m / cost, *settings.threshold_range) for m in more)
     return up, down
 
 
-def code_lengths(q: np.ndarray, near: np.ndarray) -> np.ndarray:
+def code_lengths(q: np.ndarray, near: np.ndarray, settings: RdoSettings) -> np.ndarray:
     """[2 RANGE + 1, 2 RANGE + 1] bits of an integer (column) in a context (row), each from -RANGE to RANGE, from the
     statistics of `q` [N]."""
-    return _code_lengths(_contexts(q, near), q)
+    return _code_lengths(_contexts(q, near), q, settings)
 
 
-def worth(weights: np.ndarray, price: float) -> np.ndarray:
-    """[N] bits that an error of one step is worth, squared."""
-    return np.maximum(weights + FLOOR * weights.mean(), 1e-30) / price
+def lambda_cost(weights: np.ndarray, price: float, settings: RdoSettings) -> np.ndarray:
+    """[N] bits that a squared error of one step is worth."""
+    return np.maximum(weights + settings.floor * weights.mean(), 1e-30) / price
 
 
 def _contexts(q: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """[N] int, what the neighbours of each say, from -RANGE to RANGE."""
+    """[N] int, prediction of each from its neighbours, from -RANGE to RANGE."""
     return np.clip(np.rint(q[near] @ (NEAR_WEIGHT / NEAR_WEIGHT.sum())), -RANGE, RANGE).astype(int)
 
 
-def _code_lengths(context: np.ndarray, q: np.ndarray) -> np.ndarray:
+def _code_lengths(context: np.ndarray, q: np.ndarray, settings: RdoSettings) -> np.ndarray:
     """[2 RANGE + 1, 2 RANGE + 1] bits of an integer (column) in a context (row), from their statistics."""
     side = 2 * RANGE + 1
     level = np.clip(q, -RANGE, RANGE).astype(int)
     counts = np.bincount((context + RANGE) * side + level + RANGE, minlength=side * side).reshape(side, side)
-    counts = counts + 20 * (counts.sum(0) + 0.02) / (counts.sum() + 1)  # rare contexts: as all of them together
+    # A rare context counts like all contexts together.
+    counts = counts + settings.context_prior * (counts.sum(0) + 0.02) / (counts.sum() + 1)
     return -np.log2(counts / counts.sum(1, keepdims=True))

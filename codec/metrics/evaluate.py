@@ -14,7 +14,8 @@ import numpy as np
 from ..capture import Capture, View, composite
 from ..errors import UsageError
 from ..model.camera import Camera
-from ..model.gaussians import Gaussians, GaussianSequence
+from ..model.gaussian_sequence import GaussianSequence
+from ..model.gaussians import Gaussians
 from .codec_cameras import codec_cameras
 from .image import foreground, haze, psnr, ssim
 from .stability import TemporalMeter

@@ -1,4 +1,4 @@
-"""ParametricGroup: what training makes, what fit/ makes of foreign splats, what encoding takes, what decoding gives back.
+"""ParametricGroup: what training makes and fit/ makes of foreign splats, what encoding takes and decoding gives back.
 
 One set of N Gaussians for T frames. Frame t = the canonical Gaussians, carried rigidly by the nodes of a deformation
 graph (HiFi4G), plus residual trajectories in a temporal DCT. Evaluation is native and the same for all four uses.
@@ -7,12 +7,15 @@ graph (HiFi4G), plus residual trajectories in a temporal DCT. Evaluation is nati
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from functools import cached_property
 
 import numpy as np
 
+from .. import _native
 from .camera import Calibration
 from .gaussians import Gaussians
+from .temporal_transform import dct_basis
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,11 @@ class NodeMotion:
     translations: np.ndarray
     neighbors: np.ndarray
     weights: np.ndarray
+
+    def take(self, index: np.ndarray) -> NodeMotion:
+        """The same nodes for the Gaussians at `index` ([n] int)."""
+        own = self.neighbors[index], self.weights[index]
+        return NodeMotion(self.positions, self.rotations, self.translations, *own)
 
 
 @dataclass(frozen=True)
@@ -61,3 +69,56 @@ class ParametricGroup:
     parents: np.ndarray | None = None
     calibration: Calibration | None = None
     rate_optimized: bool = False
+
+    def __len__(self) -> int:
+        return self.frame_count
+
+    def frame(self, t: int) -> Gaussians:
+        """All N Gaussians at frame `t` of the group, as `lifetimes` may hide them.
+
+        Raises:
+            IndexError: `t` is not in the group.
+        """
+        return Gaussians(**self._evaluator.frame(t))
+
+    def visible(self, t: int) -> Gaussians:
+        """The Gaussians that frame `t` of the group shows."""
+        g = self.frame(t)
+        if self.lifetimes is None:
+            return g
+        return g.take((self.lifetimes[:, 0] <= t) & (t < self.lifetimes[:, 1]))
+
+    def carried(self) -> tuple[np.ndarray, np.ndarray]:
+        """What the nodes alone do: means [T, N, 3] f32 and rotations [T, N, 4] f32 wxyz that carry the Gaussians."""
+        return self._evaluator.carried()
+
+    def moved(self) -> tuple[np.ndarray, np.ndarray]:
+        """Means [T, N, 3] f32 and quaternions [T, N, 4] f32 wxyz of all frames."""
+        return self._evaluator.moved()
+
+    def take(self, index: np.ndarray) -> ParametricGroup:
+        """The Gaussians at `index` ([n] int), in that order."""
+        pick = lambda a: None if a is None else a[index]  # noqa: E731
+        return ParametricGroup(
+            self.frame_count,
+            self.canonical.take(index),
+            self.nodes and self.nodes.take(index),
+            {n: np.ascontiguousarray(c[:, :, index]) for n, c in self.trajectories.items()},
+            pick(self.lifetimes),
+            pick(self.parents),
+            self.calibration,
+            self.rate_optimized,
+        )
+
+    @cached_property
+    def _evaluator(self):
+        f32 = lambda a: np.ascontiguousarray(a, np.float32)  # noqa: E731
+        nodes, g = None, self.canonical
+        if self.nodes is not None:
+            motion = np.concatenate([self.nodes.rotations, self.nodes.translations], 2)
+            coefficients = np.tensordot(dct_basis(self.frame_count), motion, 1).transpose(0, 2, 1)
+            weights = np.ascontiguousarray(self.nodes.neighbors, np.uint32), f32(self.nodes.weights)
+            nodes = (f32(self.nodes.positions), f32(coefficients), *weights)
+        arrays = tuple(f32(getattr(g, f.name)) for f in fields(g))
+        trajectories = [(n, f32(c)) for n, c in self.trajectories.items()]
+        return _native.ParametricEvaluator(self.frame_count, arrays, nodes, trajectories)

@@ -32,17 +32,27 @@ class Importance:
     Attributes:
         weights: attribute -> [N, C] f64, W of each channel; quats: of the vector part of a quaternion that the
             Gaussian's is multiplied by from the right, which turns it about its own axes.
-        turns: [N, 3] f64, the same from the left, about the axes of the scene.
+        scene_rotations: [N, 3] f64, the same from the left, about the axes of the scene.
         removal: [N] f64, mean squared error of the picture without this Gaussian.
     """
 
     weights: dict[str, np.ndarray]
-    turns: np.ndarray
+    scene_rotations: np.ndarray
     removal: np.ndarray
 
     def take(self, index: np.ndarray) -> Importance:
         """The Gaussians at `index`."""
-        return Importance({n: w[index] for n, w in self.weights.items()}, self.turns[index], self.removal[index])
+        weights = {n: w[index] for n, w in self.weights.items()}
+        return Importance(weights, self.scene_rotations[index], self.removal[index])
+
+    def with_weights(self, **weights: np.ndarray) -> Importance:
+        """The same with other sensitivities of some attributes."""
+        return replace(self, weights=self.weights | weights)
+
+    def with_axes(self, order: np.ndarray) -> Importance:
+        """The same for Gaussians whose own axes are in `order` ([N, 3] int)."""
+        own = {n: np.take_along_axis(self.weights[n], order, 1) for n in ("log_scales", "quats")}
+        return self.with_weights(**own)
 
 
 def sensitivity_cameras(means: np.ndarray, given: list[Camera] = (), count: int = VIEWS) -> list[Camera]:
@@ -147,7 +157,7 @@ def measured_steps(g: Gaussians, quality: float, nominal: Steps, cameras: list[C
     if not len(g):
         return nominal
     measured = measure([g], cameras)
-    weights, degrees = measured.weights | {"quats": measured.turns}, g.shN.shape[1]
+    weights, degrees = measured.weights | {"quats": measured.scene_rotations}, g.shN.shape[1]
     values = {"means": g.means, "log_scales": g.log_scales, "quats": g.quats[:, 1:], "sh0": decorrelate(g.sh0)}
     values |= {"logit_opacities": g.logit_opacities[:, None], "shN": decorrelate(g.shN).reshape(len(g), -1)}
     steps = steps_for_error(weights, {n: values[n] for n in weights}, error_for(quality), subject_radius(g.means))

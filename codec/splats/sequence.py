@@ -21,7 +21,8 @@ import numpy as np
 from ..capture.detect import LOOKED_FOR, find_capture
 from ..errors import CaptureError, UsageError
 from ..model.camera import Camera
-from ..model.gaussians import GOP, Gaussians, GaussianSequence, Group, Nodes
+from ..model.gaussian_sequence import DenseGroup, GaussianSequence
+from ..model.gaussians import GOP, Gaussians
 from .files import EXPECTED, is_splat, read_means, read_splat, splat_size
 from .tracking import relate
 
@@ -160,7 +161,7 @@ def open_sequence(
     for start, stop in pairwise([*cuts, len(paths)]):
         same = np.arange(sizes[start][0], dtype=np.int32) if stop - start > gop else None
         spans = [frames[a : min(a + gop, stop)] for a in range(start, stop, gop)]
-        groups += [Group(f, parents=same if k else None) for k, f in enumerate(spans)]
+        groups += [DenseGroup(f, parents=same if k else None) for k, f in enumerate(spans)]
     return SplatSequence(fps or FPS, groups, mode=mode, names=[p.name for p in paths])
 
 
@@ -215,24 +216,22 @@ def _stored(path: Path, paths: list[Path], fps: float | None) -> SplatSequence:
     return SplatSequence(rate, groups, cameras, names=[p.name for p in paths[:end]])
 
 
-def _stored_group(path: Path, paths: list[Path], start: int, count: int, extra: str | None) -> Group:
+def _stored_group(path: Path, paths: list[Path], start: int, count: int, extra: str | None) -> DenseGroup:
     own = paths[start : start + count]
     if not extra:
-        return Group(Frames(own, {})[:])
+        return DenseGroup(Frames(own, {})[:])
     try:
         with np.load(path / Path(extra).name) as stored:
             arrays = {k: stored[k] for k in stored.files}
     except (OSError, ValueError) as e:
         raise CaptureError(f"{path / extra}: missing or damaged ({e}), sequence.json refers to it") from e
-    lifetimes, nodes, hidden = arrays.get("lifetimes"), None, {}
-    if "node_rest" in arrays:
-        nodes = Nodes(*(arrays[f"node_{n}"] for n in ("positions", "rotations", "translations", "rest")))
+    lifetimes, hidden = arrays.get("lifetimes"), {}
     if lifetimes is not None:
         for t in range(count):
             away = (lifetimes[:, 0] > t) | (t >= lifetimes[:, 1])
             if away.any():
                 hidden[t] = away, arrays[f"hidden_{t}"]
-    return Group(Frames(own, {}, hidden)[:], lifetimes, nodes, arrays.get("parents"))
+    return DenseGroup(Frames(own, {}, hidden)[:], lifetimes, arrays.get("parents"))
 
 
 def _camera(c: dict) -> Camera:

@@ -17,7 +17,8 @@ import numpy as np
 
 from ..atomic_write import part_file
 from ..model.camera import Camera
-from ..model.gaussians import GaussianSequence, Group
+from ..model.gaussian_sequence import DenseGroup, GaussianSequence
+from ..model.parametric_group import ParametricGroup
 from .ply import write_ply
 
 HIDDEN = -30.0  # logit opacity that no renderer shows
@@ -46,11 +47,11 @@ class SequenceWriter:
     def frame_count(self) -> int:
         return sum(g["frames"] for g in self.groups)
 
-    def add(self, group: Group, progress: Callable[[int], None] | None = None) -> None:
+    def add(self, group: DenseGroup | ParametricGroup, progress: Callable[[int], None] | None = None) -> None:
         """Writes a group; `progress` is called with the number of frames written in all."""
         start, extra = self.frame_count, {}
         for t in range(len(group)):
-            g = group.frames[t]
+            g = group.frame(t)
             if group.lifetimes is not None:
                 away = (group.lifetimes[:, 0] > t) | (t >= group.lifetimes[:, 1])
                 if away.any():
@@ -64,8 +65,6 @@ class SequenceWriter:
             extra["lifetimes"] = group.lifetimes
         if group.parents is not None:
             extra["parents"] = group.parents
-        if group.nodes is not None:
-            extra |= {f"node_{k}": v for k, v in vars(group.nodes).items()}
         if extra:
             entry["extra"] = f"group_{len(self.groups):04d}.npz"
             with part_file(self._folder / entry["extra"]) as part, part.open("wb") as f:

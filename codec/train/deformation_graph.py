@@ -262,6 +262,16 @@ class NodeGraph:
         means = (blend[:, :9].view(-1, 3, 3) * x[:, None]).sum(2) + blend[:, 9:12]
         return means, torch.nn.functional.normalize(blend[:, 12:], dim=1)
 
+    def blend(self) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes that carry each Gaussian, [N, k] int32, and their weights, [N, k] f32."""
+        n, k = len(self.means), min(BLENDED, len(self.nodes))
+        index, weights = np.zeros((n, k), np.int32), np.zeros((n, k), np.float32)
+        index[:, : self._neighbors.shape[1]], weights[:, : self._weights_of.shape[1]] = (
+            self._neighbors,
+            self._weights_of,
+        )
+        return index, weights
+
     def carriers(self, chosen: torch.Tensor) -> torch.Tensor:
         """[M] bool: nodes that carry a Gaussian of `chosen` ([N] bool) with a weight of more than `HELD`."""
         weights = self._gather[:, chosen.numpy()]

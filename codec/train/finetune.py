@@ -19,8 +19,8 @@ import torch
 
 from ..bitstream.color import STEP_WEIGHTS
 from ..bitstream.quantization import Steps, trajectory_step
-from ..bitstream.transform import dct_basis
-from ..model.gaussians import Gaussians, Group, Nodes
+from ..model.parametric_group import NodeMotion, ParametricGroup
+from ..model.temporal_transform import dct_basis
 from ..render.workspace import Workspace
 from . import keyframe
 from .deformation_graph import NodeGraph, Pose, quat_conjugate, quat_multiply, quat_to_rotvec
@@ -194,31 +194,32 @@ class GroupModel:
             total = total + laplace_bits(c + noise, self.log_scales[name]).sum()
         return total
 
-    def group(self, parents: np.ndarray | None) -> Group:
-        """All frames in numpy; `parents` as in Group."""
+    def group(self, parents: np.ndarray | None) -> ParametricGroup:
+        """The group as it is encoded; `parents` as in ParametricGroup."""
         frames = len(self.poses)
         lifetimes = torch.stack([self.born, self.end], 1).numpy().astype(np.int32)
         cut = (lifetimes != [0, frames]).any()
-        return Group(
-            [self.gaussians(t) for t in range(frames)],
-            lifetimes=lifetimes if cut else None,
-            nodes=self.nodes(),
-            parents=parents,
+        with torch.no_grad():
+            used = {n: rounded(c) * self.unit[n] for n, c in self.coefficients.items()}
+        return ParametricGroup(
+            frames,
+            self.key.gaussians(),
+            self.nodes(),
+            {n: np.ascontiguousarray(c.transpose(1, 2).numpy()) for n, c in used.items() if c.any()},
+            lifetimes if cut else None,
+            parents,
+            rate_optimized=True,
         )
 
-    def nodes(self) -> Nodes:
-        """The carrying motion, for the encoder."""
+    def nodes(self) -> NodeMotion:
+        """The carrying motion."""
         rotations, near = [], None
         for pose in self.poses:
             near = quat_to_rotvec(pose.turned, near)
             rotations.append(near)
         translations = [pose.nodes - self.graph.nodes for pose in self.poses]
-        arrays = (self.graph.nodes, torch.stack(rotations), torch.stack(translations), self.key.params["means"])
-        return Nodes(*(a.numpy().astype(np.float32) for a in arrays))
-
-    def gaussians(self, t: int) -> Gaussians:
-        """Frame `t` in numpy."""
-        return Model(self.frame(t, self.residuals(t))).gaussians()
+        arrays = (self.graph.nodes, torch.stack(rotations), torch.stack(translations))
+        return NodeMotion(*(a.numpy().astype(np.float32) for a in arrays), *self.graph.blend())
 
 
 def _padded(model: Model, last: Model) -> Model:

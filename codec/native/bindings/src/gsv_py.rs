@@ -1,11 +1,13 @@
-//! Python face of the bitstream core: dicts of arrays <-> groups, config dicts <-> container. Planar [C, N] arrays on the
+//! Python face of the bitstream core: QuantizedGroup <-> group, config dicts <-> container. Planar [C, N] arrays on the
 //! Python side, interleaved ones in Rust. Long work releases the GIL.
 
 mod container;
 mod decoded;
 mod group_from;
+mod parametric;
 mod values;
 
+use gsv::attributes::Attribute;
 use gsv::levels::LEVELS;
 use gsv::unit;
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
@@ -16,6 +18,7 @@ use values::{bytes_of, invalid, raise, rows};
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(morton_order, m)?)?;
     m.add_function(wrap_pyfunction!(node_weights, m)?)?;
+    m.add_function(wrap_pyfunction!(context_neighbors, m)?)?;
     m.add_function(wrap_pyfunction!(code_turns, m)?)?;
     m.add_function(wrap_pyfunction!(encode_group, m)?)?;
     m.add_function(wrap_pyfunction!(units, m)?)?;
@@ -26,6 +29,10 @@ pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(container::fragment, m)?)?;
     m.add_function(wrap_pyfunction!(container::finish, m)?)?;
     m.add_function(wrap_pyfunction!(container::demux, m)?)?;
+    m.add_function(wrap_pyfunction!(parametric::blend_rigid, m)?)?;
+    m.add_function(wrap_pyfunction!(parametric::blend_rigid_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(attributes, m)?)?;
+    m.add_class::<parametric::ParametricEvaluator>()?;
     m.add_class::<decoded::DecodedGroup>()
 }
 
@@ -66,6 +73,20 @@ fn node_weights<'py>(
     Ok((index, blend.weight.into_pyarray(py).reshape(shape)?.into_any()))
 }
 
+/// [N, 4] i64, for each of the positions [N, 3] u32 (in Morton order) the nearest of those just before it, nearest first (spec
+/// 7.3): the contexts of the entropy coder. Its own index where there is none.
+#[pyfunction]
+fn context_neighbors<'py>(py: Python<'py>, positions: PyReadonlyArray2<'py, u32>) -> PyResult<Bound<'py, PyAny>> {
+    let p = grid(&positions, "positions")?;
+    let near = py.detach(|| gsv::neighbors::nearest(&p));
+    let own = near.iter().enumerate().flat_map(|(i, near)| {
+        let known = move |j: &u32| if *j == u32::MAX { i as i64 } else { i64::from(*j) };
+        near.iter().map(known).collect::<Vec<_>>()
+    });
+    let flat: Vec<i64> = own.collect();
+    Ok(flat.into_pyarray(py).reshape([p.len(), gsv::neighbors::NEAR])?.into_any())
+}
+
 /// Quaternions [N, 4] f32 of what a layer codes itself -> integers [N, 3] i32 of quats, and the form [N] u8 of each: 1, i, j or
 /// k, by whose inverse it was multiplied from the right.
 ///
@@ -104,12 +125,12 @@ fn code_turns<'py>(
     ))
 }
 
-/// Encodes a group of integers: payload and a report per unit. A predicted group needs the group that it refers to.
+/// Encodes a `QuantizedGroup`: payload and a report per unit. A predicted group needs the group that it refers to.
 #[pyfunction]
 #[pyo3(signature = (group, reference = None))]
 fn encode_group<'py>(
     py: Python<'py>,
-    group: &Bound<'py, PyDict>,
+    group: &Bound<'py, PyAny>,
     reference: Option<Py<decoded::DecodedGroup>>,
 ) -> PyResult<(Bound<'py, PyBytes>, Bound<'py, PyList>)> {
     let reference = reference.as_ref().map(|r| r.get().group());
@@ -168,6 +189,21 @@ fn unit_bytes<'py>(
     let id = [unit_type, layer, attribute];
     unit::write(&mut out, id, &dependencies, payload.as_slice()?).map_err(|e| raise(py, e))?;
     Ok(PyBytes::new(py, &out))
+}
+
+/// The attribute table (spec 3.2): dicts of name, number, channels (of shN for one coefficient), companded.
+#[pyfunction]
+fn attributes<'py>(py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
+    let list = PyList::empty(py);
+    for a in Attribute::ALL {
+        let d = PyDict::new(py);
+        d.set_item("name", a.name())?;
+        d.set_item("number", a as u8)?;
+        d.set_item("channels", a.channels(1) / if a == Attribute::ShN { 3 } else { 1 })?;
+        d.set_item("companded", [Attribute::LogScales, Attribute::LogitOpacities].contains(&a))?;
+        list.append(d)?;
+    }
+    Ok(list)
 }
 
 /// The caps of each level (spec 5), as dicts.

@@ -3,7 +3,8 @@
 #![no_main]
 
 use gsv::decode::{Decoding, decode_units};
-use gsv::evaluate::{Evaluator, Frame};
+use gsv::evaluate::Evaluator;
+use gsv::parametric::Frame;
 use gsv::group::Group;
 use gsv::levels::LEVELS;
 use gsv::unit::{self, ALL_LAYERS};

@@ -11,16 +11,26 @@ const LENGTHS: usize = 32; // lengths with a model of their own
 const BLOCK: usize = 16; // indices that one bin says to have no coefficients at all
 
 /// Coefficients of N Gaussians or nodes, `channels` values each, lowest frequency first.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Trajectories {
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Trajectories<V = i32> {
     pub channels: usize,
     /// N + 1 places, in coefficients: those of i are `start[i]..start[i + 1]`.
     start: Vec<u32>,
     /// `channels` values per coefficient.
-    values: Vec<i32>,
+    values: Vec<V>,
 }
 
-impl Trajectories {
+impl<V> Default for Trajectories<V> {
+    fn default() -> Self {
+        Trajectories {
+            channels: 0,
+            start: Vec::new(),
+            values: Vec::new(),
+        }
+    }
+}
+
+impl<V: Copy + Default + PartialEq> Trajectories<V> {
     pub fn new(channels: usize) -> Self {
         Trajectories {
             channels,
@@ -39,24 +49,24 @@ impl Trajectories {
     }
 
     /// Appends one Gaussian: `coefficients` holds its values, `channels` per coefficient; zeros at the end are left out.
-    pub fn push(&mut self, coefficients: &[i32]) {
+    pub fn push(&mut self, coefficients: &[V]) {
         let used = coefficients
             .iter()
-            .rposition(|v| *v != 0)
+            .rposition(|v| *v != V::default())
             .map_or(0, |last| last / self.channels.max(1) + 1);
         self.values.extend_from_slice(&coefficients[..used * self.channels]);
         self.start.push((self.values.len() / self.channels.max(1)) as u32);
     }
 
     /// Those of `count` Gaussians from `first` on.
-    pub fn part(&self, first: usize, count: usize) -> Trajectories {
+    pub fn part(&self, first: usize, count: usize) -> Self {
         let mut out = Trajectories::new(self.channels);
         (first..first + count).for_each(|i| out.push(self.get(i)));
         out
     }
 
     /// Appends the Gaussians of another layer.
-    pub fn append(&mut self, other: Trajectories) {
+    pub fn append(&mut self, other: Self) {
         if self.is_empty() {
             *self = other;
             return;
@@ -81,7 +91,7 @@ impl Trajectories {
 
     /// The values of `i`, `channels` per coefficient; none if there is no `i`.
     #[inline]
-    pub fn get(&self, i: usize) -> &[i32] {
+    pub fn get(&self, i: usize) -> &[V] {
         let place = |i: usize| self.start.get(i).map(|s| *s as usize * self.channels);
         match (place(i), place(i + 1)) {
             (Some(from), Some(to)) => self.values.get(from..to).unwrap_or(&[]),

@@ -1,10 +1,11 @@
 //! DecodedGroup: a payload -> integers in the form that encode_group takes, and attributes of frames.
 
+use super::group_from::group_from;
+use super::parametric::{carried, frame};
 use super::values::{bytes_of, raise};
-use gsv::attributes::{Attribute, sh_coefficients};
-use gsv::curve::Curve;
+use gsv::curve::{Curve, PIECES};
 use gsv::decode::{Decoding, decode_damaged, decode_group};
-use gsv::evaluate::{Evaluator, FrameMut};
+use gsv::evaluate::Evaluator;
 use gsv::group::{BIRTH, Group};
 use gsv::inventory::Damage;
 use gsv::levels::Level;
@@ -15,7 +16,7 @@ use numpy::ndarray::{Array2, Array3};
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods};
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
-use pyo3::types::{PyDict, PyList, PySlice};
+use pyo3::types::{PyDict, PyList, PyTuple};
 
 /// A decoded group: integers, and f32 attributes of any frame.
 #[pyclass(frozen, module = "gscodec._native")]
@@ -98,51 +99,42 @@ impl DecodedGroup {
         self.evaluator.group().header.sh_degree
     }
 
-    /// The group as encode_group takes it.
-    fn integers<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        integers(py, &self.evaluator)
+    /// The integers, a `QuantizedGroup` as encode_group takes it.
+    fn quantized<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        quantized(py, &self.evaluator)
+    }
+
+    /// What a decoder will make of `group` (a `QuantizedGroup`), worked out without bytes.
+    #[staticmethod]
+    #[pyo3(signature = (group, reference = None))]
+    fn reconstruct(py: Python, group: &Bound<PyAny>, reference: Option<Py<DecodedGroup>>) -> PyResult<Self> {
+        let reference = reference.as_ref().map(|r| r.get().group());
+        let group = group_from(group, reference)?;
+        let evaluator = py.detach(|| Evaluator::reconstruct(group, reference)).map_err(|e| raise(py, e))?;
+        Ok(DecodedGroup {
+            evaluator,
+            units: Vec::new(),
+            damage: Vec::new(),
+        })
+    }
+
+    /// What the nodes alone do in all frames: means [T, N, 3] f32 and rotations [T, N, 4] f32 wxyz by which Gaussians are carried.
+    fn carried<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
+        carried(py, &self.evaluator.parametric())
+    }
+
+    /// Nodes [N, k] u32 that carry each Gaussian, and weights [N, k] f32; k is 0 without nodes.
+    fn blend<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
+        let blend = self.evaluator.blend();
+        let shape = [self.count(), blend.per];
+        let index = blend.index.clone().into_pyarray(py).reshape(shape)?.into_any();
+        Ok((index, blend.weight.clone().into_pyarray(py).reshape(shape)?.into_any()))
     }
 
     /// Attributes of frame `t` of all Gaussians, f32: views of one array, since few large pages are had faster than many small ones.
     fn frame<'py>(&self, py: Python<'py>, t: u16) -> PyResult<Bound<'py, PyDict>> {
         self.check(t)?;
-        let (n, k) = (self.count(), sh_coefficients(self.sh_degree()));
-        let shapes = [
-            ("means", vec![n, 3]),
-            ("quats", vec![n, 4]),
-            ("log_scales", vec![n, 3]),
-            ("logit_opacities", vec![n]),
-            ("sh0", vec![n, 3]),
-            ("shN", vec![n, k, 3]),
-        ];
-        let numpy = py.import("numpy")?;
-        let all = numpy.call_method1("empty", (n * (14 + 3 * k), "f4"))?; // not zeroed: all of it is written
-        let all = all.cast_into::<PyArray1<f32>>()?;
-        {
-            let mut own = all.readwrite();
-            let (means, rest) = own.as_slice_mut()?.split_at_mut(3 * n);
-            let (quats, rest) = rest.split_at_mut(4 * n);
-            let (log_scales, rest) = rest.split_at_mut(3 * n);
-            let (logit_opacities, rest) = rest.split_at_mut(n);
-            let (sh0, sh_n) = rest.split_at_mut(3 * n);
-            let out = FrameMut {
-                means: means.as_chunks_mut().0,
-                quats: quats.as_chunks_mut().0,
-                log_scales,
-                logit_opacities,
-                sh0,
-                sh_n,
-            };
-            py.detach(|| self.evaluator.frame_into(t, out));
-        }
-        let (d, mut start) = (PyDict::new(py), 0);
-        for (name, shape) in shapes {
-            let end = start + shape.iter().product::<usize>();
-            let part = all.get_item(PySlice::new(py, start as isize, end as isize, 1))?;
-            d.set_item(name, part.call_method1("reshape", (shape,))?)?;
-            start = end;
-        }
-        Ok(d)
+        frame(py, &self.evaluator.parametric(), t)
     }
 
     /// [N] bool: which Gaussians frame `t` shows; None: all.
@@ -252,40 +244,36 @@ fn parents_into<'py>(py: Python<'py>, parents: &[u32]) -> Bound<'py, PyArray1<i3
 }
 
 /// low, width, slopes.
-fn curve_row(c: &Curve) -> Vec<f32> {
+fn companding_row(c: &Curve) -> [f32; 2 + PIECES] {
     let slopes = c.slopes.iter().map(|s| f32::from(*s));
-    [c.low, c.width].into_iter().chain(slopes).collect()
+    let mut row = [c.low, c.width].into_iter().chain(slopes);
+    std::array::from_fn(|_| row.next().unwrap_or(0.0))
 }
 
-fn integers<'py>(py: Python<'py>, e: &Evaluator) -> PyResult<Bound<'py, PyDict>> {
+/// An instance of a dataclass of gscodec.bitstream.quantized_group.
+fn dataclass<'py>(py: Python<'py>, name: &str, fields: &Bound<'py, PyDict>) -> PyResult<Bound<'py, PyAny>> {
+    let class = py.import("gscodec.bitstream.quantized_group")?.getattr(name)?;
+    class.call((), Some(fields))
+}
+
+fn quantized<'py>(py: Python<'py>, e: &Evaluator) -> PyResult<Bound<'py, PyAny>> {
     let (g, h) = (e.group(), &e.group().header);
     let d = PyDict::new(py);
     d.set_item("frames", h.frames)?;
-    d.set_item("origin", h.origin.to_vec())?;
+    d.set_item("origin", h.origin.to_vec().into_pyarray(py))?;
     d.set_item("grid_step", h.grid_step)?;
     d.set_item("grid_bits", h.grid_bits)?;
     d.set_item("positions", grid(py, &g.positions)?)?;
-    let channels = PyDict::new(py);
-    for ((a, values), scale) in h.attributes().iter().zip(&g.channels).zip(&h.scales) {
-        let c = scale.steps.len();
-        let planes = Array2::from_shape_fn((c, g.positions.len()), |(k, i)| values[i * c + k]);
-        let one = PyDict::new(py);
-        one.set_item("values", planes.into_pyarray(py))?;
-        one.set_item("steps", scale.steps.clone())?;
-        one.set_item("offsets", scale.offsets.clone())?;
-        let curves = h.curves_of(*a).iter().map(curve_row).collect::<Vec<_>>();
-        one.set_item("curves", curves)?;
-        if *a == Attribute::Quats {
-            one.set_item("levers", h.levers.map(|l| l.to_vec()).to_vec())?;
-        }
-        channels.set_item(a.name(), one)?;
+    d.set_item("channels", channels_of(py, g)?)?;
+    d.set_item("scale_exponents", matrix(py, &h.levers.map(|l| l.map(i32::from)))?)?;
+    let layers = g.layers.iter().map(|l| l.count).collect::<Vec<_>>();
+    d.set_item("layers", PyTuple::new(py, layers)?)?;
+    d.set_item("corrections", matrix(py, &g.corrections)?)?;
+    if !h.shifts.is_empty() {
+        let rows: Vec<&[u8]> = h.shifts.iter().map(|s| &s[..1 + h.attributes().len()]).collect();
+        let width = 1 + h.attributes().len();
+        d.set_item("shifts", rows.concat().into_pyarray(py).reshape([rows.len(), width])?)?;
     }
-    d.set_item("channels", channels)?;
-    d.set_item("layers", g.layers.iter().map(|l| l.count).collect::<Vec<_>>())?;
-    d.set_item(
-        "corrections",
-        g.corrections.iter().map(|c| c.to_vec()).collect::<Vec<_>>(),
-    )?;
     if let Some(parents) = &g.parents {
         d.set_item("reference", h.reference)?;
         d.set_item("parents", parents_into(py, parents))?;
@@ -295,14 +283,11 @@ fn integers<'py>(py: Python<'py>, e: &Evaluator) -> PyResult<Bound<'py, PyDict>>
         let one = PyDict::new(py);
         one.set_item("coefficients", dense(py, t, head.coefficients))?;
         one.set_item("step", head.step)?;
-        trajectories.set_item(head.attribute.name(), one)?;
+        trajectories.set_item(head.attribute.name(), dataclass(py, "QuantizedTrajectories", &one)?)?;
     }
     d.set_item("trajectories", trajectories)?;
     if let Some(l) = &g.lifetimes {
-        d.set_item(
-            "lifetimes",
-            l.as_flattened().to_vec().into_pyarray(py).reshape([l.len(), 2])?,
-        )?;
+        d.set_item("lifetimes", matrix(py, l)?)?;
     }
     if h.nodes.count > 0 {
         let one = PyDict::new(py);
@@ -311,7 +296,31 @@ fn integers<'py>(py: Python<'py>, e: &Evaluator) -> PyResult<Bound<'py, PyDict>>
         one.set_item("rotation_step", h.nodes.rotation_step)?;
         one.set_item("translation_step", h.nodes.translation_step)?;
         one.set_item("neighbors", h.nodes.neighbors)?;
-        d.set_item("nodes", one)?;
+        d.set_item("nodes", dataclass(py, "QuantizedNodes", &one)?)?;
     }
-    Ok(d)
+    dataclass(py, "QuantizedGroup", &d)
+}
+
+fn channels_of<'py>(py: Python<'py>, g: &Group) -> PyResult<Bound<'py, PyDict>> {
+    let (h, channels) = (&g.header, PyDict::new(py));
+    for ((a, values), scale) in h.attributes().iter().zip(&g.channels).zip(&h.scales) {
+        let c = scale.steps.len();
+        let planes = Array2::from_shape_fn((c, g.positions.len()), |(k, i)| values[i * c + k]);
+        let one = PyDict::new(py);
+        one.set_item("values", planes.into_pyarray(py))?;
+        one.set_item("steps", scale.steps.clone().into_pyarray(py))?;
+        one.set_item("offsets", scale.offsets.clone().into_pyarray(py))?;
+        let rows: Vec<[f32; 2 + PIECES]> = h.curves_of(*a).iter().map(companding_row).collect();
+        if !rows.is_empty() {
+            one.set_item("companding", matrix(py, &rows)?)?;
+        }
+        channels.set_item(a.name(), dataclass(py, "QuantizedChannels", &one)?)?;
+    }
+    Ok(channels)
+}
+
+/// Rows as a matrix.
+fn matrix<'py, T: numpy::Element + Copy, const C: usize>(py: Python<'py>, rows: &[[T; C]]) -> PyResult<Bound<'py, PyAny>> {
+    let flat = rows.as_flattened().to_vec().into_pyarray(py);
+    Ok(flat.reshape([rows.len(), C])?.into_any())
 }

@@ -1,4 +1,4 @@
-//! A dict of planar integer arrays -> a group.
+//! `gscodec.bitstream.quantized_group.QuantizedGroup` (planar arrays) -> `gsv::group::Group` (interleaved).
 
 use super::values::{array, invalid, item, optional, points, value};
 use gsv::attributes::{Attribute, sh_coefficients};
@@ -10,7 +10,7 @@ use numpy::{PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArray
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-pub fn group_from(d: &Bound<PyDict>, reference: Option<&Group>) -> PyResult<Group> {
+pub fn group_from(d: &Bound<PyAny>, reference: Option<&Group>) -> PyResult<Group> {
     let positions = points(d, "positions")?;
     let channels: Bound<PyDict> = value(d, "channels")?;
     let mut header = Header {
@@ -27,7 +27,7 @@ pub fn group_from(d: &Bound<PyDict>, reference: Option<&Group>) -> PyResult<Grou
     };
     layers_from(d, &mut header, &mut group)?;
     for a in header.attributes() {
-        let c: Bound<PyDict> = value(&channels, a.name())?;
+        let c = entry(&channels, a.name())?;
         let width = a.channels(header.sh_degree);
         group.channels.push(planar(
             &array(&c, "values", "int32")?,
@@ -40,18 +40,12 @@ pub fn group_from(d: &Bound<PyDict>, reference: Option<&Group>) -> PyResult<Grou
             return invalid(format!("{}: expected {width} steps and offsets", a.name()));
         }
         header.scales.push(Scale { steps, offsets });
-        if *a == Attribute::Quats && optional(&c, "levers")?.is_some() {
-            header.levers = value(&c, "levers")?;
-        }
     }
+    header.levers = value(d, "scale_exponents")?;
     header.shifts = shifts_from(d, &header)?;
     header.curves = curves_from(&channels)?;
-    if let Some(t) = optional(d, "trajectories")? {
-        let t: Bound<PyDict> = t.extract()?;
-        motion_from(&t, &mut header, &mut group)?;
-    }
+    motion_from(&value(d, "trajectories")?, &mut header, &mut group)?;
     if let Some(n) = optional(d, "nodes")? {
-        let n: Bound<PyDict> = n.extract()?;
         nodes_from(&n, &mut header, &mut group)?;
     }
     if optional(d, "lifetimes")?.is_some() {
@@ -79,8 +73,8 @@ pub fn group_from(d: &Bound<PyDict>, reference: Option<&Group>) -> PyResult<Grou
     Ok(group)
 }
 
-/// `layers`, `corrections`, and of a predicted group `reference` and `parents`.
-fn layers_from(d: &Bound<PyDict>, header: &mut Header, group: &mut Group) -> PyResult<()> {
+/// Fields `layers`, `corrections`, and of a predicted group `reference` and `parents`.
+fn layers_from(d: &Bound<PyAny>, header: &mut Header, group: &mut Group) -> PyResult<()> {
     let n = group.positions.len();
     let counts: Vec<u32> = match optional(d, "layers")? {
         Some(_) => value(d, "layers")?,
@@ -93,8 +87,8 @@ fn layers_from(d: &Bound<PyDict>, header: &mut Header, group: &mut Group) -> PyR
         Some(_) => value(d, "corrections")?,
         None => vec![[0.0; 2]; counts.len()],
     };
+    header.reference = value(d, "reference")?;
     if optional(d, "parents")?.is_some() {
-        header.reference = value(d, "reference")?;
         let parents = array(d, "parents", "int32")?;
         let Ok(parents) = parents.extract::<PyReadonlyArray1<i32>>() else {
             return invalid("parents: expected shape [N]".into());
@@ -118,7 +112,7 @@ fn layers_from(d: &Bound<PyDict>, header: &mut Header, group: &mut Group) -> PyR
 }
 
 /// `shifts`: for each layer those of positions and of each attribute.
-fn shifts_from(d: &Bound<PyDict>, header: &Header) -> PyResult<Vec<[u8; 6]>> {
+fn shifts_from(d: &Bound<PyAny>, header: &Header) -> PyResult<Vec<[u8; 6]>> {
     if optional(d, "shifts")?.is_none() {
         return Ok(Vec::new());
     }
@@ -133,13 +127,13 @@ fn shifts_from(d: &Bound<PyDict>, header: &Header) -> PyResult<Vec<[u8; 6]>> {
     Ok(found.iter().map(own).collect())
 }
 
-/// `curves` of log_scales and logit_opacities: for each channel low, width, and the slopes.
+/// `companding` of log_scales and logit_opacities: for each channel low, width, and the slopes.
 fn curves_from(channels: &Bound<PyDict>) -> PyResult<Option<[Curve; 4]>> {
     let mut found = Vec::new();
     for a in [Attribute::LogScales, Attribute::LogitOpacities] {
-        let c: Bound<PyDict> = value(channels, a.name())?;
-        if optional(&c, "curves")?.is_some() {
-            let rows: Vec<[f32; 2 + PIECES]> = value(&c, "curves")?;
+        let c = entry(channels, a.name())?;
+        if optional(&c, "companding")?.is_some() {
+            let rows: Vec<[f32; 2 + PIECES]> = value(&c, "companding")?;
             found.extend(rows.into_iter().map(|[low, width, slopes @ ..]| Curve {
                 low,
                 width,
@@ -152,9 +146,17 @@ fn curves_from(channels: &Bound<PyDict>) -> PyResult<Option<[Curve; 4]>> {
         n => match found.try_into() {
             Ok(curves) => Ok(Some(curves)),
             Err(_) => invalid(format!(
-                "curves: expected 3 of log_scales and 1 of logit_opacities, or none, got {n}"
+                "companding: expected 3 rows of log_scales and 1 of logit_opacities, or none, got {n}"
             )),
         },
+    }
+}
+
+/// The channels of an attribute.
+fn entry<'py>(channels: &Bound<'py, PyDict>, name: &str) -> PyResult<Bound<'py, PyAny>> {
+    match channels.get_item(name)? {
+        Some(c) => Ok(c),
+        None => invalid(format!("channels: expected the attribute '{name}'")),
     }
 }
 
@@ -165,10 +167,9 @@ fn sh_degree(channels: &Bound<PyDict>) -> PyResult<u8> {
             return invalid(format!("channels: unknown attribute '{name}'"));
         }
     }
-    let Some(sh) = optional(channels, "shN")? else {
+    let Some(sh) = channels.get_item("shN")? else {
         return Ok(0);
     };
-    let sh: Bound<PyDict> = sh.extract()?;
     let width: usize = item(&sh, "values")?.len()?;
     match (0..=3u8).find(|d| 3 * sh_coefficients(*d) == width) {
         Some(d) => Ok(d),
@@ -198,10 +199,9 @@ fn motion_from(t: &Bound<PyDict>, header: &mut Header, group: &mut Group) -> PyR
         }
     }
     for attribute in Attribute::ALL {
-        let Some(a) = optional(t, attribute.name())? else {
+        let Some(a) = t.get_item(attribute.name())? else {
             continue;
         };
-        let a: Bound<PyDict> = a.extract()?;
         let channels = attribute.channels(header.sh_degree);
         let (coefficients, out) = coefficients(&a, attribute.name(), channels, group.positions.len())?;
         header.trajectories.push(TrajectoryHeader {
@@ -215,7 +215,7 @@ fn motion_from(t: &Bound<PyDict>, header: &mut Header, group: &mut Group) -> PyR
 }
 
 /// `coefficients` [K, C, N] -> K and sparse trajectories.
-fn coefficients(d: &Bound<PyDict>, name: &str, channels: usize, count: usize) -> PyResult<(u16, Trajectories)> {
+fn coefficients(d: &Bound<PyAny>, name: &str, channels: usize, count: usize) -> PyResult<(u16, Trajectories)> {
     let a = array(d, "coefficients", "int32")?;
     let Ok(a) = a.extract::<PyReadonlyArray3<i32>>() else {
         return invalid(format!("trajectories of {name}: expected shape [K, C, N]"));
@@ -236,7 +236,7 @@ fn coefficients(d: &Bound<PyDict>, name: &str, channels: usize, count: usize) ->
     Ok((k as u16, out))
 }
 
-fn nodes_from(d: &Bound<PyDict>, header: &mut Header, group: &mut Group) -> PyResult<()> {
+fn nodes_from(d: &Bound<PyAny>, header: &mut Header, group: &mut Group) -> PyResult<()> {
     group.node_positions = points(d, "positions")?;
     if group.node_positions.is_empty() {
         return Ok(());

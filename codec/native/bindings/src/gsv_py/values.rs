@@ -1,4 +1,4 @@
-//! Checked access to what Python passes: keys of dicts, arrays of one dtype and shape, bytes; and errors on the way back.
+//! Checked access to what Python passes: fields of dataclasses, arrays of one dtype and shape, bytes; and errors on the way back.
 
 use gsv::error::Error;
 use numpy::{PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
@@ -33,40 +33,46 @@ pub fn bytes_of<'py>(data: &Bound<'py, PyAny>) -> PyResult<PyReadonlyArray1<'py,
     a.extract()
 }
 
-pub fn item<'py>(d: &Bound<'py, PyDict>, key: &str) -> PyResult<Bound<'py, PyAny>> {
-    match d.get_item(key)? {
-        Some(v) if !v.is_none() => Ok(v),
-        _ => invalid(format!("expected the key '{key}'")),
+/// An entry of a dict or a field of a dataclass, which must not be None.
+pub fn item<'py>(d: &Bound<'py, PyAny>, name: &str) -> PyResult<Bound<'py, PyAny>> {
+    match optional(d, name)? {
+        Some(v) => Ok(v),
+        None => invalid(format!("expected '{name}', there is none")),
     }
 }
 
-pub fn optional<'py>(d: &Bound<'py, PyDict>, key: &str) -> PyResult<Option<Bound<'py, PyAny>>> {
-    Ok(d.get_item(key)?.filter(|v| !v.is_none()))
+/// An entry of a dict or a field of a dataclass; None where it is missing.
+pub fn optional<'py>(d: &Bound<'py, PyAny>, name: &str) -> PyResult<Option<Bound<'py, PyAny>>> {
+    let found = match d.cast::<PyDict>() {
+        Ok(d) => d.get_item(name)?,
+        Err(_) => Some(d.getattr(name)?),
+    };
+    Ok(found.filter(|v| !v.is_none()))
 }
 
-pub fn value<'py, T: for<'a> FromPyObject<'a, 'py>>(d: &Bound<'py, PyDict>, key: &str) -> PyResult<T> {
-    let v = item(d, key)?;
+pub fn value<'py, T: for<'a> FromPyObject<'a, 'py>>(d: &Bound<'py, PyAny>, name: &str) -> PyResult<T> {
+    let v = item(d, name)?;
     v.extract()
-        .or_else(|_| invalid(format!("'{key}': unexpected value {v}")))
+        .or_else(|_| invalid(format!("'{name}': unexpected value {v}")))
 }
 
-/// `key` converted to a contiguous array of `dtype`, if that changes no value.
-pub fn array<'py>(d: &Bound<'py, PyDict>, key: &str, dtype: &str) -> PyResult<Bound<'py, PyAny>> {
+/// The field converted to a contiguous array of `dtype`, if that changes no value.
+pub fn array<'py>(d: &Bound<'py, PyAny>, name: &str, dtype: &str) -> PyResult<Bound<'py, PyAny>> {
     let np = d.py().import("numpy")?;
-    let v = np.call_method1("asarray", (item(d, key)?,))?;
+    let v = np.call_method1("asarray", (item(d, name)?,))?;
     let out = np.call_method1("ascontiguousarray", (&v, dtype))?;
     if !np.call_method1("array_equal", (&v, &out))?.extract::<bool>()? {
-        return invalid(format!("'{key}': expected integers that fit {dtype}"));
+        return invalid(format!("'{name}': expected integers that fit {dtype}"));
     }
     Ok(out)
 }
 
-pub fn points(d: &Bound<PyDict>, key: &str) -> PyResult<Vec<[u32; 3]>> {
-    let a = array(d, key, "uint32")?;
+pub fn points(d: &Bound<PyAny>, name: &str) -> PyResult<Vec<[u32; 3]>> {
+    let a = array(d, name, "uint32")?;
     let Ok(a) = a.extract::<PyReadonlyArray2<u32>>() else {
-        return invalid(format!("'{key}': expected shape [N, 3]"));
+        return invalid(format!("'{name}': expected shape [N, 3]"));
     };
-    rows(&a, key)
+    rows(&a, name)
 }
 
 pub fn rows(a: &PyReadonlyArray2<u32>, key: &str) -> PyResult<Vec<[u32; 3]>> {

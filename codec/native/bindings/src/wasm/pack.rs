@@ -4,7 +4,7 @@
 //! each. Half floats are relative to an origin in the middle of the scene, where they are finest. Colours are those of the
 //! view, and what the view does not show is left out.
 
-use gsv::evaluate::Frame;
+use gsv::parametric::Frame;
 use raster::Projected;
 use std::f32::consts::PI;
 

@@ -1,4 +1,4 @@
-"""Work side by side in threads: numpy and the kernels let go of the interpreter while they compute."""
+"""Work side by side in threads: numpy and the native kernels release the interpreter while they compute."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ Result = TypeVar("Result")
 
 def each_frame(make: Callable[[int], Result], frames: int) -> list[Result]:
     """`make(t)` of every frame, in order; the calls must not depend on each other."""
-    with ThreadPoolExecutor(min(frames, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(max(1, min(frames, os.cpu_count() or 1))) as pool:
         return list(pool.map(make, range(frames)))
 
 
-def ahead(items: Iterable[Result]) -> Iterator[Result]:
-    """`items`, the next one being made while one is used."""
+def prefetched(items: Iterable[Result]) -> Iterator[Result]:
+    """`items`; the next one is made while one is used."""
     items, end = iter(items), object()
     with ThreadPoolExecutor(1) as pool:
         coming = pool.submit(next, items, end)

@@ -1,0 +1,151 @@
+"""Variables of adaptive rounding: the integers of one attribute, and the latents under them, in quantization steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..model.temporal_transform import dct_basis
+from . import companding, rdo
+from .quantize import Quantized
+from .settings import EncodeSettings, RoundingSettings
+
+
+class Latents:
+    """Integers and the latents under them, arrays of one shape.
+
+    Args:
+        latents: what was quantized. integers: the result.
+        thresholds: how much farther than half a step above, and below, an integer still is the better one.
+
+    Attributes:
+        change: of the integers since the start: -1, 0 or 1.
+    """
+
+    def __init__(self, latents: np.ndarray, integers: np.ndarray, thresholds: tuple, settings: RoundingSettings):
+        up, down = thresholds
+        self.integers, self._thresholds, self._settings = integers, thresholds, settings
+        low, high = integers - 0.5 - down + settings.inside, integers + 0.5 + up - settings.inside
+        self._latents = np.clip(latents, low, high).astype(np.float32)
+        self._first, self._second = (np.zeros_like(self._latents) for _ in range(2))
+        self.change = np.zeros(self._latents.shape, np.int8)
+
+    @property
+    def now(self) -> np.ndarray:
+        """The integers as they are now."""
+        return self.integers + self.change
+
+    def follow(self, derivative: np.ndarray, rate: float, step: int) -> None:
+        """Adam's `step` (from 1) along the derivative by the integers."""
+        (b1, b2), epsilon = self._settings.betas, self._settings.epsilon
+        self._first += (1 - b1) * (derivative - self._first)
+        self._second += (1 - b2) * (derivative * derivative - self._second)
+        size = np.sqrt(self._second / (1 - b2**step)) + epsilon
+        self._latents -= rate * self._first / (1 - b1**step) / size
+        off, (up, down) = self._latents - self.integers, self._thresholds
+        self.change = (off > 0.5 + up).astype(np.int8) - (-off > 0.5 + down)
+
+
+class CanonicalVariable:
+    """Canonical integers of an attribute."""
+
+    def __init__(self, attribute: str, quantized: Quantized, settings: EncodeSettings):
+        self.attribute, plan = attribute, quantized.plan
+        channels = quantized.integers.channels[attribute]
+        self._curves, self._offset = plan.parameters.curves.get(attribute), channels.offsets
+        self._unit = quantized.factors(attribute).astype(int)
+        self._step = (self._unit * channels.steps).astype(np.float32)
+        q = channels.values.T / self._unit
+        coded = channels.offsets + self._step * q
+        if attribute in quantized.coefficients:  # the mean of what is left over time
+            left = quantized.coefficients[attribute][0] - _first_coefficient(quantized, attribute)
+            scale = plan.parameters.trajectory_steps[attribute]  # a coefficient's step is sqrt(T) times as large
+            wanted = companding.compand(companding.expand(coded, self._curves) + scale * left.T, self._curves)
+        else:
+            wanted = companding.compand(quantized.form.values[attribute], self._curves)
+        slopes = companding.slopes(coded, self._curves)
+        weights = plan.importance.weights[attribute] * (slopes * self._step) ** 2
+        thresholds = np.zeros((2, *q.shape), np.float32)
+        for own, near in quantized.layers:
+            for c in range(q.shape[1]):
+                found = rdo.decision_thresholds(q[own, c], weights[own, c], near, plan.price, settings.rdo)
+                thresholds[:, own, c] = found
+        self._latents = Latents((wanted - self._offset) / self._step, q, thresholds, settings.rounding)
+        self._before = self._values()
+
+    def _coded(self) -> np.ndarray:
+        return self._offset + self._step * self._latents.now
+
+    def _values(self) -> np.ndarray:
+        return companding.expand(self._coded(), self._curves)
+
+    def add(self, values: np.ndarray, t: int) -> None:
+        """To `values` [N, C] of the decoded frame `t`, what has changed."""
+        values += self._values() - self._before
+
+    def by_integers(self, derivative: np.ndarray, t: int) -> np.ndarray:
+        """The derivative by them, from that by the values of frame `t`."""
+        return derivative * (self._step * companding.slopes(self._coded(), self._curves))
+
+    def follow(self, derivative: np.ndarray, rate: float, step: int) -> None:
+        """As of `Latents`."""
+        self._latents.follow(derivative, rate, step)
+
+    def put(self, channels: dict, trajectories: dict) -> None:
+        """Puts the integers into those of the group."""
+        q = (self._latents.now * self._unit).astype(np.int32)
+        channels[self.attribute] = replace(channels[self.attribute], values=np.ascontiguousarray(q.T))
+
+
+def _first_coefficient(quantized: Quantized, attribute: str) -> np.ndarray | float:
+    coded = quantized.integers.trajectories.get(attribute)
+    return 0.0 if coded is None else coded.coefficients[0]
+
+
+@dataclass(frozen=True)
+class TrajectoryVariable:
+    """DCT coefficients of an attribute, as far as those of each Gaussian go. Methods as in `CanonicalVariable`.
+
+    Attributes:
+        latents: [M, C] integers. basis: [K, T] f32, times the step.
+        frequency, own: [M] of each the temporal frequency and the Gaussian, sorted by Gaussian.
+        starts: where those of each Gaussian begin.
+    """
+
+    attribute: str
+    latents: Latents
+    basis: np.ndarray
+    frequency: np.ndarray
+    own: np.ndarray
+    starts: np.ndarray
+
+    def add(self, values: np.ndarray, t: int) -> None:
+        sums = np.add.reduceat(self.basis[self.frequency, t, None] * self.latents.change, self.starts, 0)
+        values[self.own[self.starts]] += sums
+
+    def by_integers(self, derivative: np.ndarray, t: int) -> np.ndarray:
+        return self.basis[self.frequency, t, None] * derivative[self.own]
+
+    def follow(self, derivative: np.ndarray, rate: float, step: int) -> None:
+        self.latents.follow(derivative, rate, step)
+
+    def put(self, channels: dict, trajectories: dict) -> None:
+        coefficients = trajectories[self.attribute].coefficients.copy()
+        coefficients[self.frequency, :, self.own] += self.latents.change
+        trajectories[self.attribute] = replace(trajectories[self.attribute], coefficients=coefficients)
+
+
+def trajectory_variable(attribute: str, quantized: Quantized, settings: EncodeSettings) -> TrajectoryVariable:
+    """The trajectories of `attribute`, which the group has."""
+    coded, plan = quantized.integers.trajectories[attribute], quantized.plan
+    q, frames = coded.coefficients.transpose(2, 0, 1), quantized.form.frames  # [N, K, C]
+    used = np.flip(np.maximum.accumulate(np.flip((q != 0).any(2), 1), 1), 1)
+    own, frequency = np.nonzero(used)
+    starts = np.flatnonzero(np.diff(own, prepend=-1))
+    wanted = quantized.coefficients[attribute][: q.shape[1]].transpose(2, 0, 1)[own, frequency]
+    q, weights = q[own, frequency], plan.importance.weights[attribute][own] * coded.step**2
+    thresholds = rdo.trajectory_thresholds(q, weights, frames, plan.price, settings.rdo)
+    latents = Latents(wanted, q, thresholds, settings.rounding)
+    basis = (dct_basis(frames)[: coded.coefficients.shape[0]] * coded.step).astype(np.float32)
+    return TrajectoryVariable(attribute, latents, basis, frequency, own, starts)

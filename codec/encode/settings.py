@@ -1,0 +1,178 @@
+"""What the encoder is asked for, and its hyperparameters by stage. Each is documented once, with unit and reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ..errors import UsageError
+
+LAYERS_MAX = 16  # spec 4
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """Stage plan (quantization_plan.py).
+
+    Attributes:
+        level_percentiles: of log sensitivity, between which layers are even.
+        least_sensitivity: share of the mean sensitivity that every Gaussian has when layers are made.
+        still_layers: layers of a single frame of at least `still_least` Gaussians: a layer has steps of its own.
+            Trajectories would miss their neighbours in other layers, so that a moving group has one.
+        shift_most: doublings of a layer's step at most.
+        prune: a Gaussian goes if the picture without it errs by less than this share of the error per Gaussian.
+        rebirth: times `prune` that a Gaussian must matter to come back after the reference left it out.
+        few: Gaussians up to which there is time for `more_views`.
+        views, more_views: from which sensitivity is measured; `more_views` of small groups and single frames.
+    """
+
+    level_percentiles: tuple[float, float] = (3, 97)
+    least_sensitivity: float = 1e-4
+    still_layers: int = 4
+    still_least: int = 1000
+    shift_most: int = 8
+    prune: float = 0.3
+    rebirth: float = 8.0
+    few: int = 20_000
+    views: int = 24
+    more_views: int = 48
+
+
+@dataclass(frozen=True)
+class CompandingSettings:
+    """Curves of log_scales and logit_opacities (companding.py).
+
+    Attributes:
+        least: Gaussians from which sensitivity by value is known well enough to save anything.
+        bins: of the histogram of values; tails: percentiles between which they lie.
+        steepest: how much coarser a piece may be than where the picture is most sensitive.
+        prior: Gaussians of mean sensitivity that each bin counts besides its own.
+    """
+
+    least: int = 16000
+    bins: int = 24
+    tails: tuple[float, float] = (0.2, 99.8)
+    steepest: float = 32.0
+    prior: float = 20.0
+
+
+@dataclass(frozen=True)
+class ScaleExponentSettings:
+    """Steps of rotations by decoded sizes (rotation_residuals.py).
+
+    Attributes:
+        share: of the sensitivity's octaves that steps follow.
+        least: Gaussians from which exponents can be fitted.
+        prior: share of the mean sensitivity that all have: a few views know little of one Gaussian.
+    """
+
+    share: float = 0.5
+    least: int = 100
+    prior: float = 0.02
+
+
+@dataclass(frozen=True)
+class RdoSettings:
+    """Rate-distortion optimised quantization (rdo.py).
+
+    Attributes:
+        bit_price: of a bit, in units of the picture's error per Gaussian.
+        optimized_price: share of that where training had a rate term, which has dropped what is not worth its bits.
+        floor: share of the mean sensitivity that all Gaussians have: a few views know little of one, and errors that
+            agree add up.
+        zero_bits, nonzero_bits: of a coefficient of a trajectory that is 0, or +-1.
+        length_bits: of one more temporal frequency.
+        passes: over canonical integers, whose contexts depend on each other.
+        threshold_range: how far a decision threshold may lie beyond half a step, in steps.
+        context_prior: counts that a context takes from all contexts together.
+    """
+
+    bit_price: float = 0.05
+    optimized_price: float = 0.6
+    floor: float = 0.2
+    zero_bits: float = 0.5
+    nonzero_bits: float = 3.0
+    length_bits: float = 0.7
+    passes: int = 2
+    threshold_range: tuple[float, float] = (-0.4, 9.0)
+    context_prior: float = 20.0
+
+
+@dataclass(frozen=True)
+class RoundingSettings:
+    """Stage refine: adaptive rounding (adaptive_rounding.py).
+
+    Attributes:
+        betas, epsilon: of Adam; epsilon is in the sum of squared differences by a step: what changes less stays, since
+            its square may be 0 in f32.
+        inside: steps by which a latent starts within the interval of its integer, at least.
+        drawn_rate: steps that the first drawn view moves a latent, times the root of the number of views.
+        frame_views: drawn views a frame by which a small group of splats is refined; still_views: of a single frame.
+    """
+
+    betas: tuple[float, float] = (0.9, 0.99)
+    epsilon: float = 1e-6
+    inside: float = 0.02
+    drawn_rate: float = 0.1
+    frame_views: int = 10
+    still_views: int = 100
+
+
+@dataclass(frozen=True)
+class RateControlSettings:
+    """Quality for each group of a stream with a bit rate (rate_control.py).
+
+    Attributes:
+        slope: of log size against quality, on the statue and on trained captures.
+        tolerance: of a group's size, as a share.
+        tries: at most.
+        least_budget: share of the mean budget that a group has, however much the groups before it took.
+    """
+
+    slope: float = 0.036
+    tolerance: float = 0.02
+    tries: int = 6
+    least_budget: float = 0.25
+
+
+@dataclass(frozen=True)
+class EncodeSettings:
+    """What the encoder is asked for.
+
+    Attributes:
+        quality: 0 (small) to 100 (fine); 50 is about 41 dB against the input.
+        bitrate: bits per second that the whole file is to have, instead of one quality; None: `quality` it is.
+        keep_all: also code Gaussians that are never visible.
+        random_access: frames from one independent group to the next at most; the groups between are predicted from it
+            where their parents are known and it is cheaper. 0 or 1: every group is independent.
+        layers: layers of importance in each group, each with its own steps; any first few decode alone. None: what is
+            smallest.
+        refine: views by which each group is refined; 0: none is. None: as many as usually pay (README).
+        doubt: a predicted group of more than this share of its reference's bytes is coded both ways.
+        plan, companding, scale_exponents, rdo, rounding, rate_control: hyperparameters of the stages.
+    """
+
+    quality: float = 50.0
+    bitrate: float | None = None
+    keep_all: bool = False
+    random_access: int = 60
+    layers: int | None = None
+    refine: int | None = None
+    doubt: float = 0.7
+    plan: PlanSettings = field(default_factory=PlanSettings)
+    companding: CompandingSettings = field(default_factory=CompandingSettings)
+    scale_exponents: ScaleExponentSettings = field(default_factory=ScaleExponentSettings)
+    rdo: RdoSettings = field(default_factory=RdoSettings)
+    rounding: RoundingSettings = field(default_factory=RoundingSettings)
+    rate_control: RateControlSettings = field(default_factory=RateControlSettings)
+
+    def __post_init__(self):
+        if not 0 <= self.quality <= 100:
+            raise UsageError(f"--quality {self.quality:g} is out of range, expected 0 (small) to 100 (fine)")
+        if self.bitrate is not None and not self.bitrate > 0:
+            raise UsageError(f"--bitrate {self.bitrate:g} is out of range, expected bits per second above 0")
+        if self.random_access < 0:
+            raise UsageError(f"--random-access {self.random_access} is out of range, expected 0 frames or more")
+        if self.layers is not None and not 1 <= self.layers <= LAYERS_MAX:
+            raise UsageError(f"--layers {self.layers} is out of range, expected 1 to {LAYERS_MAX}")
+        if self.refine is not None and self.refine < 0:
+            raise UsageError(f"--refine {self.refine} is out of range, expected 0 views or more")

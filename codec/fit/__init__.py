@@ -1,0 +1,5 @@
+"""Foreign splats -> ParametricGroup: nodes and trajectories. The counterpart of train/ for what others trained."""
+
+from .fit import fit_groups
+
+__all__ = ["fit_groups"]

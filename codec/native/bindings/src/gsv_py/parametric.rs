@@ -1,0 +1,314 @@
+//! Evaluation for Python: frames of a decoded, trained or fitted group, and the blend of rigid motions with its gradient.
+
+use super::values::invalid;
+use gsv::attributes::{Attribute, sh_coefficients};
+use gsv::blend::Blend;
+use gsv::parametric::{AttributeMotion, Coefficient, Frame, FrameMut, Parametric};
+use gsv::rigid_blend::{Pose, RigidBlend};
+use gsv::trajectories::Trajectories;
+use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
+use pyo3::exceptions::PyIndexError;
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PySlice};
+use rayon::prelude::*;
+
+type Arrays<'py> = (
+    PyReadonlyArray2<'py, f32>,
+    PyReadonlyArray2<'py, f32>,
+    PyReadonlyArray2<'py, f32>,
+    numpy::PyReadonlyArray1<'py, f32>,
+    PyReadonlyArray2<'py, f32>,
+    PyReadonlyArray3<'py, f32>,
+);
+/// positions [M, 3], coefficients [K, 6, M], neighbors [N, k], weights [N, k].
+type Nodes<'py> = (
+    PyReadonlyArray2<'py, f32>,
+    PyReadonlyArray3<'py, f32>,
+    PyReadonlyArray2<'py, u32>,
+    PyReadonlyArray2<'py, f32>,
+);
+
+/// A group in floats, ready to be evaluated at any frame (`gscodec.model.parametric_group`).
+#[pyclass(frozen, module = "gscodec._native")]
+pub struct ParametricEvaluator {
+    frames: u16,
+    rest: Frame,
+    blend: Blend,
+    nodes: Vec<[f32; 3]>,
+    node_motion: Trajectories<f32>,
+    motions: Vec<AttributeMotion<f32>>,
+}
+
+#[pymethods]
+impl ParametricEvaluator {
+    /// `canonical`: means, quats, log_scales, logit_opacities, sh0, shN. `trajectories`: (attribute, [K, C, N]) pairs.
+    #[new]
+    fn new(
+        py: Python,
+        frames: u16,
+        canonical: Arrays,
+        nodes: Option<Nodes>,
+        trajectories: Vec<(String, PyReadonlyArray3<f32>)>,
+    ) -> PyResult<Self> {
+        let n = canonical.0.shape()[0];
+        let rest = Frame {
+            means: canonical.0.as_slice()?.as_chunks().0.to_vec(),
+            quats: canonical.1.as_slice()?.as_chunks().0.to_vec(),
+            log_scales: canonical.2.as_slice()?.to_vec(),
+            logit_opacities: canonical.3.as_slice()?.to_vec(),
+            sh0: canonical.4.as_slice()?.to_vec(),
+            sh_n: canonical.5.as_slice()?.to_vec(),
+        };
+        let (mut blend, mut places, mut node_motion) = (Blend::default(), Vec::new(), Trajectories::new(6));
+        if let Some((positions, coefficients, index, weight)) = nodes {
+            blend = blend_of(&index, &weight, n)?;
+            places = positions.as_slice()?.as_chunks().0.to_vec();
+            node_motion = sparse(py, &coefficients, 6, places.len(), "nodes")?;
+        }
+        let mut motions = Vec::new();
+        for (name, values) in trajectories {
+            let Some(attribute) = Attribute::ALL.into_iter().find(|a| a.name() == name) else {
+                return invalid(format!("trajectories: unknown attribute '{name}'"));
+            };
+            let channels = match attribute {
+                Attribute::ShN => 3 * canonical.5.shape()[1],
+                a => a.channels(0),
+            };
+            let t = sparse(py, &values, channels, n, &name)?;
+            motions.push(AttributeMotion::new(attribute, 1.0, false, t));
+        }
+        Ok(ParametricEvaluator {
+            frames,
+            rest,
+            blend,
+            nodes: places,
+            node_motion,
+            motions,
+        })
+    }
+
+    /// Attributes of frame `t` of all Gaussians, f32.
+    fn frame<'py>(&self, py: Python<'py>, t: u16) -> PyResult<Bound<'py, PyDict>> {
+        if t >= self.frames {
+            return Err(PyIndexError::new_err(format!("frame {t} of a group of {}", self.frames)));
+        }
+        frame(py, &self.parametric(), t)
+    }
+
+    /// Means [T, N, 3] and quaternions [T, N, 4] wxyz of all frames.
+    fn moved<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
+        let p = self.parametric();
+        over_time(py, &p, |t, m, q| p.moved_into(t, m, q))
+    }
+
+    /// As of `DecodedGroup`.
+    fn carried<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
+        carried(py, &self.parametric())
+    }
+}
+
+impl ParametricEvaluator {
+    fn parametric(&self) -> Parametric<'_, f32> {
+        Parametric {
+            frames: self.frames,
+            origin: [0.0; 3],
+            rest: &self.rest,
+            rotations: &self.rest.quats,
+            blend: &self.blend,
+            nodes: &self.nodes,
+            node_motion: &self.node_motion,
+            node_steps: [1.0; 2],
+            motions: &self.motions,
+        }
+    }
+}
+
+fn blend_of(index: &PyReadonlyArray2<u32>, weight: &PyReadonlyArray2<f32>, count: usize) -> PyResult<Blend> {
+    if index.shape() != weight.shape() || index.shape()[0] != count {
+        return invalid(format!(
+            "neighbors and weights: expected shape [{count}, k] of both, got {:?} and {:?}",
+            index.shape(),
+            weight.shape()
+        ));
+    }
+    Ok(Blend {
+        per: index.shape()[1],
+        index: index.as_slice()?.to_vec(),
+        weight: weight.as_slice()?.to_vec(),
+    })
+}
+
+/// [K, C, N] -> those of each Gaussian.
+fn sparse(
+    py: Python,
+    a: &PyReadonlyArray3<f32>,
+    channels: usize,
+    count: usize,
+    name: &str,
+) -> PyResult<Trajectories<f32>> {
+    let &[k, c, n] = a.shape() else {
+        return invalid(format!("trajectories of {name}: expected shape [K, C, N]"));
+    };
+    if (c, n) != (channels, count) {
+        return invalid(format!(
+            "trajectories of {name}: expected shape [K, {channels}, {count}], got {:?}",
+            a.shape()
+        ));
+    }
+    let values = a.as_slice()?;
+    Ok(py.detach(|| {
+        let rows = k * c;
+        let blocks: Vec<Trajectories<f32>> = (0..n.div_ceil(BLOCK)).into_par_iter().map(|block| {
+            let (first, last) = (block * BLOCK, n.min((block + 1) * BLOCK));
+            let mut own = vec![0.0; (last - first) * rows];
+            for r in 0..rows {
+                let row = &values[r * n + first..r * n + last];
+                row.iter().zip(own[r..].iter_mut().step_by(rows)).for_each(|(v, o)| *o = *v);
+            }
+            let mut out = Trajectories::new(c);
+            own.chunks(rows.max(1)).for_each(|one| out.push(one));
+            out
+        }).collect();
+        let mut out = Trajectories::new(c);
+        blocks.into_iter().for_each(|b| out.append(b));
+        out
+    }))
+}
+
+/// Gaussians whose coefficients are transposed together: what fits a cache.
+const BLOCK: usize = 256;
+
+/// Attributes of a frame: views of one array, since few large pages are had faster than many small ones.
+pub fn frame<'py, V: Coefficient>(py: Python<'py>, p: &Parametric<V>, t: u16) -> PyResult<Bound<'py, PyDict>> {
+    let n = p.rest.means.len();
+    let k = p.rest.sh_n.len() / (3 * n.max(1));
+    let k = (0..=3).map(sh_coefficients).find(|c| *c == k).unwrap_or(0);
+    let shapes = [
+        ("means", vec![n, 3]),
+        ("quats", vec![n, 4]),
+        ("log_scales", vec![n, 3]),
+        ("logit_opacities", vec![n]),
+        ("sh0", vec![n, 3]),
+        ("shN", vec![n, k, 3]),
+    ];
+    let numpy = py.import("numpy")?;
+    let all = numpy.call_method1("empty", (n * (14 + 3 * k), "f4"))?; // not zeroed: all of it is written
+    let all = all.cast_into::<PyArray1<f32>>()?;
+    {
+        let mut own = all.readwrite();
+        let (means, rest) = own.as_slice_mut()?.split_at_mut(3 * n);
+        let (quats, rest) = rest.split_at_mut(4 * n);
+        let (log_scales, rest) = rest.split_at_mut(3 * n);
+        let (logit_opacities, rest) = rest.split_at_mut(n);
+        let (sh0, sh_n) = rest.split_at_mut(3 * n);
+        let out = FrameMut {
+            means: means.as_chunks_mut().0,
+            quats: quats.as_chunks_mut().0,
+            log_scales,
+            logit_opacities,
+            sh0,
+            sh_n,
+        };
+        py.detach(|| p.frame_into(t, out));
+    }
+    let (d, mut start) = (PyDict::new(py), 0);
+    for (name, shape) in shapes {
+        let end = start + shape.iter().product::<usize>();
+        let part = all.get_item(PySlice::new(py, start as isize, end as isize, 1))?;
+        d.set_item(name, part.call_method1("reshape", (shape,))?)?;
+        start = end;
+    }
+    Ok(d)
+}
+
+/// Means [T, N, 3] and rotations [T, N, 4] by which the nodes alone carry Gaussians in all frames.
+pub fn carried<'py, V: Coefficient>(py: Python<'py>, p: &Parametric<V>) -> PyResult<Pair<'py>> {
+    over_time(py, p, |t, m, r| p.carried_into(t, m, r))
+}
+
+type Pair<'py> = (Bound<'py, PyAny>, Bound<'py, PyAny>);
+
+/// [T, N, 3] and [T, N, 4] of what `fill` writes for each frame.
+fn over_time<'py, V: Coefficient>(
+    py: Python<'py>,
+    p: &Parametric<V>,
+    fill: impl Fn(u16, &mut [[f32; 3]], &mut [[f32; 4]]) + Sync,
+) -> PyResult<Pair<'py>> {
+    let (frames, n) = (usize::from(p.frames), p.rest.means.len());
+    let (means, rotations) = py.detach(|| {
+        let mut means = vec![[0.0f32; 3]; frames * n];
+        let mut rotations = vec![[0.0f32; 4]; frames * n];
+        let chunks = means.chunks_mut(n.max(1)).zip(rotations.chunks_mut(n.max(1)));
+        chunks.zip(0..p.frames).for_each(|((m, r), t)| fill(t, m, r));
+        (means.into_flattened(), rotations.into_flattened())
+    });
+    let means = means.into_pyarray(py).reshape([frames, n, 3])?.into_any();
+    Ok((means, rotations.into_pyarray(py).reshape([frames, n, 4])?.into_any()))
+}
+
+/// Poses [M, 16] f32 (rows of R, offset s of x -> R x + s, quaternion wxyz) -> `RigidBlend`.
+fn poses(a: &PyReadonlyArray2<f32>) -> PyResult<RigidBlend> {
+    if a.shape()[1] != 16 {
+        return invalid(format!("poses: expected shape [M, 16], got {:?}", a.shape()));
+    }
+    let pose = |r: &[f32; 16]| -> Pose {
+        let column = |b: usize| [r[b], r[3 + b], r[6 + b], 0.0];
+        [
+            column(0),
+            column(1),
+            column(2),
+            [r[9], r[10], r[11], 0.0],
+            [r[12], r[13], r[14], r[15]],
+        ]
+    };
+    let rows = a.as_slice()?.as_chunks::<16>().0;
+    Ok(RigidBlend::new(rows.iter().map(pose).collect()))
+}
+
+/// Where [N, 3] positions at rest are carried, [N, 3], and by which rotations, [N, 4] wxyz (spec 13.3).
+///
+/// `poses` [M, 16] f32: rows of the rotation matrix R, offset s of x -> R x + s, quaternion of R.
+#[pyfunction]
+pub fn blend_rigid<'py>(
+    py: Python<'py>,
+    poses: PyReadonlyArray2<'py, f32>,
+    rest: PyReadonlyArray2<'py, f32>,
+    neighbors: PyReadonlyArray2<'py, u32>,
+    weights: PyReadonlyArray2<'py, f32>,
+) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
+    let (x, nodes) = (rest.as_slice()?.as_chunks::<3>().0, self::poses(&poses)?);
+    let blend = blend_of(&neighbors, &weights, x.len())?;
+    let (mut means, mut rotations) = (vec![[0.0f32; 3]; x.len()], vec![[0.0f32; 4]; x.len()]);
+    py.detach(|| nodes.carry(&blend, x, (&mut means, &mut rotations), |_, x, q| (x, q)));
+    let means = means.into_flattened().into_pyarray(py).reshape([x.len(), 3])?.into_any();
+    let rotations = rotations.into_flattened().into_pyarray(py);
+    Ok((means, rotations.reshape([x.len(), 4])?.into_any()))
+}
+
+/// The gradient [M, 16] by `poses` of a loss, from its gradients by the results of `blend_rigid`.
+#[pyfunction]
+pub fn blend_rigid_backward<'py>(
+    py: Python<'py>,
+    poses: PyReadonlyArray2<'py, f32>,
+    rest: PyReadonlyArray2<'py, f32>,
+    neighbors: PyReadonlyArray2<'py, u32>,
+    weights: PyReadonlyArray2<'py, f32>,
+    by_means: PyReadonlyArray2<'py, f32>,
+    by_rotations: PyReadonlyArray2<'py, f32>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let (x, nodes) = (rest.as_slice()?.as_chunks::<3>().0, self::poses(&poses)?);
+    let blend = blend_of(&neighbors, &weights, x.len())?;
+    let (g, h) = (by_means.as_slice()?.as_chunks().0, by_rotations.as_slice()?.as_chunks().0);
+    let grads = py.detach(|| nodes.backward(&blend, x, g, h));
+    let row = |p: &Pose| -> [f32; 16] {
+        let r = |a: usize, b: usize| p[b][a];
+        let [s, q] = [p[3], p[4]];
+        [
+            r(0, 0), r(0, 1), r(0, 2), r(1, 0), r(1, 1), r(1, 2), r(2, 0), r(2, 1), r(2, 2),
+            s[0], s[1], s[2], q[0], q[1], q[2], q[3],
+        ]
+    };
+    let rows: Vec<[f32; 16]> = grads.iter().map(row).collect();
+    let count = rows.len();
+    Ok(rows.into_flattened().into_pyarray(py).reshape([count, 16])?.into_any())
+}

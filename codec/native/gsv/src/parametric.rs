@@ -1,0 +1,270 @@
+//! Canonical Gaussians, nodes and trajectories -> f32 attributes of frame t (spec 13).
+//!
+//! The one evaluation of the product: of a decoded group, whose coefficients are integers times a step, and of a group that was
+//! trained or fitted, whose coefficients are floats. Nothing is predicted from its result, so f32 will do.
+
+use crate::attributes::Attribute;
+use crate::blend::Blend;
+use crate::dequantize::{IDENTITY, Quat, multiply};
+use crate::rigid_blend::{RigidBlend, from_rotation_vector, pose};
+use crate::trajectories::Trajectories;
+use rayon::prelude::*;
+
+const CHANNELS_MAX: usize = 45; // of shN at degree 3
+/// Gaussians of one task.
+const RUN: usize = 2048;
+
+/// Attributes of all N Gaussians in one frame, in the layout of `codec.model.gaussians.Gaussians`.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Frame {
+    pub means: Vec<[f32; 3]>,
+    pub quats: Vec<[f32; 4]>,
+    pub log_scales: Vec<f32>,      // [N, 3]
+    pub logit_opacities: Vec<f32>, // [N]
+    pub sh0: Vec<f32>,             // [N, 3]
+    pub sh_n: Vec<f32>,            // [N, K, 3]
+}
+
+impl Frame {
+    /// Makes room for as many Gaussians as `other` has.
+    pub fn resize_as(&mut self, other: &Frame) {
+        self.means.resize(other.means.len(), [0.0; 3]);
+        self.quats.resize(other.means.len(), [0.0; 4]);
+        self.log_scales.resize(other.log_scales.len(), 0.0);
+        self.logit_opacities.resize(other.logit_opacities.len(), 0.0);
+        self.sh0.resize(other.sh0.len(), 0.0);
+        self.sh_n.resize(other.sh_n.len(), 0.0);
+    }
+
+    /// Its buffers, to be filled.
+    pub fn as_mut(&mut self) -> FrameMut<'_> {
+        FrameMut {
+            means: &mut self.means,
+            quats: &mut self.quats,
+            log_scales: &mut self.log_scales,
+            logit_opacities: &mut self.logit_opacities,
+            sh0: &mut self.sh0,
+            sh_n: &mut self.sh_n,
+        }
+    }
+}
+
+/// The buffers of a frame, to be filled. Lengths are those of `Frame`.
+pub struct FrameMut<'a> {
+    pub means: &'a mut [[f32; 3]],
+    pub quats: &'a mut [[f32; 4]],
+    pub log_scales: &'a mut [f32],
+    pub logit_opacities: &'a mut [f32],
+    pub sh0: &'a mut [f32],
+    pub sh_n: &'a mut [f32],
+}
+
+/// A coefficient of a trajectory, in units of its step.
+pub trait Coefficient: Copy + Default + PartialEq + Send + Sync {
+    fn to_f32(self) -> f32;
+}
+
+impl Coefficient for i32 {
+    #[inline(always)]
+    fn to_f32(self) -> f32 {
+        self as f32
+    }
+}
+
+impl Coefficient for f32 {
+    #[inline(always)]
+    fn to_f32(self) -> f32 {
+        self
+    }
+}
+
+/// Trajectories of one attribute, with the Gaussians that have any.
+pub struct AttributeMotion<V> {
+    attribute: Attribute,
+    step: f32,
+    /// Colours are Y, Co, Cg (spec 13.5).
+    decorrelated: bool,
+    pub coefficients: Trajectories<V>,
+    moving: Vec<u32>,
+}
+
+impl<V: Coefficient> AttributeMotion<V> {
+    pub fn new(attribute: Attribute, step: f32, decorrelated: bool, coefficients: Trajectories<V>) -> Self {
+        let moving = (0..coefficients.len()).filter(|i| !coefficients.get(*i).is_empty());
+        AttributeMotion {
+            attribute,
+            step,
+            decorrelated: decorrelated && matches!(attribute, Attribute::Sh0 | Attribute::ShN),
+            moving: moving.map(|i| i as u32).collect(),
+            coefficients,
+        }
+    }
+
+    /// Adds frame `t` to `values`, `channels` per Gaussian.
+    fn add(&self, basis: &[f32], values: &mut [f32], channels: usize) {
+        for &i in &self.moving {
+            let mut d: [f32; CHANNELS_MAX] = transform(self.coefficients.get(i as usize), channels, basis);
+            if self.decorrelated {
+                let colours = d.as_chunks_mut().0.iter_mut().take(channels / 3);
+                colours.for_each(|c| *c = rgb(*c)); // linear, so that it may be done to the difference
+            }
+            let from = i as usize * channels;
+            let own = values.get_mut(from..from + channels).unwrap_or_default();
+            own.iter_mut().zip(&d).for_each(|(v, d)| *v += self.step * d);
+        }
+    }
+
+    fn rotate(&self, basis: &[f32], quats: &mut [Quat]) {
+        for &i in &self.moving {
+            let d: [f32; 3] = transform(self.coefficients.get(i as usize), 3, basis);
+            if let Some(q) = quats.get_mut(i as usize) {
+                *q = normalize(multiply(with_real_part(d.map(|v| v * self.step)), *q));
+            }
+        }
+    }
+}
+
+/// Everything that a frame is evaluated from.
+pub struct Parametric<'a, V> {
+    pub frames: u16,
+    /// Added to all means.
+    pub origin: [f32; 3],
+    /// Means from the origin; its quats are not read.
+    pub rest: &'a Frame,
+    pub rotations: &'a [Quat],
+    pub blend: &'a Blend,
+    /// [M] at rest, from the origin.
+    pub nodes: &'a [[f32; 3]],
+    /// [M] of 6 channels: rotation vector, translation.
+    pub node_motion: &'a Trajectories<V>,
+    /// Radians and world units.
+    pub node_steps: [f32; 2],
+    pub motions: &'a [AttributeMotion<V>],
+}
+
+impl<V: Coefficient> Parametric<'_, V> {
+    /// Evaluates frame `t` (clamped to the group) into buffers as long as those of `Frame`.
+    pub fn frame_into(&self, t: u16, out: FrameMut) {
+        let basis = &basis(self.frames, t.min(self.frames.saturating_sub(1)))[..];
+        let rest = self.rest;
+        let still = [
+            (Attribute::LogScales, &rest.log_scales, out.log_scales),
+            (Attribute::LogitOpacities, &rest.logit_opacities, out.logit_opacities),
+            (Attribute::Sh0, &rest.sh0, out.sh0),
+            (Attribute::ShN, &rest.sh_n, out.sh_n),
+        ];
+        let (means, quats) = (out.means, out.quats);
+        rayon::join(
+            || self.move_at(basis, means, quats),
+            || {
+                still.into_par_iter().for_each(|(attribute, rest, values)| {
+                    values.iter_mut().zip(rest).for_each(|(v, r)| *v = *r);
+                    if let Some(m) = self.motion(attribute) {
+                        m.add(basis, values, m.coefficients.channels);
+                    }
+                });
+            },
+        );
+    }
+
+    /// Means and quaternions alone, of frame `t`.
+    pub fn moved_into(&self, t: u16, means: &mut [[f32; 3]], quats: &mut [Quat]) {
+        let basis = &basis(self.frames, t.min(self.frames.saturating_sub(1)))[..];
+        self.move_at(basis, means, quats);
+    }
+
+    fn motion(&self, attribute: Attribute) -> Option<&AttributeMotion<V>> {
+        self.motions.iter().find(|m| m.attribute == attribute)
+    }
+
+    fn move_at(&self, basis: &[f32], means: &mut [[f32; 3]], quats: &mut [Quat]) {
+        let own = |i: usize| self.rotations.get(i).copied().unwrap_or(IDENTITY);
+        self.carry(basis, (means, quats), |i, q| multiply(q, own(i)));
+        rayon::join(
+            || self.motion(Attribute::Quats).map(|m| m.rotate(basis, quats)),
+            || self.motion(Attribute::Means).map(|m| m.add(basis, means.as_flattened_mut(), 3)),
+        );
+    }
+
+    /// What the nodes alone do at frame `t`: where each Gaussian is carried, and by which rotation.
+    pub fn carried_into(&self, t: u16, means: &mut [[f32; 3]], rotations: &mut [Quat]) {
+        let basis = &basis(self.frames, t.min(self.frames.saturating_sub(1)))[..];
+        self.carry(basis, (means, rotations), |_, q| q);
+    }
+
+    /// Spec 13.3. `turned`: index of a Gaussian and the rotation by which it is carried -> the quaternion to be written.
+    fn carry(
+        &self,
+        basis: &[f32],
+        out: (&mut [[f32; 3]], &mut [Quat]),
+        turned: impl Fn(usize, Quat) -> Quat + Sync,
+    ) {
+        let (origin, rest) = (self.origin, &self.rest.means[..]);
+        if self.blend.per == 0 {
+            let out = out.0.par_chunks_mut(RUN).zip(out.1.par_chunks_mut(RUN));
+            out.zip(rest.par_chunks(RUN)).enumerate().for_each(|(run, ((x, q), x0))| {
+                x.iter_mut().zip(x0).for_each(|(x, x0)| *x = add(origin, *x0));
+                q.iter_mut().zip(run * RUN..).for_each(|(q, i)| *q = turned(i, IDENTITY));
+            });
+            return;
+        }
+        let [rotation_step, translation_step] = self.node_steps;
+        let pose = |(j, n): (usize, &[f32; 3])| {
+            let [rx, ry, rz, tx, ty, tz] = transform(self.node_motion.get(j), 6, basis);
+            let q = from_rotation_vector([rx, ry, rz].map(|v| v * rotation_step));
+            pose(q, *n, [tx, ty, tz].map(|v| v * translation_step))
+        };
+        let poses = RigidBlend::new(self.nodes.iter().enumerate().map(pose).collect());
+        poses.carry(self.blend, rest, out, |i, x, q| (add(origin, x), turned(i, q)));
+    }
+}
+
+fn add(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
+    [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
+}
+
+/// Y, Co, Cg -> R, G, B (spec 13.5).
+pub fn rgb([y, co, cg]: [f32; 3]) -> [f32; 3] {
+    [y + co - cg, y + cg, y - co - cg]
+}
+
+/// DCT-II basis functions at frame `t` (spec 13.1), one per frequency.
+fn basis(frames: u16, t: u16) -> Vec<f32> {
+    let n = f64::from(frames);
+    let at = |k: u16| {
+        let scale = if k == 0 { 1.0 } else { 2.0f64 };
+        ((scale / n).sqrt() * (std::f64::consts::PI * f64::from(2 * u32::from(t) + 1) * f64::from(k) / (2.0 * n)).cos())
+            as f32
+    };
+    (0..frames).map(at).collect()
+}
+
+/// Sum over frequencies, per channel; the channels that an attribute lacks are 0.
+fn transform<const C: usize, V: Coefficient>(coefficients: &[V], channels: usize, basis: &[f32]) -> [f32; C] {
+    let mut sum = [0.0; C];
+    let mut add = |row: &[V], b: &f32| row.iter().zip(&mut sum).for_each(|(v, s)| *s += v.to_f32() * b);
+    if channels == C {
+        let rows = coefficients.as_chunks::<C>().0; // of a length that the compiler knows
+        rows.iter().zip(basis).for_each(|(row, b)| add(row, b));
+    } else {
+        let rows = coefficients.chunks(channels.max(1));
+        rows.zip(basis).for_each(|(row, b)| add(row, b));
+    }
+    sum
+}
+
+/// A unit quaternion, unless `v` is longer than 1.
+fn with_real_part(v: [f32; 3]) -> Quat {
+    let w = (1.0 - v.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
+    [w, v[0], v[1], v[2]]
+}
+
+fn normalize(q: Quat) -> Quat {
+    let length = q.iter().map(|v| v * v).sum::<f32>().sqrt();
+    if length > 0.0 {
+        let scale = 1.0 / length;
+        q.map(|v| scale * v)
+    } else {
+        IDENTITY
+    }
+}
