@@ -10,7 +10,7 @@ a variant whose tool is gone fails.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -70,6 +70,14 @@ VARIANTS = {
         patches=((motion, "MOVE_RATE", 0.0), (motion, "TURN_RATE", 0.0), (motion, "MEANS_RATE", motion.MOVE_RATE))
     ),
 }
+
+
+def run(
+    captures: Iterable[str], names: list[str] | None, preset: str, quality: float, data: Path | None, out: Path
+) -> Iterator[dict]:
+    """Yields what `measure` yields for each of `captures`."""
+    for capture in captures:
+        yield from measure(capture, names, preset, quality, data, out)
 
 
 def measure(

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from bench.machine import write_result
 from bench.scenes import DISTANCE, UP, capsule, capsule_camera, file_scene
 from gscodec.errors import UsageError
 from gscodec.model.camera import Camera
@@ -105,23 +106,25 @@ def measure(scene: str, gaussians: Gaussians, cam: Camera, simd: str, threads: i
 
 
 def run(
-    scenes: tuple[str, ...] = SCENES,
+    scenes: Sequence[str] = SCENES,
     simd: list[str] | None = None,
     threads: list[int] | None = None,
     repeats: int = 15,
     data: Path | None = None,
     work: Path = Path("build/bench"),
+    out: Path | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Iterator[dict]:
-    """Yields the entries of all cases of `scenes`.
+    """Yields the entries of all cases of `scenes`, then writes them and the settings to `out`.
 
     Args:
         simd: levels of every case; None: all levels for the anchors, the fastest for the others.
         threads: numbers of threads of every case; None: 1 and all cores for the anchors, all cores for the others.
-        data: folder with splats and captures; what is not there is left out, which `say` is told.
-        work: where the trained lumberjack is kept, see `sequences`.
+        data: folder with splats and captures; a case whose files are missing is left out, and `say` gets a line.
+        work: where the trained lumberjack is kept (sequences.py).
+        out: the result file, or None.
     """
-    cores = os.cpu_count() or 1
+    entries = []
     for case in CASES:
         if case.scene not in scenes:
             continue
@@ -130,6 +133,17 @@ def run(
         except UsageError as e:
             say(f"{case.scene}: left out, {e}")
             continue
-        for level in simd or simd_levels()[: None if case.every else 1]:
-            for count in threads or ([1, cores] if case.every and cores > 1 else [cores]):
-                yield measure(case.scene, *loaded, level, count, repeats)
+        for level, count in _variants(case, simd, threads):
+            entries.append(measure(case.scene, *loaded, level, count, repeats))
+            yield entries[-1]
+    if out:
+        settings = {"scenes": list(scenes), "simd": simd or simd_levels(), "threads": threads, "repeats": repeats}
+        write_result(out, {"settings": settings, "entries": entries})
+
+
+def _variants(case: Case, simd: list[str] | None, threads: list[int] | None) -> Iterator[tuple[str, int]]:
+    """(instruction set, number of threads) of the entries of a case."""
+    cores = os.cpu_count() or 1
+    for level in simd or simd_levels()[: None if case.every else 1]:
+        for count in threads or ([1, cores] if case.every and cores > 1 else [cores]):
+            yield level, count

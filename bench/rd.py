@@ -37,6 +37,26 @@ VIDEO = ("videogs", "videogs-raw", "x265", "svt-av1", "gsav")  # these pack SH d
 Coded = tuple[int, int, float, float, Callable[[int], Gaussians]]
 
 
+def run(
+    sequences: Iterable[str],
+    codecs: Iterable[str],
+    data: Path,
+    work: Path,
+    out: Path,
+    say: Callable[[str], None] = lambda text: None,
+) -> Iterator[dict]:
+    """Yields the entries of each codec on each sequence and puts them into the result file `out` as they come.
+
+    A curve whose data or tool is missing is left out, and `say` gets a line.
+    """
+    for sequence in sequences:
+        for codec in codecs:
+            try:
+                yield from update(out, measure(sequence, codec, data, work))
+            except UsageError as e:
+                say(f"{sequence}, {codec}: left out, {e}")
+
+
 def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[dict]:
     """Yields the entries of a codec's curve on one sequence.
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -81,28 +81,52 @@ def held_out(capture: Capture, names: tuple[str, ...]) -> Capture:
     return replace(capture, cameras=cameras, read=lambda camera, t: capture.read(kept[camera], t))
 
 
-def measure(case: str, recipe: str, preset: str, frames: str | None, data: Path, quality: float) -> Iterator[dict]:
-    """Entries of one recipe on one case.
+@dataclass(frozen=True)
+class Run:
+    """One recipe on one case.
 
-    Args:
+    Attributes:
+        case: name in CASES.
+        recipe: name in RECIPES.
         frames: "A:B" or "A:B:STEP", None: all.
+    """
+
+    case: str
+    recipe: str
+    preset: str
+    frames: str | None
+    quality: float
+
+
+def run(runs: Iterable[Run], data: Path, out: Path) -> Iterator[dict]:
+    """Yields the entries of all `runs` and puts them into the result file `out` as they come.
+
+    Raises:
+        UsageError: a capture is not in the data folder.
+    """
+    for each in runs:
+        yield from update(out, measure(each, data))
+
+
+def measure(run: Run, data: Path) -> Iterator[dict]:
+    """Entries of one recipe on one case.
 
     Raises:
         UsageError: the capture is not in the data folder.
     """
     from gscodec.train.settings import train_settings
 
-    capture = CASES[case].open(data)
-    chosen = range(capture.frame_count)[slice(*(int(x) if x else None for x in (frames or ":").split(":")))]
-    settings = train_settings(preset, quality=quality)
-    run = {"gscodec": _ours, "alone": _alone, "v3": _v3}[recipe]
-    for name, seconds, size, models, *more in run(capture, chosen, settings):
+    capture = CASES[run.case].open(data)
+    chosen = range(capture.frame_count)[slice(*(int(x) if x else None for x in (run.frames or ":").split(":")))]
+    settings = train_settings(run.preset, quality=run.quality)
+    recipe = {"gscodec": _ours, "alone": _alone, "v3": _v3}[run.recipe]
+    for name, seconds, size, models, *more in recipe(capture, chosen, settings):
         result = evaluate(part(capture, chosen), models)
         yield {
-            "capture": case,
+            "capture": run.case,
             "recipe": name,
-            "preset": preset,
-            "quality": quality if name in ("gscodec", "alone-coded") else None,
+            "preset": run.preset,
+            "quality": run.quality if name in ("gscodec", "alone-coded") else None,
             "frames": [chosen.start, chosen.stop, chosen.step],
             "seconds_per_frame": round(seconds / len(chosen), 2),
             **{k: result[k] for k in KEYS},
