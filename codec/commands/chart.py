@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from .checkout import require_bench
 from .options import stdout
 
 
@@ -15,7 +16,8 @@ def chart(
     charts: Annotated[Path, typer.Argument(help="Folder for the charts.")] = Path("bench/charts"),
 ) -> None:
     """Charts (.svg and .png) of all results that have one."""
-    from ..metrics.charts import draw_charts
+    require_bench()
+    from bench.plots.charts import draw_charts
 
     for path in draw_charts(results, charts):
         stdout.print(str(path))

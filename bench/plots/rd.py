@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .bd_rate import rising
+from gscodec.metrics import rising
 
 OURS = "gscodec"
 LOOK = {  # codec -> (name on the chart, colour)
