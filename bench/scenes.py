@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.errors import UsageError
 from gscodec.model.camera import Camera, look_at
 from gscodec.model.gaussians import Gaussians
 from gscodec.render.movie import orbit_camera
+
+from .data import existing
 
 RADIUS, HEIGHT = 0.25, 1.8  # metres
 DISTANCE, FOCAL = 2.8, 1.4  # metres; image widths
@@ -52,14 +53,12 @@ def file_scene(name: str, data: Path, work: Path, width: int, height: int) -> tu
     Raises:
         UsageError: the files are missing.
     """
-    from bench.sequences import open_case
     from gscodec.splats import open_sequence
+
+    from .sequences import open_case
 
     if name == "lumberjack":
         gaussians = open_case(name, data, work).frame(0)
     else:
-        path = Path(data) / "splats" / f"{name}.ply"
-        if not path.exists():
-            raise UsageError(f"{path} is not there; the data folder (GSCODEC_DATA) must have it")
-        gaussians = open_sequence(path).frame(0)
+        gaussians = open_sequence(existing(Path(data) / "splats" / f"{name}.ply")).frame(0)
     return gaussians, orbit_camera(gaussians, UP[name], 0.25, width, height)
