@@ -18,14 +18,15 @@ from unittest.mock import patch
 
 import numpy as np
 
-from bench import train
-from bench.machine import ROOT, update_entries
 from gscodec.capture import Capture
 from gscodec.errors import UsageError
 from gscodec.train import change_detection as changes
 from gscodec.train import finetune
 from gscodec.train import tracking as motion
 from gscodec.train import train as recipe
+
+from . import train
+from .machine import ROOT, update_entries
 
 WHOLE = "whole recipe"
 LUMBERJACK, STAGE = "lumberjack", "stage"

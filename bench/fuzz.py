@@ -1,6 +1,6 @@
 """Fuzzes the demuxer, the unit parser and the entropy decoders; counts executions in bench/results/fuzz.json.
 
-usage: python bench/fuzz.py [--seconds 180]        for each target; needs a nightly toolchain and cargo-fuzz
+usage: python -m bench.fuzz [--seconds 180]        for each target; needs a nightly toolchain and cargo-fuzz
 
 Executions add up, for each state of the code that is fuzzed (the git tree of gsv/src). Each target runs in libFuzzer
 without a sanitizer, since the code has no unsafe block, and with limits on the time and memory of one input. A finding
@@ -15,7 +15,7 @@ import re
 import subprocess
 import sys
 
-from bench.machine import RESULTS, ROOT, write_result
+from .machine import RESULTS, ROOT, write_result
 
 FUZZ = ROOT / "codec" / "native" / "fuzz"
 TARGETS = ("demux", "group", "units")

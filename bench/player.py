@@ -1,6 +1,6 @@
 """Speed of the web player in headless Chromium without a GPU: its CPU path, frames a second, milliseconds, memory.
 
-usage: python bench/player.py FOLDER [statue] [demo] ...
+usage: python -m bench.player FOLDER [statue] [demo] ...
 
 FOLDER keeps the streams; what is missing is encoded first, apart from the measuring: the bundled capture (demo), and of
 the folder that GSCODEC_DATA names the moving statue, 40 frames (statue: without what no view shows, statue_all: all
@@ -17,6 +17,7 @@ Of each stream:
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import statistics
@@ -26,10 +27,11 @@ import threading
 import time
 from pathlib import Path
 
-from bench.browser import Browser, Browsers
-from bench.machine import RESULTS, ROOT, write_result
-from bench.run import animated, gscodec
 from gscodec.player.server import Server
+
+from .browser import Browser, Browsers
+from .machine import RESULTS, ROOT, write_result
+from .run import animated, gscodec
 
 SIZE = "512x512"
 LOADS = 5
@@ -222,9 +224,13 @@ def measure(browsers: Browsers, name: str, path: Path) -> dict:
 
 def main() -> None:
     """Measures the streams named on the command line, all by default."""
-    if len(sys.argv) < 2:
-        sys.exit(__doc__)
-    found = streams(Path(sys.argv[1]), sys.argv[2:] or ["demo", *STATUES])
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="where the streams are made and kept")
+    parser.add_argument("streams", nargs="*", metavar="STREAM", help=f"of demo, {', '.join(STATUES)}; all by default")
+    a = parser.parse_args()
+    if unknown := set(a.streams) - {"demo", *STATUES}:
+        sys.exit(f"error: no such stream: {', '.join(unknown)}, expected demo, {', '.join(STATUES)}")
+    found = streams(a.folder, a.streams or ["demo", *STATUES])
     results = {}
     with Browsers() as browsers:
         version = browsers.start().page.context.browser.version

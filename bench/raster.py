@@ -16,8 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.machine import write_result
-from bench.scenes import DISTANCE, UP, capsule, capsule_camera, file_scene
 from gscodec.errors import UsageError
 from gscodec.model.camera import Camera
 from gscodec.model.gaussians import Gaussians
@@ -26,6 +24,9 @@ from gscodec.render.step import render_loss
 from gscodec.render.workspace import PARAMETERS, Workspace, simd_levels
 from gscodec.train.keyframe import RATES
 from gscodec.train.model import from_gaussians
+
+from .machine import write_result
+from .scenes import DISTANCE, UP, capsule, capsule_camera, file_scene
 
 RATE = 1e-6  # of Adam: the scene must not change while it is measured
 BUDGET_S = 2.0  # an entry takes fewer repeats than asked for, at least 5, beyond that

@@ -1,6 +1,6 @@
 """Training's estimate of the bits of canonical attributes beside the coder's -> bench/results/rate_term.json.
 
-usage: GSCODEC_DATA=... python bench/rate_term.py
+usage: GSCODEC_DATA=... python -m bench.rate_term
 
 The first frames of lumberjack are trained (preset fast) with rate terms of several weights. Each attribute is then
 estimated at the nominal steps of training, and coded as users would: with measured steps, rate-distortion optimised.
@@ -9,14 +9,12 @@ Bits per Gaussian.
 
 from __future__ import annotations
 
-import os
+import argparse
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from bench.machine import RESULTS, write_result
 from gscodec import _native
 from gscodec.bitstream.quantization import steps_for, subject_radius
 from gscodec.capture import open_capture
@@ -25,6 +23,9 @@ from gscodec.train.entropy_model import CanonicalRate
 from gscodec.train.model import from_gaussians
 from gscodec.train.settings import train_settings
 from gscodec.train.train import train_groups
+
+from .data import data_folder
+from .machine import RESULTS, write_result
 
 FRAMES, QUALITY = 4, 62.0
 WEIGHTS = (0.0, 0.02, 0.08, 0.32)
@@ -65,7 +66,8 @@ def correlations(table: list[dict]) -> dict[str, float]:
 
 def main() -> None:
     """Writes the table."""
-    capture = replace(open_capture(Path(os.environ["GSCODEC_DATA"]) / "lumberjack"), frame_count=FRAMES)
+    argparse.ArgumentParser(description=__doc__.split("\n")[0]).parse_args()
+    capture = replace(open_capture(data_folder() / "lumberjack"), frame_count=FRAMES)
     table = [row for weight in WEIGHTS for row in rows(capture, weight)]
     correlation = correlations(table)
     write_result(

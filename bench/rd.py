@@ -15,15 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.baselines import BASELINES, Baseline
-from bench.machine import commit, update_entries
-from bench.sequences import SINGLE, open_case
 from gscodec.decode import open_stream
 from gscodec.encode.encode import REFINE, EncodeSettings, encode_groups, stream_config
 from gscodec.errors import UsageError
 from gscodec.metrics import bd_rate, evaluate_splats, rising
 from gscodec.metrics.bd_rate import shared_psnr
 from gscodec.model.gaussians import Gaussians, GaussianSequence, Group
+
+from .baselines import BASELINES, Baseline
+from .machine import commit, update_entries
+from .sequences import SINGLE, open_case
 
 OURS = "gscodec"
 QUALITIES = (20, 30, 40, 50, 60, 70, 80, 90, 100)

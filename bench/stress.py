@@ -15,11 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bench import train
-from bench.machine import update_entries
-from bench.procedural import Scene
-from bench.stress_scenes import SCENES
 from gscodec.model.gaussians import Gaussians, Group
+
+from . import train
+from .machine import update_entries
+from .procedural import Scene
+from .stress_scenes import SCENES
 
 PRESET = "fast"
 BUDGET = {"gaussians_max": 3750, "initial_points": 2000}  # for pictures of 128 x 128

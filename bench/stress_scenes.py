@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.procedural import Light, Scene, Shape, moved, placed, rotation
+from .procedural import Light, Scene, Shape, moved, placed, rotation
 
 UP = (0, 0, 1)
 SKIN, SHIRT, BELT = (0.8, 0.55, 0.4), (0.25, 0.4, 0.75), (0.8, 0.7, 0.2)

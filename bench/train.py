@@ -19,11 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.machine import update_entries
-from bench.still import still_share
 from gscodec.capture import Capture
 from gscodec.errors import UsageError
 from gscodec.model.gaussians import Gaussians, Group
+
+from .machine import update_entries
+from .still import still_share
 
 RECIPES = ("gscodec", "alone", "v3")
 V3_PACKING = {"qp": 25, "raw": True}  # its default, in the better of its two forms
@@ -156,8 +157,8 @@ def _alone(capture: Capture, frames: range, settings) -> Iterator[tuple]:
 
 
 def _v3(capture: Capture, frames: range, settings) -> Iterator[tuple]:
-    from bench.baselines import videogs
-    from bench.baselines.v3 import train_v3
+    from .baselines import videogs
+    from .baselines.v3 import train_v3
 
     start = time.perf_counter()
     models = train_v3(part(capture, frames), range(len(frames)), settings)

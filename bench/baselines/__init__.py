@@ -10,9 +10,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 
-from bench.baselines import draco, gsav, sog, spz, svt_av1, videogs, x265_anchor, zstd
-from bench.baselines.maps import order_of
 from gscodec.model.gaussians import Gaussians
+
+from . import draco, gsav, sog, spz, svt_av1, videogs, x265_anchor, zstd
+from .maps import order_of
 
 
 @dataclass(frozen=True)

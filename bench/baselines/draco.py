@@ -10,9 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.baselines.grid import morton_order
 from gscodec.errors import require
 from gscodec.model.gaussians import Gaussians
+
+from .grid import morton_order
 
 SETTINGS = {f"{p}/{a} bit": {"position": p, "attribute": a} for p, a in ((11, 5), (12, 6), (13, 7), (14, 8), (16, 8))}
 ATTRIBUTES = ("quats", "log_scales", "logit_opacities", "sh0", "shN")

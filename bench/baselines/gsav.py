@@ -11,10 +11,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.baselines.ffmpeg import VP9, decode_videos, encode_videos
-from bench.baselines.grid import morton_order, side_of
-from bench.baselines.zstd import compress, decompress
 from gscodec.model.gaussians import Gaussians
+
+from .ffmpeg import VP9, decode_videos, encode_videos
+from .grid import morton_order, side_of
+from .zstd import compress, decompress
 
 SETTINGS = {f"snap {s}": {"snap": s} for s in (0, 1, 2, 4, 8, 16)}
 CHANNELS, WIDE = 14, 4  # channels, and how many of them lie side by side

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.baselines.grid import grid_order
 from gscodec.model.gaussians import Gaussians
+
+from .grid import grid_order
 
 CHANNELS = {"means": 3, "sh0": 3, "log_scales": 3, "quats": 4, "logit_opacities": 1}
 LOSSLESS = ("means_low", "means_high")

@@ -6,9 +6,10 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from bench.baselines.splat_transform import convert
 from gscodec.model.gaussians import Gaussians
 from gscodec.splats import read_splat
+
+from .splat_transform import convert
 
 SETTINGS = {"default": {}}
 

@@ -13,11 +13,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from bench.baselines.splat_transform import convert
-from bench.baselines.zstd import decompress
 from gscodec.model.gaussians import SH_COUNTS, Gaussians
 from gscodec.splats.compressed_ply import logit
 from gscodec.splats.smallest_three import join_smallest_three
+
+from .splat_transform import convert
+from .zstd import decompress
 
 SETTINGS = {"default": {}}
 COLOR_SCALE = 0.15

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.baselines.ffmpeg import SVT_AV1, decode_videos, encode_videos
-from bench.baselines.maps import CHANNELS, LOSSLESS, pack, unpack
 from gscodec.model.gaussians import Gaussians
+
+from .ffmpeg import SVT_AV1, decode_videos, encode_videos
+from .maps import CHANNELS, LOSSLESS, pack, unpack
 
 SETTINGS = {f"qp {qp}": {"qp": qp} for qp in (4, 10, 18, 26, 34, 42)}
 PRESET = 6

@@ -17,7 +17,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from bench.baselines.hashgrid import HashGrid
 from gscodec.bitstream.quantization import subject_radius
 from gscodec.render.workspace import Workspace
 from gscodec.train.deformation_graph import quat_multiply, rotvec_to_quat
@@ -26,6 +25,8 @@ from gscodec.train.model import Model
 from gscodec.train.settings import TrainSettings
 from gscodec.train.train import initial_model
 from gscodec.train.views import Views, compare
+
+from .hashgrid import HashGrid
 
 STEPS = (90, 225)  # a frame: as long as the preset medium takes, 800 : 2000
 FIELD_RATES = {"grid": 2e-2, "mlp": 2e-3}

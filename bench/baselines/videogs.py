@@ -13,9 +13,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.baselines.ffmpeg import X264, decode_videos, encode_videos
 from gscodec.model.gaussians import Gaussians
 from gscodec.splats.compressed_ply import logit, sigmoid
+
+from .ffmpeg import X264, decode_videos, encode_videos
 
 SETTINGS = {f"qp {qp}": {"qp": qp} for qp in (8, 12, 15, 18, 20, 25, 35, 45, 51)}
 SETTINGS |= {f"qp 51/{rest}": {"qp": 51, "rest": rest} for rest in (26, 30, 34)}  # below what the scripts reach

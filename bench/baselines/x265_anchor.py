@@ -10,9 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.baselines.ffmpeg import X265, decode_videos, encode_videos
-from bench.baselines.maps import LOSSLESS, pack, unpack
 from gscodec.model.gaussians import Gaussians
+
+from .ffmpeg import X265, decode_videos, encode_videos
+from .maps import LOSSLESS, pack, unpack
 
 QPS = {"rp0": (4, 4, 4), "rp1": (4, 10, 4), "rp2": (10, 16, 10), "rp3": (16, 22, 16), "rp4": (22, 28, 22)}
 QPS |= {"rp5": (28, 34, 28)}  # opacity; scales and rotation; colour
