@@ -10,6 +10,7 @@ from synthetic import turning
 
 pytest.importorskip("torch")
 
+from bench.ablation import FRAMES, VARIANTS, WHOLE
 from bench.animate_splat import Motion, animate_splat, animated
 from bench.machine import ROOT, write_result
 from bench.plots.charts import draw_charts
@@ -20,6 +21,7 @@ from gscodec.capture import open_capture
 from gscodec.errors import CaptureError, UsageError
 from gscodec.splats import write_splat
 from gscodec.splats.ply_table import read_table
+from gscodec.train.settings import train_settings
 
 BENCH = ROOT / "bench"
 KEYS = {
@@ -86,11 +88,14 @@ def test_ablation_shows_what_each_tool_is_worth(tmp_path):
     assert [p.name for p in draw_charts(tmp_path, tmp_path / "charts")] == ["ablation.svg", "ablation.png"]
 
 
-def test_ablation_takes_out_what_is_there():
-    pytest.importorskip("torch")
-    from bench.ablation import VARIANTS
-
-    assert [n for n, v in VARIANTS.items() for where, name, _ in v.patches if not hasattr(where, name)] == []
+def test_each_variant_of_the_ablation_changes_the_settings():
+    whole = train_settings("fast")
+    changed = {name: variant.change(whole) for name, variant in VARIANTS.items()}
+    assert changed.pop(WHOLE) == whole
+    assert whole not in changed.values()
+    assert len(set(map(repr, changed.values()))) == len(changed), "two variants are the same"
+    assert all(v.captures for v in VARIANTS.values())
+    assert {c for v in VARIANTS.values() for c in v.captures} == set(FRAMES)
 
 
 @pytest.mark.parametrize("script", [p for p in BENCH.glob("*.py") if "__main__" in p.read_text()], ids=lambda p: p.stem)
