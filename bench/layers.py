@@ -1,8 +1,9 @@
-"""What layers cost, and what their prefixes are worth: one frame of the statue in 1 to 4 layers.
+"""Size and quality of layered coding: one frame of the statue in 1 to 4 layers.
 
 usage: GSCODEC_DATA=... python -m bench.layers        writes bench/results/layers.json
 
-For each prefix also the best of a few corrections of scale and opacity (spec, "Layer correction").
+A row per prefix of the layers: bytes, codec PSNR, and the PSNR with the best of nine corrections of scale and opacity
+(spec, "Layer correction").
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Reference beside what a stream decodes to, for the eye: rows are frames, the columns reference and render.
+"""One picture for visual comparison: a row per frame, on the left the reference, on the right the decoded stream.
 
 usage: python -m bench.picture STREAM.gsv CAPTURE PICTURE.png [CAMERA [FRAME ...]]
 """

@@ -1,9 +1,9 @@
-"""Positions beside Draco's kd-tree coder, bits per Gaussian at equal steps -> bench/results/positions.json.
+"""Bits per Gaussian of the positions, ours beside Draco's kd-tree coder at equal steps: bench/results/positions.json.
 
-usage: GSCODEC_DATA=... python -m bench.positions [NAME=SPLAT ...]   (other splats besides those of the data folder)
+usage: GSCODEC_DATA=... python -m bench.positions [NAME=SPLAT ...]   (splats besides those of the data folder)
 
-Both coders get the same integers, as a set: points of the grid that Draco quantizes to with so many bits. DracoPy 2,
-compression level 10, order free. Ours is the positions unit of a stream.
+Both coders get the same set of integers, the points of Draco's quantization grid. Draco: DracoPy 2, compression level
+10, order free. Ours: the positions unit of a stream.
 """
 
 from __future__ import annotations

@@ -1,9 +1,14 @@
-"""Speed of the rasterizer: for each scene, size, instruction set and number of threads the milliseconds it takes.
+"""Speed of the rasterizer by scene, image size, instruction set and number of threads.
 
-Keys of an entry: scene, gaussians, width, height, covered (share of the pixels with alpha > 0.02), simd, threads,
-project_ms (projection, depth sort and binning), forward_ms (blending), backward_ms (tiles, then Gaussians), step_ms (a
-whole training step: these, the image loss and Adam), memory_bytes (all buffers of a forward pass). Times are medians
-of the runs, after two that warm up.
+Keys of an entry:
+  scene, gaussians, width, height, simd, threads
+  covered        share of the pixels with alpha > 0.02
+  project_ms     projection, depth sort and binning
+  forward_ms     blending
+  backward_ms    tiles, then Gaussians
+  step_ms        a whole training step: all passes, the image loss and Adam
+  memory_bytes   all buffers of a forward pass
+Times are medians of the runs after two warm-up runs.
 """
 
 from __future__ import annotations
@@ -28,13 +33,13 @@ from gscodec.train.model import from_gaussians
 from .machine import write_result
 from .scenes import DISTANCE, UP, capsule, capsule_camera, file_scene
 
-RATE = 1e-6  # of Adam: the scene must not change while it is measured
-BUDGET_S = 2.0  # an entry takes fewer repeats than asked for, at least 5, beyond that
+RATE = 1e-6  # learning rate of Adam: the scene must not change during the measurement
+BUDGET_S = 2.0  # after these seconds an entry stops, with at least 5 repeats
 
 
 @dataclass(frozen=True)
 class Case:
-    """One picture; `every` level and number of threads is measured, or only the fastest with all cores."""
+    """One scene at one image size. `every`: all instruction sets and 1 thread too, else the fastest with all cores."""
 
     scene: str
     gaussians: int  # of a capsule
@@ -78,7 +83,7 @@ def measure(scene: str, gaussians: Gaussians, cam: Camera, simd: str, threads: i
     mask = covered.astype(np.uint8) * 255
     rates = {name: RATE for name in ("means", *RATES)}
     parts, steps = [], []
-    for adam in (False, True):  # the passes alone, as the peers' were measured, then whole steps
+    for adam in (False, True):  # the passes alone, then whole training steps
         begin, count = time.perf_counter(), 0
         while count < repeats + 2 and (count < 7 or time.perf_counter() - begin < BUDGET_S):
             start, count = time.perf_counter(), count + 1

@@ -1,9 +1,9 @@
-"""Training's estimate of the bits of canonical attributes beside the coder's -> bench/results/rate_term.json.
+"""Bits of the canonical attributes: training's estimate beside the coder's, in bench/results/rate_term.json.
 
 usage: GSCODEC_DATA=... python -m bench.rate_term
 
-The first frames of lumberjack are trained (preset fast) with rate terms of several weights. Each attribute is then
-estimated at the nominal steps of training, and coded as users would: with measured steps, rate-distortion optimised.
+The first frames of lumberjack are trained (preset fast) with several weights of the rate term. The estimate is at the
+nominal steps of training; the coder uses measured steps and rate-distortion optimisation, as `gscodec encode` does.
 Bits per Gaussian.
 """
 
@@ -32,7 +32,7 @@ WEIGHTS = (0.0, 0.02, 0.08, 0.32)
 
 
 def rows(capture, weight: float) -> list[dict]:
-    """One row per attribute, of a group that was trained with this weight of the rate term."""
+    """A row per attribute of a group trained with this weight of the rate term."""
     settings = train_settings("fast", gop=FRAMES, rate_lambda=weight, quality=QUALITY)
     group = next(train_groups(capture, settings))
     model = from_gaussians(group.frames[0])
@@ -54,7 +54,7 @@ def rows(capture, weight: float) -> list[dict]:
 
 
 def correlations(table: list[dict]) -> dict[str, float]:
-    """Of estimated and coded bits: of each attribute over the weights, and of all together."""
+    """Correlation of estimated and coded bits: per attribute over the weights, and over all rows."""
     chosen = {
         name: [r for r in table if r["attribute"] == name] for name in dict.fromkeys(r["attribute"] for r in table)
     }

@@ -1,4 +1,4 @@
-"""Benchmarks of the whole pipeline, through the command line as users run it; results as JSON in bench/results.
+"""Benchmarks of the whole pipeline through the command line: a JSON in bench/results per case.
 
 usage: python -m bench.run [statue] [statue40] [lumberjack] [demo]
 
@@ -63,7 +63,7 @@ def statue(data: Path, folder: Path) -> dict:
 
 
 def statue40(data: Path, folder: Path) -> dict:
-    """Twice as long: the second group is predicted from the first."""
+    """40 frames of it: the second group is predicted from the first."""
     return measure("statue40", animated(data, folder, 40), folder, "--quality", "52")
 
 
@@ -80,7 +80,7 @@ def lumberjack(data: Path, folder: Path) -> dict:
 
 
 def demo(_: Path | None, folder: Path) -> dict:
-    """The bundled example of `make demo`, and the picture of it."""
+    """The bundled example of `make demo`; also draws its picture."""
     source = ROOT / "examples" / "lumberjack"
     result = measure("demo", source, folder)
     write_png(ROOT / "bench" / "charts" / "demo.png", beside(folder / "demo.gsv", source, (0, 10, 19)))
@@ -88,7 +88,7 @@ def demo(_: Path | None, folder: Path) -> dict:
 
 
 def beside(stream: Path, source: Path, frames: tuple[int, ...]) -> np.ndarray:
-    """[H, W, 3] u8: the first test view of the capture and the same of the stream, frame beside frame."""
+    """[H, W, 3] u8: for each of `frames`, side by side, the first test view of the capture and of the stream."""
     capture, decoded = open_capture(source), open_stream(stream)
     test, pictures = capture.indices("test")[0], []
     views = [capture.view(test, t) for t in frames]

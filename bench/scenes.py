@@ -1,4 +1,4 @@
-"""Scenes of the rasterizer's benchmark: a capsule of any number of Gaussians, and splats from files."""
+"""Scenes of the rasterizer's benchmark: a capsule with any number of Gaussians, and splats from files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ UP = {"statue": "-y", "playbot": "-y", "lumberjack": "z"}  # scene from files ->
 
 
 def capsule(n: int, seed: int = 0) -> Gaussians:
-    """N Gaussians evenly on a person-sized capsule, in random order.
+    """N Gaussians, uniform on the surface of a person-sized capsule, in random order.
 
     Splats of 0.6 x the mean spacing x U(0.5, 1.5) per axis, opacity U(0.15, 0.95).
     """
@@ -48,7 +48,7 @@ def capsule_camera(width: int, height: int, distance: float = DISTANCE) -> Camer
 
 
 def file_scene(name: str, data: Path, work: Path, width: int, height: int) -> tuple[Gaussians, Camera]:
-    """The Gaussians of a file in `data` (lumberjack: of the one trained in `work`) and a camera that sees them all.
+    """The Gaussians of a file in `data`, or of the lumberjack trained in `work`, and a camera with all in view.
 
     Raises:
         UsageError: the files are missing.

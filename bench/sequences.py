@@ -1,9 +1,10 @@
-"""The sequences and frames that codecs are measured on; made once and kept in a work folder, until it is deleted.
+"""The sequences and frames on which codecs are measured; made once and kept in a work folder.
 
-statue: a scanned statue that moves (20 frames, 101,275 Gaussians), made by animate_splat.py.
-lumberjack: the captured character (30 frames), trained as `gscodec encode` does it, but without harmonics, which most
-video packings do not have, nor can they have Gaussians that do not live in all frames of a group: these few are left
-out. statue-0, playbot and fruit are single frames of SH degree 0, 2 and 3.
+statue                     a scanned statue in motion (animate_splat.py), 20 frames, 101,275 Gaussians
+lumberjack                 the captured character, 30 frames, trained as by `gscodec encode`, at SH degree 0 and only
+                           with the Gaussians that live in all frames of the group: most video packings have neither
+                           higher harmonics nor lifetimes
+statue-0, playbot, fruit   single frames of SH degree 0, 2 and 3
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def _lumberjack(data: Path, folder: Path) -> None:
 
 
 def _lasting(group: Group) -> Group:
-    """Those of the Gaussians of the only group that live in all of its frames."""
+    """The group without the Gaussians that do not live in all of its frames."""
     if group.lifetimes is None:
         return group
     lasts = (group.lifetimes == [0, len(group)]).all(1)

@@ -1,4 +1,4 @@
-"""The command line: the commands of commands/, and what becomes of their errors.
+"""The command line: the app of all commands, and the handling of their errors.
 
 An error that the user can mend ends as one sentence on stderr with exit code 1 (2 for a wrong call). Any other
 exception is a bug and shows its traceback.

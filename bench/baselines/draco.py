@@ -1,7 +1,7 @@
 """Draco's point cloud coder on each frame alone: positions quantized by Draco, the other attributes 8-bit integers.
 
-In Morton order with the order kept: for so many attributes Draco's sequential coder is smaller than its kd-tree, and
-much faster. Attributes have the ranges of the frame; the highest compression level.
+Points are in Morton order, which is kept: with this many attributes, Draco's sequential coder is smaller and much
+faster than its kd-tree coder. The range of an attribute is that of the frame; compression level 10, the highest.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ ATTRIBUTES = ("quats", "log_scales", "logit_opacities", "sh0", "shN")
 
 
 def encode(frames: Sequence[Gaussians], position: int, attribute: int) -> dict[str, bytes]:
-    """Codes frames with the given bits; returns their files."""
+    """Codes frames with `position` and `attribute` bits; returns their files."""
     draco, files = require("DracoPy", "the Draco baseline"), {}
     for t, frame in enumerate(frames):
         g, ranges, codes = frame.take(morton_order(frame.means)), [], {}

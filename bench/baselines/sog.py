@@ -1,4 +1,4 @@
-"""SOG version 2 for each frame, written by splat-transform with its defaults; there is nothing to choose."""
+"""SOG version 2 for each frame, written by splat-transform with its defaults: one setting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SPZ version 4 (Niantic) for each frame, written by splat-transform with its defaults; read here, by its description.
+"""SPZ version 4 (Niantic) per frame: written by splat-transform with its defaults, read here after its description.
 
 A header of 32 bytes, a table of (compressed, plain) sizes, and zstd streams of positions (24 bit fixed point), opacity,
 colour, log scales (8 bit each), rotations (xyzw, the smallest three as sign and 9 bits, the index of the largest on

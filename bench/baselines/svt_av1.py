@@ -1,7 +1,7 @@
-"""AV1 (SVT-AV1) on the maps of maps.py: the packing of MPEG's anchor with the encoder that is most used today.
+"""AV1 (SVT-AV1) on the maps of maps.py: the packing of MPEG's anchor with a current encoder.
 
-SVT-AV1 codes 4:2:0 only, so that each channel is a video of its own in the luma; chroma is flat. Preset 6 is what the
-project's guide gives for video on demand.
+SVT-AV1 codes 4:2:0 only, so that each channel is the luma of a video of its own; chroma is flat. Preset 6 is the one
+for video on demand in the project's guide.
 """
 
 from __future__ import annotations

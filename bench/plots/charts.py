@@ -1,4 +1,4 @@
-"""Charts from results: every .json in a folder that has charts becomes their .svg and .png. matplotlib draws."""
+"""Results -> charts: each .json of a folder that is named in CHARTS is drawn as .svg and .png by matplotlib."""
 
 from __future__ import annotations
 

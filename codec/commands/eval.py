@@ -38,9 +38,9 @@ def evaluate(
 
 
 def evaluate_stream(stream_path: Path, source: Path, *, split: str, frames: str | None, bar: Bar) -> dict:
-    """Measures a .gsv file against the capture or the splats it came from (keys: README, "Measures").
+    """Measures a .gsv file against the capture or the splats that were encoded (keys: README, "Measures").
 
-    `prefixes` has the figures of its first layers.
+    A stream with layers also has `prefixes`, the same measures of its first layer, its first two layers and so on.
     """
     from ..decode import open_stream
     from ..decode.report import describe

@@ -1,4 +1,4 @@
-"""`gscodec info`: what is in a file, as lines or JSON, and its attribute maps as images."""
+"""`gscodec info`: content of a file as lines or JSON, and its attribute maps as images."""
 
 from __future__ import annotations
 
