@@ -63,7 +63,7 @@ browser:
 		|| echo "note: no Chromium, the player's browser tests will be skipped"
 
 bench: venv
-	$(BIN)/python bench/run.py
+	$(BIN)/python -m bench.run
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info codec/*.so codec/native/target $(DEMO)

@@ -1,4 +1,6 @@
-"""Measurements: a benchmark writes JSON with machine, commit and settings, and charts are drawn from that JSON alone.
+"""Benchmarks: each writes a JSON with machine, commit and settings to results/; plots/ draws charts from these alone.
 
-`raster` and `rd` are behind `gscodec bench`; `run` measures the whole pipeline; results/ and charts/ are published.
+gscodec bench NAME       raster, rd, train, ablation, stress: tables with an entry per setting
+python -m bench.NAME     run (the whole pipeline), player, fuzz, layers, positions, rate_term, picture, animate_splat
+baselines/               other codecs on the same Gaussians
 """

@@ -1,31 +1,25 @@
-"""What each loss and tool of the training is worth: two captures, trained without one of them at a time.
+"""Ablation: two captures are trained without one loss or tool at a time.
 
-lumberjack is the bundled capture, a subject with masks; stage (of the data folder, at half its size) a full room while
-a ball drops into it. One entry of bench/results/ablation.json per capture and variant, all from the same seed and
-preset. `psnr` is of the model before coding, `psnr_coded` decoded from the stream, both on the test cameras, of the
-subject where there are masks. What has no setting of its own is taken out of the module that has it, by name, so that
-a variant whose tool is gone fails.
+lumberjack is the bundled capture, a subject with masks; stage (in the data folder, at half its size) is a full room
+into which a ball drops. bench/results/ablation.json has one entry per capture and variant, all from the same seed and
+preset. `psnr` is that of the model before coding, `psnr_coded` that of the decoded stream; both are measured on the
+test cameras, of the subject where there are masks. A variant is a change of the training settings, so that each entry
+can be repeated by any caller of the training.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from unittest.mock import patch
 
-import numpy as np
-
-from bench import train
-from bench.machine import ROOT, update_entries
 from gscodec.capture import Capture
 from gscodec.errors import UsageError
-from gscodec.train import change_detection as changes
-from gscodec.train import finetune
-from gscodec.train import tracking as motion
-from gscodec.train import train as recipe
+from gscodec.train.settings import TrainSettings, train_settings
+
+from . import train
+from .machine import ROOT, update_entries
 
 WHOLE = "whole recipe"
 LUMBERJACK, STAGE = "lumberjack", "stage"
@@ -34,56 +28,46 @@ FRAMES = {LUMBERJACK: (0, 10), STAGE: (7, 15)}  # the ball comes at 10
 
 @dataclass(frozen=True)
 class Variant:
-    """Changes to the settings, (object, name, value) of what has none, and the captures that use the tool."""
+    """One row of the ablation.
 
-    settings: dict = field(default_factory=dict)
-    patches: tuple[tuple[object, str, object], ...] = ()
+    Attributes:
+        change: settings of the whole recipe -> settings of the variant.
+        captures: the captures that use the tool that is left out.
+    """
+
+    change: Callable[[TrainSettings], TrainSettings]
     captures: tuple[str, ...] = (LUMBERJACK, STAGE)
 
 
-def without(rates: dict[str, float], *names: str) -> dict[str, float]:
-    """Learning rates of what is still learned."""
-    return {n: r for n, r in rates.items() if n not in names}
-
-
-NO_POINTS = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
 VARIANTS = {
-    WHOLE: Variant(),
-    "no D-SSIM": Variant({"ssim_lambda": 0.0}),
-    "no mask term": Variant({"mask_lambda": 0.0}, captures=(LUMBERJACK,)),
-    "no rigidity": Variant({"rigidity": 0.0}),
-    "no rate term": Variant({"rate_lambda": 0.0}),
-    "no fine-tuning": Variant({"finetune_steps": 0}),
-    "no cuts": Variant({"cut_ratio": math.inf}),
-    "cut ratio 1.5": Variant({"cut_ratio": 1.5}),
-    "cut ratio 3": Variant({"cut_ratio": 3.0}),
-    "colours held in tracking": Variant(patches=((motion, "RATES", without(motion.RATES, "sh0", "shN")),)),
-    "full-size pictures only": Variant(patches=((motion, "SMALL", 1.0),)),
-    "nothing held still": Variant(patches=((changes, "THRESHOLD", -1.0),)),
-    "no noise on canonical values": Variant(
-        patches=((finetune.GroupModel, "_relaxed", lambda group, generator: group.key.params),)
-    ),
-    "no births": Variant(patches=((motion.Tracker, "bear", lambda *_: None),), captures=(STAGE,)),
-    "no plane sweep": Variant(patches=((recipe, "sweep", lambda *_: NO_POINTS),), captures=(STAGE,)),
-    "no shell of far points": Variant(patches=((recipe, "shell", lambda *_: NO_POINTS),), captures=(STAGE,)),
-    "no node graph": Variant(  # every Gaussian for itself, at the rate of a node
-        patches=((motion, "MOVE_RATE", 0.0), (motion, "TURN_RATE", 0.0), (motion, "MEANS_RATE", motion.MOVE_RATE))
-    ),
+    WHOLE: Variant(lambda s: s),
+    "no D-SSIM": Variant(lambda s: replace(s, ssim_lambda=0.0)),
+    "no mask term": Variant(lambda s: replace(s, mask_lambda=0.0), captures=(LUMBERJACK,)),
+    "no rigidity": Variant(lambda s: replace(s, rigidity=0.0)),
+    "no rate term": Variant(lambda s: replace(s, rate_lambda=0.0)),
+    "no fine-tuning": Variant(lambda s: replace(s, finetune_steps=0)),
+    "no cuts": Variant(lambda s: replace(s, cut_ratio=math.inf)),
+    "cut ratio 1.5": Variant(lambda s: replace(s, cut_ratio=1.5)),
+    "cut ratio 3": Variant(lambda s: replace(s, cut_ratio=3.0)),
 }
 
 
-def measure(
-    capture: str, names: list[str] | None, preset: str, quality: float, data: Path | None, out: Path
+def run(
+    captures: Iterable[str], names: list[str] | None, preset: str, quality: float, data: Path | None, out: Path
 ) -> Iterator[dict]:
-    """Entries of the variants `names` (None: all that `capture` uses), which also go into the result file `out`.
+    """Yields the entries of each capture and puts them into the result file `out` as they come.
+
+    Args:
+        names: variants; None: all that use the capture.
 
     Raises:
-        UsageError: the capture is not in the data folder.
+        UsageError: a capture is not in the data folder.
     """
-    found = _open(capture, data)
-    chosen = names or [n for n, v in VARIANTS.items() if capture in v.captures]
-    entries = ({"capture": capture, **_entry(found, name, preset, quality)} for name in chosen)
-    return update_entries(out, entries, lambda e: [e["capture"], e["variant"], e["preset"]])
+    for capture in captures:
+        opened = _open(capture, data)
+        chosen = names or [n for n, v in VARIANTS.items() if capture in v.captures]
+        entries = ({"capture": capture, **_entry(opened, name, preset, quality)} for name in chosen)
+        yield from update_entries(out, entries, lambda e: [e["capture"], e["variant"], e["preset"]])
 
 
 def _open(capture: str, data: Path | None) -> Capture:
@@ -97,14 +81,8 @@ def _open(capture: str, data: Path | None) -> Capture:
 
 
 def _entry(capture: Capture, name: str, preset: str, quality: float) -> dict:
-    from gscodec.train.settings import train_settings
-
-    variant = VARIANTS[name]
-    settings = train_settings(preset, quality=quality, **variant.settings)
-    with ExitStack() as stack:
-        for where, attribute, value in variant.patches:
-            stack.enter_context(patch.object(where, attribute, value))
-        groups, seconds = train.sequence(capture, settings)
+    settings = VARIANTS[name].change(train_settings(preset, quality=quality))
+    groups, seconds = train.sequence(capture, settings)
     models = train.shown(groups)
     size, decoded, _ = train.coded(capture, groups, settings)
     model, stream = (train.evaluate(capture, frames) for frames in (models, decoded))

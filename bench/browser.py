@@ -20,7 +20,7 @@ def find_chromium() -> str | None:
 
 
 class Browsers:
-    """Chromiums that are ended together.
+    """Starts Chromiums and closes all of them at the end.
 
     Raises:
         playwright.sync_api.Error: Chromium cannot be started.
@@ -47,7 +47,7 @@ class Browser:
     """One page, 1280 x 800.
 
     Attributes:
-        errors: what the page threw or logged as an error.
+        errors: exceptions and logged errors of the page.
     """
 
     def __init__(self, chromium):
@@ -59,7 +59,7 @@ class Browser:
         self._devtools = self.page.context.new_cdp_session(self.page)
 
     def call(self, method: str, **params) -> dict:
-        """A command of the DevTools protocol, for the page."""
+        """Sends a command of the DevTools protocol for the page."""
         return self._devtools.send(method, params)
 
     def resize(self, width: int, height: int, *, mobile: bool = False, scale: float = 1) -> None:
@@ -69,12 +69,12 @@ class Browser:
         self.call("Emulation.setTouchEmulationEnabled", enabled=mobile)
 
     def goto(self, url: str) -> None:
-        """Opens a page; `errors` starts anew."""
+        """Opens a page and empties `errors`."""
         self.errors.clear()
         self.page.goto(url)
 
     def eval(self, script: str):
-        """Value of a JavaScript expression; promises are waited for.
+        """Value of a JavaScript expression, of a promise once it is resolved.
 
         Raises:
             playwright.sync_api.Error: it threw.
@@ -82,10 +82,10 @@ class Browser:
         return self.page.evaluate(script)
 
     def wait(self, script: str, seconds: float = PATIENCE):
-        """The value of an expression as soon as it is true.
+        """Waits until an expression is true; returns its value.
 
         Raises:
-            TimeoutError: it does not become true.
+            TimeoutError: it is not true after `seconds`.
         """
         try:
             return self.page.wait_for_function(script, timeout=1000 * seconds, polling=50).json_value()
@@ -105,18 +105,18 @@ class Browser:
         mouse.up(button=button)
 
     def fingers(self, *ways: list[tuple[float, float]]) -> None:
-        """Touches: one list of positions for each finger, all of the same length."""
+        """Touch: one list of positions per finger, all of the same length."""
         for i, places in enumerate(zip(*ways, strict=True)):
             points = [{"x": x, "y": y, "id": n} for n, (x, y) in enumerate(places)]
             self.call("Input.dispatchTouchEvent", type="touchMove" if i else "touchStart", touchPoints=points)
         self.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
     def wheel(self, x: float, y: float, delta: float) -> None:
-        """Turns the mouse wheel; negative: away from the hand, which zooms in."""
+        """Turns the mouse wheel at (x, y); a negative `delta` zooms in."""
         self.page.mouse.move(x, y)
         self.page.mouse.wheel(0, delta)
 
     def screenshot(self, box: dict | None = None) -> bytes:
-        """PNG of the window, or of the part `box` (x, y, width, height) of it; at the size that `resize` has set."""
+        """PNG of the window, or of its part `box` (x, y, width, height), at the size set by `resize`."""
         clip = {"clip": box | {"scale": 1}} if box else {}
         return base64.b64decode(self.call("Page.captureScreenshot", **clip)["data"])

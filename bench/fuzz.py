@@ -1,10 +1,9 @@
-"""Fuzzes the demuxer, the unit parser and the entropy decoders; counts executions in bench/results/fuzz.json.
+"""Fuzzes the demuxer, the unit parser and the entropy decoders; bench/results/fuzz.json counts the executions.
 
-usage: python bench/fuzz.py [--seconds 180]        for each target; needs a nightly toolchain and cargo-fuzz
+usage: python -m bench.fuzz [--seconds 180]        seconds per target; needs a nightly toolchain and cargo-fuzz
 
-Executions add up, for each state of the code that is fuzzed (the git tree of gsv/src). Each target runs in libFuzzer
-without a sanitizer, since the code has no unsafe block, and with limits on the time and memory of one input. A finding
-ends the run.
+Each target runs in libFuzzer without a sanitizer, since the code has no unsafe block, and with limits on the time and
+memory of one input. A finding ends the run. Counts add up over runs, per state of the code (git tree of gsv/src).
 """
 
 from __future__ import annotations
@@ -15,11 +14,11 @@ import re
 import subprocess
 import sys
 
-from bench.machine import RESULTS, ROOT, write_result
+from .machine import RESULTS, ROOT, write_result
 
 FUZZ = ROOT / "codec" / "native" / "fuzz"
 TARGETS = ("demux", "group", "units")
-SECONDS_OF_INPUT, MEGABYTES = 10, 512  # more is a finding
+SECONDS_OF_INPUT, MEGABYTES = 10, 512  # of one input; more is a finding
 
 
 def fuzz(target: str, seconds: int) -> int:
@@ -36,7 +35,7 @@ def fuzz(target: str, seconds: int) -> int:
 
 
 def main() -> None:
-    """Runs all targets and adds what they did to the results."""
+    """Runs all targets and adds their executions to the results."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--seconds", type=int, default=180, help="of each target")
     seconds = parser.parse_args().seconds

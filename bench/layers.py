@@ -1,20 +1,19 @@
-"""What layers cost, and what their prefixes are worth: one frame of the statue in 1 to 4 layers.
+"""Size and quality of layered coding: one frame of the statue in 1 to 4 layers.
 
-usage: GSCODEC_DATA=... python bench/layers.py        writes bench/results/layers.json
+usage: GSCODEC_DATA=... python -m bench.layers        writes bench/results/layers.json
 
-For each prefix also the best of a few corrections of scale and opacity (spec, "Layer correction").
+A row per prefix of the layers: bytes, codec PSNR, and the PSNR with the best of nine corrections of scale and opacity
+(spec, "Layer correction").
 """
 
 from __future__ import annotations
 
-import os
+import argparse
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 
-from bench.machine import RESULTS, write_result
 from gscodec import _native
 from gscodec.encode.intra_group import code_group
 from gscodec.metrics.codec_cameras import codec_cameras
@@ -24,13 +23,17 @@ from gscodec.model.gaussians import Gaussians
 from gscodec.render.image import render_image
 from gscodec.splats import read_splat
 
+from .data import data_folder
+from .machine import RESULTS, write_result
+
 SCALES, OPACITIES = (0.0, 0.15, 0.3), (0.0, 0.3, 0.7)
 LEVEL = 4
 
 
 def main() -> None:
     """Writes the results."""
-    original = read_splat(Path(os.environ["GSCODEC_DATA"]) / "splats" / "statue.ply")
+    argparse.ArgumentParser(description=__doc__.split("\n")[0]).parse_args()
+    original = read_splat(data_folder() / "splats" / "statue.ply")
     cameras = codec_cameras([original])[::2]
     images = [render_image(original, c) for c in cameras]
 

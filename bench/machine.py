@@ -1,4 +1,4 @@
-"""What a figure was measured on: the head of every file in bench/results."""
+"""Result files: each opens with the machine and the commit of the measurement."""
 
 from __future__ import annotations
 
@@ -44,8 +44,12 @@ def update_entries(
     key: Callable[[dict], object],
     whole: Callable[[list[dict]], dict] = lambda entries: {"entries": entries},
 ) -> Iterator[dict]:
-    """Yields `entries` and puts each into the list of that name in `path`, in place of an older one of the same key;
-    `whole` makes the file's content of the list."""
+    """Yields `entries` and puts each into the list "entries" of the JSON `path` as it comes.
+
+    Args:
+        key: of an entry; an older entry with the same key is replaced.
+        whole: list of entries -> content of the file.
+    """
     for entry in entries:
         old = json.loads(path.read_text())["entries"] if path.exists() else []
         write_result(path, whole([*(e for e in old if key(e) != key(entry)), entry]))

@@ -1,22 +1,25 @@
-"""Speed of the web player in headless Chromium without a GPU: its CPU path, frames a second, milliseconds, memory.
+"""Speed and memory of the web player's CPU path, in headless Chromium without a GPU.
 
-usage: python bench/player.py FOLDER [statue] [demo] ...
+usage: python -m bench.player FOLDER [statue] [demo] ...
 
-FOLDER keeps the streams; what is missing is encoded first, apart from the measuring: the bundled capture (demo), and of
-the folder that GSCODEC_DATA names the moving statue, 40 frames (statue: without what no view shows, statue_all: all
-101,275 Gaussians) and 300 frames (long, for the memory).
+Streams lie in FOLDER; a missing one is encoded first, which is not measured:
+  demo         the bundled capture
+  statue       the moving statue of the data folder (GSCODEC_DATA), 40 frames, without Gaussians that no view shows
+  statue_all   the same with all of its 101,275 Gaussians
+  long         the same as statue with 300 frames, for the memory
 
-Of each stream:
-  first_picture_ms   from the start of the navigation, page and stream from this machine, nothing cached
-  fps_clock          pictures a second when 60 are wanted, median of 3 times 2 s; the display allows no more
-  fps_free           pictures a second of all frames in order, asked for as fast as they come
-  project_ms, blend_ms   medians of a picture: evaluating and projecting it, the slower one of the raster workers
-  decode, evaluate   ms a frame: a group decoded, its frames evaluated; wasm in a page and native, on one core each
-  memory_mb          largest proportional set size of the page's process while the stream plays once
+Results of a stream:
+  first_picture_ms       from the start of the navigation; page and stream come from this machine, nothing is cached
+  fps_clock              frames per second where 60, the display's limit, are asked for; median of 3 x 2 s
+  fps_free               frames per second where all frames are asked for in order, without the display's clock
+  project_ms, blend_ms   medians per frame: evaluation and projection; the slower one of the raster workers
+  decode, evaluate       ms per frame to decode a group and to evaluate its frames, wasm and native, one core each
+  memory_mb              largest proportional set size of the page's process while the stream plays once
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import statistics
@@ -26,21 +29,22 @@ import threading
 import time
 from pathlib import Path
 
-from bench.browser import Browser, Browsers
-from bench.machine import RESULTS, ROOT, write_result
-from bench.run import animated, gscodec
 from gscodec.player.server import Server
+
+from .browser import Browser, Browsers
+from .machine import RESULTS, ROOT, write_result
+from .run import animated, gscodec
 
 SIZE = "512x512"
 LOADS = 5
 PLAYER = "document.querySelector('gsv-player')"
 STATUES = {"statue": (40, ()), "statue_all": (40, ("--keep-all",)), "long": (300, ())}
 
-# the time of the first picture, kept by every page
+# keeps the time of the first picture in the page
 KEEP = "addEventListener('picture', () => (window.firstPicture ??= performance.now()), true)"
 FIRST = "window.firstPicture"
 
-# every picture's times while all frames are drawn in order
+# draws `count` frames in order; times of each in ms
 FREE = """async ([count]) => {
     const player = document.querySelector("gsv-player");
     player.pause();
@@ -68,7 +72,7 @@ FREE = """async ([count]) => {
     return { seconds: (performance.now() - start) / 1000, ...times };
 }"""
 
-# one module alone: groups decoded and all of their frames evaluated
+# decodes groups and evaluates their frames in one wasm module; ms per frame of three runs
 DECODE = """async ([limit]) => {
     const { Native, load } = await import("/native.js");
     const native = await Native.create(await load(new URL("/native.wasm", location.href)));
@@ -116,7 +120,7 @@ print(json.dumps(runs))
 
 
 def streams(folder: Path, names: list[str]) -> dict[str, Path]:
-    """The streams that can be had; missing ones are encoded."""
+    """Name -> file of the streams `names`; a missing one is encoded, or left out where its data is missing."""
     data = Path(os.environ["GSCODEC_DATA"]) if "GSCODEC_DATA" in os.environ else None
     folder.mkdir(parents=True, exist_ok=True)
     found = {}
@@ -135,7 +139,7 @@ def streams(folder: Path, names: list[str]) -> dict[str, Path]:
 
 
 def first_pictures(browsers: Browsers, url: str) -> list[float]:
-    """Milliseconds to the first picture, each time in a browser that has seen nothing."""
+    """Milliseconds to the first picture, each in a new browser with an empty cache."""
     times = []
     for _ in range(LOADS):
         browser = browsers.start("--disable-gpu")
@@ -147,7 +151,7 @@ def first_pictures(browsers: Browsers, url: str) -> list[float]:
 
 
 def clocked(browser: Browser, url: str, seconds: int = 2) -> float:
-    """Pictures a second while 60 are wanted."""
+    """Frames per second where 60 are asked for."""
     browser.page.add_init_script(KEEP)
     browser.goto(f"{url}?size={SIZE}")
     browser.wait(FIRST)
@@ -159,7 +163,7 @@ def clocked(browser: Browser, url: str, seconds: int = 2) -> float:
 
 
 def renderer_memory(stop: threading.Event, found: list[float]) -> None:
-    """Adds the largest proportional set size of the page's process, MB, until `stop`."""
+    """Adds the proportional set size of each renderer process in MB to `found`, until `stop`."""
     while not stop.wait(0.1):
         for entry in Path("/proc").glob("[0-9]*"):
             try:
@@ -172,7 +176,7 @@ def renderer_memory(stop: threading.Event, found: list[float]) -> None:
 
 
 def memory(browser: Browser, url: str) -> float:
-    """MB while the whole stream plays once at twice its speed."""
+    """Largest MB of the page's process while the stream plays once at twice its speed."""
     stop, found = threading.Event(), []
     thread = threading.Thread(target=renderer_memory, args=(stop, found))
     thread.start()
@@ -184,7 +188,7 @@ def memory(browser: Browser, url: str) -> float:
 
 
 def decode_times(browser: Browser, url: str, path: Path, groups: int = 2) -> dict:
-    """Milliseconds a frame and their ratio, medians of three runs."""
+    """ms per frame in wasm and native and their ratio, medians of three runs."""
     browser.goto(url + "?src=none.gsv")
     wasm = browser.page.evaluate(DECODE, [groups])
     env = dict(os.environ, RAYON_NUM_THREADS="1")
@@ -222,9 +226,13 @@ def measure(browsers: Browsers, name: str, path: Path) -> dict:
 
 def main() -> None:
     """Measures the streams named on the command line, all by default."""
-    if len(sys.argv) < 2:
-        sys.exit(__doc__)
-    found = streams(Path(sys.argv[1]), sys.argv[2:] or ["demo", *STATUES])
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="where the streams are made and kept")
+    parser.add_argument("streams", nargs="*", metavar="STREAM", help=f"of demo, {', '.join(STATUES)}; all by default")
+    a = parser.parse_args()
+    if unknown := set(a.streams) - {"demo", *STATUES}:
+        sys.exit(f"error: no such stream: {', '.join(unknown)}, expected demo, {', '.join(STATUES)}")
+    found = streams(a.folder, a.streams or ["demo", *STATUES])
     results = {}
     with Browsers() as browsers:
         version = browsers.start().page.context.browser.version

@@ -1,27 +1,27 @@
-"""Positions beside Draco's kd-tree coder, bits per Gaussian at equal steps -> bench/results/positions.json.
+"""Bits per Gaussian of the positions, ours beside Draco's kd-tree coder at equal steps: bench/results/positions.json.
 
-usage: GSCODEC_DATA=... python bench/positions.py [NAME=SPLAT ...]   (other splats besides those of the data folder)
+usage: GSCODEC_DATA=... python -m bench.positions [NAME=SPLAT ...]   (splats besides those of the data folder)
 
-Both coders get the same integers, as a set: points of the grid that Draco quantizes to with so many bits. DracoPy 2,
-compression level 10, order free. Ours is the positions unit of a stream.
+Both coders get the same set of integers, the points of Draco's quantization grid. Draco: DracoPy 2, compression level
+10, order free. Ours: the positions unit of a stream.
 """
 
 from __future__ import annotations
 
-import os
-import sys
+import argparse
 from pathlib import Path
 
 import DracoPy
 import numpy as np
 
-from bench.machine import write_result
 from gscodec import _native
 from gscodec.splats import open_sequence
 
+from .data import data_folder
+from .machine import RESULTS, write_result
+
 BITS = (9, 10, 11, 12, 13, 14)
 SCENES = {"statue": "splats/statue.ply", "playbot": "splats/playbot.ply", "fruit": "splats/fruit.ply", "wave": "wave"}
-RESULT = Path(__file__).parent / "results" / "positions.json"
 
 
 def ours(positions: np.ndarray) -> int:
@@ -67,13 +67,16 @@ def compare(name: str, means: np.ndarray, bits: int) -> dict:
 
 def main() -> None:
     """Writes the table."""
-    data = Path(os.environ["GSCODEC_DATA"])
-    scenes = {n: data / p for n, p in SCENES.items()} | dict(a.split("=", 1) for a in sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("splats", nargs="*", metavar="NAME=SPLAT", help="splats besides those of the data folder")
+    named = parser.parse_args().splats
+    data = data_folder()
+    scenes = {n: data / p for n, p in SCENES.items()} | dict(a.split("=", 1) for a in named)
     rows = []
     for name, path in scenes.items():
         means = np.unique(open_sequence(Path(path)).frame(0).means, axis=0)
         rows += [compare(name, means, bits) for bits in BITS]
-    write_result(RESULT, {"rows": rows})
+    write_result(RESULTS / "positions.json", {"rows": rows})
     print(*rows, sep="\n")
 
 

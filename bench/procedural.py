@@ -1,7 +1,7 @@
-"""Small captures with exact ground truth: balls and boxes that move, traced ray by ray. Nothing here is a Gaussian.
+"""Small captures with exact ground truth: balls and boxes that move, traced ray by ray, without Gaussians.
 
-A `Scene` says what there is at a frame, in which light, and what is wrong with its cameras; `capture` makes it a
-Capture whose images are traced on demand. Metres, z upwards, the subject about 1.3 m tall around the origin.
+A `Scene` holds the shapes and the light of each frame and the errors of its cameras; `capture` makes it a Capture
+whose images are traced on demand. Metres, z upwards, the subject about 1.3 m tall around the origin.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gscodec.capture import Capture, View
 from gscodec.model.camera import Camera, look_at
 
 SAMPLES = 3  # rays along each side of a pixel
-FOCAL = 1.9  # widths
+FOCAL = 1.9  # image widths
 DISTANCE = 3.0
 HEIGHTS = (-0.3, 0.5, 1.3)  # of the rings of cameras
 AMBIENT = 0.45
@@ -24,13 +24,14 @@ AMBIENT = 0.45
 
 @dataclass(frozen=True)
 class Shape:
-    """A unit ball or a cube of side 2 under x -> A x + b, in a colour that a pattern of waves varies.
+    """A unit ball or a cube of side 2 under x -> A x + b; a pattern of waves varies its colour.
 
     Attributes:
-        ball: else a box.
-        A: [3, 3]; b: [3]: local to world.
+        ball: a ball, else a box.
+        A: [3, 3], with b local to world.
+        b: [3].
         color: [3] 0..1.
-        pattern: depth of the texture, 0 for none.
+        pattern: amplitude of the texture, 0 for none.
     """
 
     ball: bool
@@ -42,7 +43,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Light:
-    """Parallel light from `direction` (any length) and some from everywhere, both of `color`."""
+    """Parallel light from `direction` (any length) and ambient light, both of `color`."""
 
     direction: Sequence[float] = (0.5, -0.6, 0.8)
     color: Sequence[float] = (1.0, 1.0, 1.0)
@@ -53,10 +54,10 @@ class Scene:
     """One capture.
 
     Attributes:
-        shapes: what is there at a frame.
-        light: at a frame.
-        exposure: of the images of each training camera, a range (lowest, highest) of gains.
-        pose_noise: degrees and metres by which the calibration of each training camera is wrong.
+        shapes: frame -> shapes.
+        light: frame -> light.
+        exposure: lowest and highest gain of the images of a training camera.
+        pose_noise: error of the calibration of each training camera, degrees and metres.
         masks: the views have alpha.
     """
 
@@ -110,7 +111,7 @@ def _rig(train: int, test: int, size: int) -> list[Camera]:
 
 
 def _disturbed(camera: Camera, degrees: float, metres: float, rng: np.random.Generator) -> Camera:
-    """Its calibration with a wrong rotation and place, of these sizes, in random directions."""
+    """The camera with a wrong rotation and position, of these sizes, in random directions."""
     axis, shift = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
     wrong = np.eye(4)
     wrong[:3, :3] = rotation(axis, np.radians(degrees))
@@ -126,7 +127,7 @@ def rotation(axis: Sequence[float], angle: float) -> np.ndarray:
 
 
 def trace(shapes: Sequence[Shape], light: Light, camera: Camera) -> np.ndarray:
-    """[H, W, 4] f32, premultiplied, 0..1: what the camera sees, the mean of `SAMPLES`^2 rays a pixel."""
+    """[H, W, 4] f32, premultiplied, 0..1: the view of the camera, the mean of `SAMPLES`^2 rays per pixel."""
     w, h, R = camera.width, camera.height, camera.viewmat[:3, :3].astype(np.float32)
     x = ((np.arange(SAMPLES * w) + 0.5) / SAMPLES - camera.K[0, 2]) / camera.K[0, 0]
     y = ((np.arange(SAMPLES * h) + 0.5) / SAMPLES - camera.K[1, 2]) / camera.K[1, 1]
@@ -136,7 +137,7 @@ def trace(shapes: Sequence[Shape], light: Light, camera: Camera) -> np.ndarray:
     nearest = np.full(len(rays), np.inf, np.float32)
     out = np.zeros((len(rays), 4), np.float32)
     for shape in shapes:
-        index, depth, color = _seen(shape, light, camera.center, rays, squares)
+        index, depth, color = _intersect(shape, light, camera.center, rays, squares)
         closer = depth < nearest[index]
         index = index[closer]
         nearest[index] = depth[closer]
@@ -144,8 +145,8 @@ def trace(shapes: Sequence[Shape], light: Light, camera: Camera) -> np.ndarray:
     return out.reshape(h, SAMPLES, w, SAMPLES, 4).mean(3).mean(1)
 
 
-def _seen(shape: Shape, light: Light, eye: np.ndarray, rays: np.ndarray, squares: np.ndarray) -> tuple:
-    """Which rays ([P, 3], of squared lengths [P]) meet the shape: their indices [R], how far along, and the colours."""
+def _intersect(shape: Shape, light: Light, eye: np.ndarray, rays: np.ndarray, squares: np.ndarray) -> tuple:
+    """Index [R], depth [R] and colour [R, 3] of the rays ([P, 3], squared lengths [P]) that hit a shape."""
     into = np.linalg.inv(shape.A)
     radius = np.linalg.norm(shape.A, 2) * (1 if shape.ball else np.sqrt(3))
     to = shape.b - eye
@@ -166,7 +167,7 @@ def _seen(shape: Shape, light: Light, eye: np.ndarray, rays: np.ndarray, squares
 
 
 def _ball(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth (inf: missed) and normal where rays o + t d meet the unit ball."""
+    """Depth t (inf: no hit) and normal of the rays o + t d on the unit ball."""
     a, b, c = (d * d).sum(1), d @ o, o @ o - 1
     root = b * b - a * c
     depth = np.where(root >= 0, (-b - np.sqrt(root.clip(0))) / a, np.inf).astype(np.float32)
@@ -187,7 +188,7 @@ def _box(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pattern(x: np.ndarray, depth: float) -> np.ndarray:
-    """[R, 3] gains around 1, waves across the shape that differ by colour."""
+    """[R, 3] gains around 1: waves across the shape, other ones for each colour."""
     if not depth:
         return np.ones_like(x)
     waves = [np.sin(5 * x[:, 0] + 3 * x[:, 2] + c) * np.sin(6 * x[:, 1] - 4 * x[:, 2] + 2 * c) for c in range(3)]
@@ -195,10 +196,10 @@ def _pattern(x: np.ndarray, depth: float) -> np.ndarray:
 
 
 def placed(ball: bool, half: Sequence[float], at: Sequence[float], color: Sequence[float], **options) -> Shape:
-    """An upright shape of half sizes `half` around `at`."""
+    """An upright shape of half sizes `half`, centred at `at`."""
     return Shape(ball, np.diag(np.asarray(half, float)), np.asarray(at, float), color, **options)
 
 
 def moved(shapes: Sequence[Shape], turn: np.ndarray, shift: Sequence[float] = (0, 0, 0)) -> list[Shape]:
-    """All of them turned about the origin, then shifted."""
+    """The shapes, turned about the origin, then shifted."""
     return [replace(s, A=turn @ s.A, b=turn @ s.b + np.asarray(shift, float)) for s in shapes]

@@ -1,22 +1,26 @@
-"""Speed of the rasterizer: for each scene, size, instruction set and number of threads the milliseconds it takes.
+"""Speed of the rasterizer by scene, image size, instruction set and number of threads.
 
-Keys of an entry: scene, gaussians, width, height, covered (share of the pixels with alpha > 0.02), simd, threads,
-project_ms (projection, depth sort and binning), forward_ms (blending), backward_ms (tiles, then Gaussians), step_ms (a
-whole training step: these, the image loss and Adam), memory_bytes (all buffers of a forward pass). Times are medians
-of the runs, after two that warm up.
+Keys of an entry:
+  scene, gaussians, width, height, simd, threads
+  covered        share of the pixels with alpha > 0.02
+  project_ms     projection, depth sort and binning
+  forward_ms     blending
+  backward_ms    tiles, then Gaussians
+  step_ms        a whole training step: all passes, the image loss and Adam
+  memory_bytes   all buffers of a forward pass
+Times are medians of the runs after two warm-up runs.
 """
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from bench.scenes import DISTANCE, UP, capsule, capsule_camera, file_scene
 from gscodec.errors import UsageError
 from gscodec.model.camera import Camera
 from gscodec.model.gaussians import Gaussians
@@ -26,13 +30,16 @@ from gscodec.render.workspace import PARAMETERS, Workspace, simd_levels
 from gscodec.train.keyframe import RATES
 from gscodec.train.model import from_gaussians
 
-RATE = 1e-6  # of Adam: the scene must not change while it is measured
-BUDGET_S = 2.0  # an entry takes fewer repeats than asked for, at least 5, beyond that
+from .machine import write_result
+from .scenes import DISTANCE, UP, capsule, capsule_camera, file_scene
+
+RATE = 1e-6  # learning rate of Adam: the scene must not change during the measurement
+BUDGET_S = 2.0  # after these seconds an entry stops, with at least 5 repeats
 
 
 @dataclass(frozen=True)
 class Case:
-    """One picture; `every` level and number of threads is measured, or only the fastest with all cores."""
+    """One scene at one image size. `every`: all instruction sets and 1 thread too, else the fastest with all cores."""
 
     scene: str
     gaussians: int  # of a capsule
@@ -76,7 +83,7 @@ def measure(scene: str, gaussians: Gaussians, cam: Camera, simd: str, threads: i
     mask = covered.astype(np.uint8) * 255
     rates = {name: RATE for name in ("means", *RATES)}
     parts, steps = [], []
-    for adam in (False, True):  # the passes alone, as the peers' were measured, then whole steps
+    for adam in (False, True):  # the passes alone, then whole training steps
         begin, count = time.perf_counter(), 0
         while count < repeats + 2 and (count < 7 or time.perf_counter() - begin < BUDGET_S):
             start, count = time.perf_counter(), count + 1
@@ -105,23 +112,25 @@ def measure(scene: str, gaussians: Gaussians, cam: Camera, simd: str, threads: i
 
 
 def run(
-    scenes: tuple[str, ...] = SCENES,
+    scenes: Sequence[str] = SCENES,
     simd: list[str] | None = None,
     threads: list[int] | None = None,
     repeats: int = 15,
     data: Path | None = None,
     work: Path = Path("build/bench"),
+    out: Path | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Iterator[dict]:
-    """Yields the entries of all cases of `scenes`.
+    """Yields the entries of all cases of `scenes`, then writes them and the settings to `out`.
 
     Args:
         simd: levels of every case; None: all levels for the anchors, the fastest for the others.
         threads: numbers of threads of every case; None: 1 and all cores for the anchors, all cores for the others.
-        data: folder with splats and captures; what is not there is left out, which `say` is told.
-        work: where the trained lumberjack is kept, see `sequences`.
+        data: folder with splats and captures; a case whose files are missing is left out, and `say` gets a line.
+        work: where the trained lumberjack is kept (sequences.py).
+        out: the result file, or None.
     """
-    cores = os.cpu_count() or 1
+    entries = []
     for case in CASES:
         if case.scene not in scenes:
             continue
@@ -130,6 +139,17 @@ def run(
         except UsageError as e:
             say(f"{case.scene}: left out, {e}")
             continue
-        for level in simd or simd_levels()[: None if case.every else 1]:
-            for count in threads or ([1, cores] if case.every and cores > 1 else [cores]):
-                yield measure(case.scene, *loaded, level, count, repeats)
+        for level, count in _variants(case, simd, threads):
+            entries.append(measure(case.scene, *loaded, level, count, repeats))
+            yield entries[-1]
+    if out:
+        settings = {"scenes": list(scenes), "simd": simd or simd_levels(), "threads": threads, "repeats": repeats}
+        write_result(out, {"settings": settings, "entries": entries})
+
+
+def _variants(case: Case, simd: list[str] | None, threads: list[int] | None) -> Iterator[tuple[str, int]]:
+    """(instruction set, number of threads) of the entries of a case."""
+    cores = os.cpu_count() or 1
+    for level in simd or simd_levels()[: None if case.every else 1]:
+        for count in threads or ([1, cores] if case.every and cores > 1 else [cores]):
+            yield level, count

@@ -1,22 +1,20 @@
-"""Training's estimate of the bits of canonical attributes beside the coder's -> bench/results/rate_term.json.
+"""Bits of the canonical attributes: training's estimate beside the coder's, in bench/results/rate_term.json.
 
-usage: GSCODEC_DATA=... python bench/rate_term.py
+usage: GSCODEC_DATA=... python -m bench.rate_term
 
-The first frames of lumberjack are trained (preset fast) with rate terms of several weights. Each attribute is then
-estimated at the nominal steps of training, and coded as users would: with measured steps, rate-distortion optimised.
+The first frames of lumberjack are trained (preset fast) with several weights of the rate term. The estimate is at the
+nominal steps of training; the coder uses measured steps and rate-distortion optimisation, as `gscodec encode` does.
 Bits per Gaussian.
 """
 
 from __future__ import annotations
 
-import os
+import argparse
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from bench.machine import RESULTS, write_result
 from gscodec import _native
 from gscodec.bitstream.quantization import steps_for, subject_radius
 from gscodec.capture import open_capture
@@ -26,12 +24,15 @@ from gscodec.train.model import from_gaussians
 from gscodec.train.settings import train_settings
 from gscodec.train.train import train_groups
 
+from .data import data_folder
+from .machine import RESULTS, write_result
+
 FRAMES, QUALITY = 4, 62.0
 WEIGHTS = (0.0, 0.02, 0.08, 0.32)
 
 
 def rows(capture, weight: float) -> list[dict]:
-    """One row per attribute, of a group that was trained with this weight of the rate term."""
+    """A row per attribute of a group trained with this weight of the rate term."""
     settings = train_settings("fast", gop=FRAMES, rate_lambda=weight, quality=QUALITY)
     group = next(train_groups(capture, settings))
     model = from_gaussians(group.frames[0])
@@ -53,7 +54,7 @@ def rows(capture, weight: float) -> list[dict]:
 
 
 def correlations(table: list[dict]) -> dict[str, float]:
-    """Of estimated and coded bits: of each attribute over the weights, and of all together."""
+    """Correlation of estimated and coded bits: per attribute over the weights, and over all rows."""
     chosen = {
         name: [r for r in table if r["attribute"] == name] for name in dict.fromkeys(r["attribute"] for r in table)
     }
@@ -65,7 +66,8 @@ def correlations(table: list[dict]) -> dict[str, float]:
 
 def main() -> None:
     """Writes the table."""
-    capture = replace(open_capture(Path(os.environ["GSCODEC_DATA"]) / "lumberjack"), frame_count=FRAMES)
+    argparse.ArgumentParser(description=__doc__.split("\n")[0]).parse_args()
+    capture = replace(open_capture(data_folder() / "lumberjack"), frame_count=FRAMES)
     table = [row for weight in WEIGHTS for row in rows(capture, weight)]
     correlation = correlations(table)
     write_result(

@@ -1,8 +1,9 @@
-"""Size, quality and time of gscodec and its peers on the same sequences: bench/results/rd.json, entry by entry.
+"""Size, quality and time of gscodec and its peers on the same sequences: an entry of bench/results/rd.json per setting.
 
-The size is all that decoding needs, side information and container included; the quality is the codec PSNR of
-`gscodec eval` on every fifth frame. Times are of frames in memory: encoding without training (one run), decoding to
-float attributes (median of 3). The order of Gaussians that a peer makes once for its whole curve is not timed.
+size      all that decoding needs, side information and container included
+quality   codec PSNR of `gscodec eval` on every fifth frame
+time      frames in memory; encoding without training (one run), decoding to float attributes (median of 3)
+A peer that orders its Gaussians once for the whole curve does so untimed.
 """
 
 from __future__ import annotations
@@ -10,32 +11,69 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from bench.baselines import BASELINES, Baseline
-from bench.machine import commit, update_entries
-from bench.sequences import SINGLE, open_case
 from gscodec.decode import open_stream
 from gscodec.encode.encode import REFINE, EncodeSettings, encode_groups, stream_config
 from gscodec.errors import UsageError
 from gscodec.metrics import bd_rate, evaluate_splats, rising
 from gscodec.metrics.bd_rate import shared_psnr
-from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.model.gaussian_sequence import GaussianSequence, DenseGroup
 from gscodec.model.gaussians import Gaussians
+
+from .baselines import BASELINES, Baseline
+from .machine import commit, update_entries
+from .sequences import SINGLE, open_case
 
 OURS = "gscodec"
 QUALITIES = (20, 30, 40, 50, 60, 70, 80, 90, 100)
 CODECS = (OURS, *BASELINES)
 DECODE_RUNS = 3
-EVERY = 5  # frames between those whose PSNR is measured
-ANCHORS = {"videogs": (39, 45), "videogs-raw": (39, 45), "x265": (39, 52)}  # and the PSNR over which BD-rate is taken
+EVERY = 5  # PSNR is measured on every 5th frame
+ANCHORS = {"videogs": (39, 45), "videogs-raw": (39, 45), "x265": (39, 52)}  # anchor -> range of PSNR of the BD-rate
 ONE_POINT = ("sog", "spz")
-VIDEO = ("videogs", "videogs-raw", "x265", "svt-av1", "gsav")  # these pack SH degree 0 and want more than one frame
+VIDEO = ("videogs", "videogs-raw", "x265", "svt-av1", "gsav")  # SH degree 0 and more than one frame
 
-Coded = tuple[int, int, float, float, Callable[[int], Gaussians]]
+
+@dataclass(frozen=True)
+class Coded:
+    """A sequence, or the measured frames of it, through a codec.
+
+    Attributes:
+        size: bytes.
+        frames: number of frames coded.
+        encode_s, decode_s: seconds for all of them.
+        decoded: frame -> Gaussians.
+    """
+
+    size: int
+    frames: int
+    encode_s: float
+    decode_s: float
+    decoded: Callable[[int], Gaussians]
+
+
+def run(
+    sequences: Iterable[str],
+    codecs: Iterable[str],
+    data: Path,
+    work: Path,
+    out: Path,
+    say: Callable[[str], None] = lambda text: None,
+) -> Iterator[dict]:
+    """Yields the entries of each codec on each sequence and puts them into the result file `out` as they come.
+
+    A curve whose data or tool is missing is left out, and `say` gets a line.
+    """
+    for sequence in sequences:
+        for codec in codecs:
+            try:
+                yield from update(out, measure(sequence, codec, data, work))
+            except UsageError as e:
+                say(f"{sequence}, {codec}: left out, {e}")
 
 
 def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[dict]:
@@ -53,25 +91,25 @@ def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[
     alone = {"refine": REFINE} if sequence_name in SINGLE and codec == OURS else {}
     for name, setting in settings.items():
         if codec == OURS:
-            size, frames, encode_s, decode_s, decoded = _ours(sequence, groups, setting | alone)
+            coded = _ours(sequence, groups, setting | alone)
         else:
-            size, frames, encode_s, decode_s, decoded = _peer(BASELINES[codec], groups, picked, setting)
-        quality = evaluate_splats(decoded, sequence, picked)["codec_psnr"]
+            coded = _peer(BASELINES[codec], groups, picked, setting)
+        quality = evaluate_splats(coded.decoded, sequence, picked)["codec_psnr"]
         yield {
             "sequence": sequence_name,
             "codec": codec,
             "setting": name,
-            "kb_per_frame": round(size / 1000 / frames, 3),
+            "kb_per_frame": round(coded.size / 1000 / coded.frames, 3),
             "codec_psnr": round(quality, 3),
-            "encode_s_per_frame": round(encode_s / frames, 4),
-            "decode_ms_per_frame": round(1000 * decode_s / frames, 2),
+            "encode_s_per_frame": round(coded.encode_s / coded.frames, 4),
+            "decode_ms_per_frame": round(1000 * coded.decode_s / coded.frames, 2),
             "gaussians": len(sequence.frame(0)),
             "commit": commit(),
         }
 
 
 def _ours(sequence: GaussianSequence, groups: list[DenseGroup], setting: dict) -> Coded:
-    """(bytes, frames, seconds of encoding, of decoding, frame -> Gaussians)."""
+    """The sequence through gscodec."""
     first, longest = groups[0].frames[0], max(map(len, groups))
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder, "rd.gsv")
@@ -83,7 +121,7 @@ def _ours(sequence: GaussianSequence, groups: list[DenseGroup], setting: dict) -
         report = encode_groups(inputs, out, config, EncodeSettings(**setting), fingerprint={})
         encode_s = time.perf_counter() - start
         decoded, decode_s = _timed_decoding(lambda: _frames(out))
-    return report.bytes, len(decoded), encode_s, decode_s, decoded.__getitem__
+    return Coded(report.bytes, len(decoded), encode_s, decode_s, decoded.__getitem__)
 
 
 def _frames(path: Path) -> list[Gaussians]:
@@ -101,7 +139,7 @@ def _timed_decoding(decode: Callable[[], list[Gaussians]]) -> tuple[list[Gaussia
 
 
 def _peer(baseline: Baseline, groups: list[DenseGroup], picked: list[int], setting: dict) -> Coded:
-    """The same of a peer; frames that are coded alone are those of `picked`."""
+    """The sequence through a peer; one that codes frames alone gets only the frames `picked`."""
     shown = [[group.visible(t) for t in range(len(group))] for group in groups]
     numbers = range(sum(map(len, shown)))
     if baseline.per_frame:
@@ -114,13 +152,13 @@ def _peer(baseline: Baseline, groups: list[DenseGroup], picked: list[int], setti
     encode_s = time.perf_counter() - start
     decoded, decode_s = _timed_decoding(lambda: [frame for files in coded for frame in baseline.decode(files)])
     size = sum(len(data) for files in coded for data in files.values())
-    return size, len(decoded), encode_s, decode_s, dict(zip(numbers, decoded, strict=True)).__getitem__
+    return Coded(size, len(decoded), encode_s, decode_s, dict(zip(numbers, decoded, strict=True)).__getitem__)
 
 
 def update(path: Path, entries: Iterable[dict]) -> Iterator[dict]:
-    """Puts entries into a result file as they come, each in the place of an older one of the same setting.
+    """Yields entries and puts each into a result file, in place of an older one of the same setting.
 
-    Yields the entries; BD-rates and shares are those of the whole file.
+    BD-rates and shares are computed again over the whole file.
     """
     return update_entries(path, entries, lambda e: (e["sequence"], e["codec"], e["setting"]), _whole)
 
@@ -137,7 +175,7 @@ def _place(e: dict) -> tuple:
 
 
 def bd_rates(entries: Sequence[dict]) -> list[dict]:
-    """gscodec against each anchor on each sequence, over the PSNR that both reach; those that cannot be had are out."""
+    """BD-rates of gscodec against each anchor on each sequence, where the curves share a range of PSNR."""
     found = []
     for name in dict.fromkeys(e["sequence"] for e in entries):
         curves = {c: rising(_points(entries, name, c)) for c in (OURS, *ANCHORS)}
@@ -152,9 +190,10 @@ def bd_rates(entries: Sequence[dict]) -> list[dict]:
 
 
 def shares(entries: Sequence[dict]) -> list[dict]:
-    """gscodec's size of single frames at the PSNR of the peers that have one point, log size linear in PSNR between.
+    """Size of a single frame of gscodec at the PSNR of the peers that have one setting.
 
-    `kb` is None where the curve does not reach that PSNR.
+    The size is interpolated: log size is linear in PSNR between two points. `kb` is None where the curve of gscodec
+    does not reach the PSNR.
     """
     found = []
     for name in SINGLE:

@@ -1,14 +1,14 @@
-"""Benchmarks of the whole pipeline, through the command line as users run it; results as JSON in bench/results.
+"""Benchmarks of the whole pipeline through the command line: a JSON in bench/results per case.
 
-usage: python bench/run.py [statue] [statue40] [lumberjack] [demo]
+usage: python -m bench.run [statue] [statue40] [lumberjack] [demo]
 
-All but `demo` need the data folder that the environment variable GSCODEC_DATA names (lumberjack/ and splats/statue.ply
-in it, tools/animate_splat.py beside it); without it they are left out with a word. `demo` also draws
-bench/charts/demo.png.
+All cases but `demo` need the data folder that the environment variable GSCODEC_DATA names, with lumberjack/ and
+splats/statue.ply; without it they are left out, and a line says so. `demo` also draws bench/charts/demo.png.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import subprocess
@@ -19,12 +19,16 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.machine import RESULTS, ROOT, write_result
 from gscodec.capture import View, composite, cropped, open_capture
 from gscodec.decode import open_stream
+from gscodec.errors import UsageError
 from gscodec.metrics.evaluate import BACKGROUND
 from gscodec.render.image import render_image
 from gscodec.render.png import write_png
+
+from .animate_splat import animate_splat
+from .data import existing
+from .machine import RESULTS, ROOT, write_result
 
 GSCODEC = [sys.executable, "-c", "from gscodec.cli import main; main()"]
 
@@ -59,25 +63,24 @@ def statue(data: Path, folder: Path) -> dict:
 
 
 def statue40(data: Path, folder: Path) -> dict:
-    """Twice as long: the second group is predicted from the first."""
+    """40 frames of it: the second group is predicted from the first."""
     return measure("statue40", animated(data, folder, 40), folder, "--quality", "52")
 
 
 def animated(data: Path, folder: Path, frames: int) -> Path:
-    """The moving statue as .ply files."""
-    tool, plys = data.parent / "tools" / "animate_splat.py", folder / f"statue{frames}"
-    command = [sys.executable, tool, data / "splats" / "statue.ply", plys, "--frames", str(frames)]
-    subprocess.run(command, check=True, stdout=sys.stderr)
+    """The moving statue as a folder of .ply files."""
+    plys = folder / f"statue{frames}"
+    animate_splat(existing(data / "splats" / "statue.ply"), plys, frames)
     return plys
 
 
 def lumberjack(data: Path, folder: Path) -> dict:
     """The capture: 30 frames, 512 x 512, 20 training cameras."""
-    return measure("lumberjack", data / "lumberjack", folder)
+    return measure("lumberjack", existing(data / "lumberjack"), folder)
 
 
 def demo(_: Path | None, folder: Path) -> dict:
-    """The bundled example of `make demo`, and the picture of it."""
+    """The bundled example of `make demo`; also draws its picture."""
     source = ROOT / "examples" / "lumberjack"
     result = measure("demo", source, folder)
     write_png(ROOT / "bench" / "charts" / "demo.png", beside(folder / "demo.gsv", source, (0, 10, 19)))
@@ -85,7 +88,7 @@ def demo(_: Path | None, folder: Path) -> dict:
 
 
 def beside(stream: Path, source: Path, frames: tuple[int, ...]) -> np.ndarray:
-    """[H, W, 3] u8: the first test view of the capture and the same of the stream, frame beside frame."""
+    """[H, W, 3] u8: for each of `frames`, side by side, the first test view of the capture and of the stream."""
     capture, decoded = open_capture(source), open_stream(stream)
     test, pictures = capture.indices("test")[0], []
     views = [capture.view(test, t) for t in frames]
@@ -101,7 +104,9 @@ CASES = {"demo": demo, "statue": statue, "statue40": statue40, "lumberjack": lum
 
 def main() -> None:
     """Runs the cases named on the command line, all by default."""
-    named = sys.argv[1:] or list(CASES)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"one of {', '.join(CASES)}; all by default")
+    named = parser.parse_args().cases or list(CASES)
     unknown = set(named) - set(CASES)
     if unknown:
         sys.exit(f"error: no such benchmark: {', '.join(unknown)}, expected {', '.join(CASES)}")
@@ -110,8 +115,12 @@ def main() -> None:
         if name != "demo" and not data:
             print(f"{name}: left out, GSCODEC_DATA is not set", file=sys.stderr)
             continue
-        with tempfile.TemporaryDirectory() as folder:
-            result = CASES[name](Path(data) if data else None, Path(folder))
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                result = CASES[name](Path(data) if data else None, Path(folder))
+        except UsageError as e:
+            print(f"{name}: left out, {e}", file=sys.stderr)
+            continue
         write_result(RESULTS / f"{name}.json", result)
         print(json.dumps(result, indent=1))
 

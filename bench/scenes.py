@@ -1,4 +1,4 @@
-"""Scenes of the rasterizer's benchmark: a capsule of any number of Gaussians, and splats from files."""
+"""Scenes of the rasterizer's benchmark: a capsule with any number of Gaussians, and splats from files."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.errors import UsageError
 from gscodec.model.camera import Camera, look_at
 from gscodec.model.gaussians import Gaussians
 from gscodec.render.movie import orbit_camera
+
+from .data import existing
 
 RADIUS, HEIGHT = 0.25, 1.8  # metres
 DISTANCE, FOCAL = 2.8, 1.4  # metres; image widths
@@ -18,7 +19,7 @@ UP = {"statue": "-y", "playbot": "-y", "lumberjack": "z"}  # scene from files ->
 
 
 def capsule(n: int, seed: int = 0) -> Gaussians:
-    """N Gaussians evenly on a person-sized capsule, in random order.
+    """N Gaussians, uniform on the surface of a person-sized capsule, in random order.
 
     Splats of 0.6 x the mean spacing x U(0.5, 1.5) per axis, opacity U(0.15, 0.95).
     """
@@ -47,19 +48,17 @@ def capsule_camera(width: int, height: int, distance: float = DISTANCE) -> Camer
 
 
 def file_scene(name: str, data: Path, work: Path, width: int, height: int) -> tuple[Gaussians, Camera]:
-    """The Gaussians of a file in `data` (lumberjack: of the one trained in `work`) and a camera that sees them all.
+    """The Gaussians of a file in `data`, or of the lumberjack trained in `work`, and a camera with all in view.
 
     Raises:
         UsageError: the files are missing.
     """
-    from bench.sequences import open_case
     from gscodec.splats import open_sequence
+
+    from .sequences import open_case
 
     if name == "lumberjack":
         gaussians = open_case(name, data, work).frame(0)
     else:
-        path = Path(data) / "splats" / f"{name}.ply"
-        if not path.exists():
-            raise UsageError(f"{path} is not there; the data folder (GSCODEC_DATA) must have it")
-        gaussians = open_sequence(path).frame(0)
+        gaussians = open_sequence(existing(Path(data) / "splats" / f"{name}.ply")).frame(0)
     return gaussians, orbit_camera(gaussians, UP[name], 0.25, width, height)

@@ -1,22 +1,24 @@
-"""The sequences and frames that codecs are measured on; made once and kept in a work folder, until it is deleted.
+"""The sequences and frames on which codecs are measured; made once and kept in a work folder.
 
-statue: a scanned statue that moves (20 frames, 101,275 Gaussians), by the data folder's tools/animate_splat.py.
-lumberjack: the captured character (30 frames), trained as `gscodec encode` does it, but without harmonics, which most
-video packings do not have, nor can they have Gaussians that do not live in all frames of a group: these few are left
-out. statue-0, playbot and fruit are single frames of SH degree 0, 2 and 3.
+statue                     a scanned statue in motion (animate_splat.py), 20 frames, 101,275 Gaussians
+lumberjack                 the captured character, 30 frames, trained as by `gscodec encode`, at SH degree 0 and only
+                           with the Gaussians that live in all frames of the group: most video packings have neither
+                           higher harmonics nor lifetimes
+statue-0, playbot, fruit   single frames of SH degree 0, 2 and 3
 """
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from gscodec.errors import UsageError
-from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.model.gaussian_sequence import GaussianSequence, DenseGroup
 from gscodec.splats import open_sequence
+
+from .animate_splat import animate_splat
+from .data import existing
 
 FRAMES = 20
 SINGLE = {"statue-0": "statue.ply", "playbot": "playbot.ply", "fruit": "fruit.ply"}
@@ -30,7 +32,7 @@ def open_case(name: str, data: Path, work: Path) -> GaussianSequence:
         UsageError: the name is unknown or its files are missing.
     """
     if name in SINGLE:
-        return open_sequence(_there(data / "splats" / SINGLE[name]))
+        return open_sequence(existing(data / "splats" / SINGLE[name]))
     makers: dict[str, Callable[[Path, Path], None]] = {"statue": _statue, "lumberjack": _lumberjack}
     if name not in makers:
         raise UsageError(f"no sequence {name}, expected one of {', '.join(SEQUENCES)}")
@@ -41,17 +43,8 @@ def open_case(name: str, data: Path, work: Path) -> GaussianSequence:
     return open_sequence(folder)
 
 
-def _there(path: Path) -> Path:
-    if not path.exists():
-        raise UsageError(f"{path} is not there; the data folder (GSCODEC_DATA) must have it")
-    return path
-
-
 def _statue(data: Path, folder: Path) -> None:
-    tool = _there(data.parent / "tools" / "animate_splat.py")
-    source = _there(data / "splats" / "statue.ply")
-    command = [sys.executable, tool, source, folder, "--frames", str(FRAMES)]
-    subprocess.run(command, check=True, stdout=sys.stderr)
+    animate_splat(existing(data / "splats" / "statue.ply"), folder, FRAMES)
 
 
 def _lumberjack(data: Path, folder: Path) -> None:
@@ -60,14 +53,14 @@ def _lumberjack(data: Path, folder: Path) -> None:
     from gscodec.train.settings import train_settings
     from gscodec.train.train import train_groups
 
-    capture = open_capture(_there(data / "lumberjack"))
+    capture = open_capture(existing(data / "lumberjack"))
     writer = SequenceWriter(folder, capture.fps, capture.cameras)
     for group in train_groups(capture, train_settings("medium", sh_degree=0)):
         writer.add(_lasting(group))
 
 
 def _lasting(group: DenseGroup) -> DenseGroup:
-    """Those of the Gaussians of the only group that live in all of its frames."""
+    """The group without the Gaussians that do not live in all of its frames."""
     if group.lifetimes is None:
         return group
     lasts = (group.lifetimes == [0, len(group)]).all(1)

@@ -1,10 +1,11 @@
-"""Training where 4D methods fail: each case of stress_scenes.py, trained as a sequence and every frame alone.
+"""Stress test of training: each case of stress_scenes.py, trained as a sequence and with every frame alone.
 
-One entry of bench/results/stress.json per case; both have the preset's keyframe budget, and both are coded at the same
-quality. PSNR is of the subject on the test cameras, over the frames that have one. `lost` is by how much the sequence
-is worse than the frames alone, before coding; `verdict` holds it against `ALLOWED_DB`. A crash, a value that is not
-finite and more Gaussians than asked for are failures everywhere, and so is more than `STATIC_SHARE` of the bytes of the
-frames alone where nothing moves.
+bench/results/stress.json has one entry per case. Both trainings have the keyframe budget of the preset, and both are
+coded at the same quality. PSNR is that of the subject on the test cameras, over the frames that show it. `lost` is the
+PSNR of the frames alone minus that of the sequence, before coding. `verdict` is "fails" on
+  - a crash, a value that is not finite, or more Gaussians than the budget allows,
+  - `lost` above `ALLOWED_DB`,
+  - more than `STATIC_SHARE` of the bytes of the frames alone in the case without motion.
 """
 
 from __future__ import annotations
@@ -15,16 +16,17 @@ from pathlib import Path
 
 import numpy as np
 
-from bench import train
-from bench.machine import update_entries
-from bench.procedural import Scene
-from bench.stress_scenes import SCENES
 from gscodec.model.gaussian_sequence import DenseGroup
 from gscodec.model.gaussians import Gaussians
 
+from . import train
+from .machine import update_entries
+from .procedural import Scene
+from .stress_scenes import SCENES
+
 PRESET = "fast"
 BUDGET = {"gaussians_max": 3750, "initial_points": 2000}  # for pictures of 128 x 128
-BUDGETS = {  # of single cases
+BUDGETS = {  # case -> changes of the budget
     "200 frames": {
         "keyframe_steps": 250,
         "motion_steps": 20,
@@ -33,7 +35,7 @@ BUDGETS = {  # of single cases
         "initial_points": 700,
     }
 }
-ALONE_MOST = 12  # frames trained alone
+ALONE_MOST = 12  # frames of a case that are trained alone
 ALLOWED_DB = 1.0
 STATIC_SHARE = 0.2
 
@@ -47,7 +49,7 @@ def _entry(name: str, scene: Scene) -> dict:
     head = {"case": name, "frames": scene.frames, "train_cameras": scene.train, "size": scene.size}
     try:
         found = compare(name, scene, **BUDGETS.get(name, {}))
-    except Exception as e:  # that is what is looked for here
+    except Exception as e:  # a crash is a result
         at = traceback.extract_tb(e.__traceback__)[-1]
         return head | {"verdict": f"fails: {type(e).__name__} in {Path(at.filename).name}:{at.lineno}: {e}"}
     return head | found | {"verdict": _verdict(name, found)}
@@ -67,12 +69,12 @@ def _verdict(name: str, found: dict) -> str:
 
 
 def compare(name: str, scene: Scene, **budget) -> dict:
-    """Figures of one case; `budget` are changes to the training settings."""
+    """Results of one case; `budget`: changes of the training settings."""
     from gscodec.train.settings import train_settings
 
     settings = train_settings(PRESET, **(BUDGET | budget))
     capture = scene.capture(name)
-    for camera in range(len(capture.cameras)):  # drawing the truth is not training
+    for camera in range(len(capture.cameras)):  # traced and cached here, so that training is timed without it
         for t in range(capture.frame_count):
             capture.view(camera, t)
     groups, seconds = train.sequence(capture, settings)

@@ -1,17 +1,17 @@
-"""The stress cases: procedural captures of what breaks 4D methods, each one thing at a time on the same subject."""
+"""Stress cases: procedural captures, each with one condition under which 4D methods fail, of the same subject."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from bench.procedural import Light, Scene, Shape, moved, placed, rotation
+from .procedural import Light, Scene, Shape, moved, placed, rotation
 
 UP = (0, 0, 1)
 SKIN, SHIRT, BELT = (0.8, 0.55, 0.4), (0.25, 0.4, 0.75), (0.8, 0.7, 0.2)
 
 
 def figure(swing: float = 0.0, pattern: float = 0.6) -> list[Shape]:
-    """A torso, a head and two arms that are `swing` radians forward and back."""
+    """A torso with a belt, a head, and two arms that swing by +-`swing` radians."""
     shapes = [
         placed(True, (0.27, 0.19, 0.42), (0, 0, 0), SHIRT, pattern=pattern),
         placed(False, (0.12, 0.12, 0.13), (0, 0, 0.52), SKIN, pattern=pattern),
@@ -24,36 +24,36 @@ def figure(swing: float = 0.0, pattern: float = 0.6) -> list[Shape]:
 
 
 def turned(shapes: list[Shape], angle: float, shift=(0, 0, 0)) -> list[Shape]:
-    """About the vertical axis, radians."""
+    """The shapes, turned about the vertical axis by `angle` radians, then shifted."""
     return moved(shapes, rotation(UP, angle), shift)
 
 
 def walking(t: int, speed: float = 1.0) -> list[Shape]:
-    """The figure turns 4 degrees a frame, drifts 1.5 cm, its arms swing."""
+    """The figure turns by 4 degrees and drifts by 1.5 cm per frame, and its arms swing."""
     shift = (0.015 * speed * t - 0.09 * speed, 0.01 * np.sin(0.8 * t), 0)
     return turned(figure(0.5 * np.sin(0.5 * speed * t)), 0.07 * speed * t, shift)
 
 
 def racing(t: int) -> list[Shape]:
-    """35 degrees and up to 30 cm a frame."""
+    """The figure turns by 35 degrees and moves by up to 30 cm per frame."""
     place = (0.4 * np.cos(0.7 * t), 0.4 * np.sin(0.7 * t), 0.15 * np.sin(1.9 * t))
     return turned(figure(1.2 * np.sin(1.4 * t)), 0.61 * t, place)
 
 
 def visited(t: int) -> list[Shape]:
-    """A crate is there from frame 4 to 7, beside the figure and out of nowhere."""
+    """From frame 4 to 7 a crate stands beside the figure."""
     crate = placed(False, (0.18, 0.18, 0.18), (-0.55, 0.35, -0.2), (0.75, 0.3, 0.25))
     return walking(t) + ([crate] if 4 <= t < 8 else [])
 
 
 def dimmed(t: int) -> Light:
-    """From white to a third of it and red, while it swings round."""
+    """The light fades from white to a dim red and changes its direction."""
     s = t / 11
     return Light((0.5 - 1.2 * s, -0.6 + s, 0.8), (1 - 0.55 * s, 1 - 0.75 * s, 1 - 0.8 * s))
 
 
 def rods(t: int) -> list[Shape]:
-    """A lattice of rods 1.6 cm across, about a pixel, that turns."""
+    """A lattice of rods turns; they are 1.6 cm thick, about a pixel."""
     shapes = [placed(True, (0.07, 0.07, 0.07), (0, 0, 0), BELT)]
     for i in range(6):
         angle = np.pi * i / 6
@@ -63,7 +63,7 @@ def rods(t: int) -> list[Shape]:
 
 
 def sometimes(t: int) -> list[Shape]:
-    """Nothing in the first two frames and in frames 6 to 8."""
+    """The figure, absent in the first two frames and in frames 6 to 8."""
     return [] if t < 2 or 6 <= t < 9 else walking(t)
 
 

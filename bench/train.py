@@ -1,46 +1,50 @@
-"""Quality against time and size of training: our presets, and every frame trained alone.
+"""Quality against time and size of training: our presets, every frame trained alone, and V3's recipe.
 
-One entry of bench/results/train.json per (case, recipe, preset): case, recipe, preset, seconds_per_frame, psnr,
-psnr_fg, ssim, gaussians, kb_per_frame, flicker, all on the test cameras; psnr_of_frame and flicker_of_frame (of the
-window that ends there) are for runs over other frames. What gscodec trains is measured twice: before coding ("model",
-no size) and decoded from the stream ("gscodec", with `still_gaussians` and `still_bits`: still.py).
-"alone" trains a keyframe for every frame it is asked for, with the keyframe budget of the preset: what tracking is to
-be compared with; "alone-coded" is the same from our stream, every frame a group. "v3" is V3's recipe at about the time
-that our preset medium takes (baselines/v3.py), "v3-coded" the same through its own packing (baselines/videogs.py).
+bench/results/train.json has one entry per case, recipe, preset, quality and frames, measured on the test cameras:
+seconds_per_frame, psnr, psnr_fg, ssim, gaussians, kb_per_frame, flicker; psnr_of_frame and flicker_of_frame (of the
+window that ends at the frame) allow comparing runs over different frames. Recipes in the file:
+
+model         our training before coding, without a size
+gscodec       the same decoded from the stream, with still_gaussians and still_bits (still.py)
+alone         a keyframe for every frame with the keyframe budget of the preset: the reference for tracking
+alone-coded   the same decoded from our stream, every frame a group of its own
+v3            V3's recipe in about the time of our preset medium (baselines/v3.py)
+v3-coded      the same through V3's packing (baselines/videogs.py)
 """
 
 from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from bench.machine import update_entries
-from bench.still import still_share
 from gscodec.capture import Capture
 from gscodec.errors import UsageError
 from gscodec.model.gaussian_sequence import DenseGroup
 from gscodec.model.gaussians import Gaussians
 
+from .machine import update_entries
+from .still import still_share
+
 RECIPES = ("gscodec", "alone", "v3")
-V3_PACKING = {"qp": 25, "raw": True}  # its default, in the better of its two forms
-V3_GOP = 20  # frames in a group of its
+V3_PACKING = {"qp": 25, "raw": True}  # its default qp, and the better of its two scripts
+V3_GOP = 20  # frames in a group of V3
 KEYS = ("psnr", "psnr_fg", "ssim", "gaussians", "kb_per_frame", "flicker")
 
 
 @dataclass(frozen=True)
 class Case:
-    """A capture and how it is used.
+    """A capture and its use.
 
     Attributes:
         folder: in the data folder.
-        test: names of the cameras that are tested on instead of the capture's own, which are then left out.
-        scale: of the images.
-        frames: how many of them, where all would take too long.
+        test: names of the test cameras instead of the capture's own, which are then left out.
+        scale: factor on the size of the images.
+        frames: the first frames that are used; None: all.
     """
 
     folder: str
@@ -72,7 +76,7 @@ CASES = {
 
 
 def held_out(capture: Capture, names: tuple[str, ...]) -> Capture:
-    """The capture with the cameras `names` to test on and its other training cameras to train on."""
+    """The capture with the test cameras `names`, and its other training cameras for training."""
     unknown = set(names) - {c.name for c in capture.cameras}
     if unknown:
         known = ", ".join(c.name for c in capture.cameras)
@@ -82,28 +86,52 @@ def held_out(capture: Capture, names: tuple[str, ...]) -> Capture:
     return replace(capture, cameras=cameras, read=lambda camera, t: capture.read(kept[camera], t))
 
 
-def measure(case: str, recipe: str, preset: str, frames: str | None, data: Path, quality: float) -> Iterator[dict]:
-    """Entries of one recipe on one case.
+@dataclass(frozen=True)
+class Run:
+    """One recipe on one case.
 
-    Args:
+    Attributes:
+        case: name in CASES.
+        recipe: name in RECIPES.
         frames: "A:B" or "A:B:STEP", None: all.
+    """
+
+    case: str
+    recipe: str
+    preset: str
+    frames: str | None
+    quality: float
+
+
+def run(runs: Iterable[Run], data: Path, out: Path) -> Iterator[dict]:
+    """Yields the entries of all `runs` and puts them into the result file `out` as they come.
+
+    Raises:
+        UsageError: a capture is not in the data folder.
+    """
+    for each in runs:
+        yield from update(out, measure(each, data))
+
+
+def measure(run: Run, data: Path) -> Iterator[dict]:
+    """Entries of one recipe on one case.
 
     Raises:
         UsageError: the capture is not in the data folder.
     """
     from gscodec.train.settings import train_settings
 
-    capture = CASES[case].open(data)
-    chosen = range(capture.frame_count)[slice(*(int(x) if x else None for x in (frames or ":").split(":")))]
-    settings = train_settings(preset, quality=quality)
-    run = {"gscodec": _ours, "alone": _alone, "v3": _v3}[recipe]
-    for name, seconds, size, models, *more in run(capture, chosen, settings):
+    capture = CASES[run.case].open(data)
+    chosen = range(capture.frame_count)[slice(*(int(x) if x else None for x in (run.frames or ":").split(":")))]
+    settings = train_settings(run.preset, quality=run.quality)
+    recipe = {"gscodec": _ours, "alone": _alone, "v3": _v3}[run.recipe]
+    for name, seconds, size, models, *more in recipe(capture, chosen, settings):
         result = evaluate(part(capture, chosen), models)
         yield {
-            "capture": case,
+            "capture": run.case,
             "recipe": name,
-            "preset": preset,
-            "quality": quality if name in ("gscodec", "alone-coded") else None,
+            "preset": run.preset,
+            "quality": run.quality if name in ("gscodec", "alone-coded") else None,
             "frames": [chosen.start, chosen.stop, chosen.step],
             "seconds_per_frame": round(seconds / len(chosen), 2),
             **{k: result[k] for k in KEYS},
@@ -133,8 +161,8 @@ def _alone(capture: Capture, frames: range, settings) -> Iterator[tuple]:
 
 
 def _v3(capture: Capture, frames: range, settings) -> Iterator[tuple]:
-    from bench.baselines import videogs
-    from bench.baselines.v3 import train_v3
+    from .baselines import videogs
+    from .baselines.v3 import train_v3
 
     start = time.perf_counter()
     models = train_v3(part(capture, frames), range(len(frames)), settings)
@@ -148,7 +176,7 @@ def _v3(capture: Capture, frames: range, settings) -> Iterator[tuple]:
 
 
 def sequence(capture: Capture, settings) -> tuple[list[DenseGroup], float]:
-    """Our training; its groups and the seconds it took."""
+    """Trains the capture; returns the groups and the seconds."""
     from gscodec.train.train import train_groups
 
     start = time.perf_counter()
@@ -156,12 +184,12 @@ def sequence(capture: Capture, settings) -> tuple[list[DenseGroup], float]:
 
 
 def shown(groups: list[DenseGroup]) -> list[Gaussians]:
-    """Frame by frame the Gaussians that live."""
+    """The Gaussians of each frame that live in it."""
     return [group.visible(t) for group in groups for t in range(len(group))]
 
 
 def coded(capture: Capture, groups: list[DenseGroup], settings) -> tuple[int, list[Gaussians], float]:
-    """Bytes of the stream that these groups make, its frames decoded, and the seconds that coding took."""
+    """Codes the groups; returns the bytes of the stream, its decoded frames and the seconds of coding."""
     from gscodec.decode import open_stream
     from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
 
@@ -176,7 +204,7 @@ def coded(capture: Capture, groups: list[DenseGroup], settings) -> tuple[int, li
 
 
 def every_frame_alone(capture: Capture, frames: range, settings) -> tuple[list[Gaussians], float]:
-    """A keyframe for each of `frames`, and the seconds that took."""
+    """Trains a keyframe for each of `frames`; returns their Gaussians and the seconds."""
     import torch
 
     from gscodec.bitstream.quantization import subject_radius
@@ -195,7 +223,7 @@ def every_frame_alone(capture: Capture, frames: range, settings) -> tuple[list[G
 
 
 def part(capture: Capture, frames: range) -> Capture:
-    """The capture with only these frames."""
+    """The capture with only these frames; fps follows their step."""
     return replace(
         capture,
         first_frame=0,
@@ -206,7 +234,7 @@ def part(capture: Capture, frames: range) -> Capture:
 
 
 def evaluate(capture: Capture, frames: list[Gaussians]) -> dict:
-    """Figures on the test cameras (metrics/evaluate.py)."""
+    """Results on the test cameras (metrics/evaluate.py), with the mean count of Gaussians."""
     from gscodec.metrics.evaluate import evaluate_capture
 
     result = evaluate_capture(lambda t: frames[t], capture, "test", with_vmaf=False)
@@ -214,5 +242,5 @@ def evaluate(capture: Capture, frames: list[Gaussians]) -> dict:
 
 
 def update(out: Path, entries: Iterator[dict]) -> Iterator[dict]:
-    """Puts entries into the result file, in place of older ones of the same run, as they come."""
+    """Yields entries and puts each into the result file, in place of an older one of the same run."""
     return update_entries(out, entries, lambda e: [e[k] for k in ("capture", "recipe", "preset", "quality", "frames")])

@@ -14,8 +14,8 @@ pytest.importorskip("zstandard")
 
 from bench.baselines import BASELINES
 from bench.baselines.grid import grid_order
+from bench.plots.charts import draw_charts
 from bench.rd import OURS, bd_rates, measure, update
-from gscodec.metrics.charts import draw_charts
 from gscodec.splats import write_splat
 
 KEYS = {"sequence", "codec", "setting", "kb_per_frame", "codec_psnr", "encode_s_per_frame", "decode_ms_per_frame"}

@@ -1,20 +1,29 @@
 """Benchmarks write what the charts read; scripts rely on the keys."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+from synthetic import turning
 
 pytest.importorskip("torch")
 
+from bench.ablation import FRAMES, VARIANTS, WHOLE
+from bench.animate_splat import Motion, animate_splat, animated
 from bench.machine import ROOT, write_result
+from bench.plots.charts import draw_charts
 from bench.raster import measure, run
 from bench.scenes import capsule, capsule_camera
 from bench.train import held_out
 from gscodec.capture import open_capture
-from gscodec.errors import UsageError
-from gscodec.metrics.charts import draw_charts
+from gscodec.errors import CaptureError, UsageError
+from gscodec.splats import write_splat
+from gscodec.splats.ply_table import read_table
+from gscodec.train.settings import train_settings
 
+BENCH = ROOT / "bench"
 KEYS = {
     "scene",
     "gaussians",
@@ -79,11 +88,44 @@ def test_ablation_shows_what_each_tool_is_worth(tmp_path):
     assert [p.name for p in draw_charts(tmp_path, tmp_path / "charts")] == ["ablation.svg", "ablation.png"]
 
 
-def test_ablation_takes_out_what_is_there():
-    pytest.importorskip("torch")
-    from bench.ablation import VARIANTS
+def test_each_variant_of_the_ablation_changes_the_settings():
+    whole = train_settings("fast")
+    changed = {name: variant.change(whole) for name, variant in VARIANTS.items()}
+    assert changed.pop(WHOLE) == whole
+    assert whole not in changed.values()
+    assert len(set(map(repr, changed.values()))) == len(changed), "two variants are the same"
+    assert all(v.captures for v in VARIANTS.values())
+    assert {c for v in VARIANTS.values() for c in v.captures} == set(FRAMES)
 
-    assert [n for n, v in VARIANTS.items() for where, name, _ in v.patches if not hasattr(where, name)] == []
+
+@pytest.mark.parametrize("script", [p for p in BENCH.glob("*.py") if "__main__" in p.read_text()], ids=lambda p: p.stem)
+def test_scripts_say_how_they_are_used(script):
+    command = [sys.executable, "-m", f"bench.{script.stem}", "--help"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("usage: ")
+    assert f"python -m bench.{script.stem}" in script.read_text()
+
+
+def test_an_animated_splat_moves_and_keeps_its_other_properties(tmp_path):
+    write_splat(tmp_path / "a.ply", turning(n=50, frames=1, sh_count=3).frame(0))
+    static = read_table(tmp_path / "a.ply")["vertex"]
+    first, second = animated(static, 2, Motion())
+    assert np.abs(second["x"] - first["x"]).max() > 1e-4
+    np.testing.assert_array_equal(second["f_rest_8"], static["f_rest_8"])
+    np.testing.assert_allclose(sum(second[f"rot_{i}"] ** 2 for i in range(4)), 1, rtol=1e-5)
+    still = next(animated(static, 1, Motion(amount=0, jitter=0)))
+    for name in static.dtype.names:
+        np.testing.assert_allclose(still[name], static[name], rtol=1e-5, atol=1e-6, err_msg=name)
+    animate_splat(tmp_path / "a.ply", tmp_path / "plys", 2)
+    written = [read_table(tmp_path / "plys" / f"00000{t}.ply")["vertex"] for t in range(2)]
+    assert [w.tobytes() for w in written] == [first.tobytes(), second.tobytes()], "equal arguments, equal values"
+
+
+def test_only_a_ply_is_animated(tmp_path):
+    with pytest.raises(CaptureError, match=r"no such file, expected a \.ply"):
+        animate_splat(tmp_path / "no.ply", tmp_path / "plys", 2)
+    assert not (tmp_path / "plys").exists()
 
 
 def test_cameras_are_taken_out_of_training(tmp_path):

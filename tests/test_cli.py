@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from synthetic import turning
 
-from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.commands import checkout
+from gscodec.errors import UsageError
+from gscodec.model.gaussian_sequence import GaussianSequence, DenseGroup
 from gscodec.splats import write_sequence
 
 
@@ -148,6 +150,17 @@ def test_broken_files(folder, tmp_path):
     broken.write_bytes(data[: len(data) - 10])
     result = run("info", broken)
     assert "cut short" in result.stderr
+
+
+def test_benchmarks_are_found_beside_the_package(tmp_path):
+    pytest.importorskip("matplotlib")
+    fails(run("chart", cwd=tmp_path), "no results that have a chart")
+
+
+def test_an_installed_wheel_has_no_benchmarks(tmp_path, monkeypatch):
+    monkeypatch.setattr(checkout, "PACKAGE", tmp_path / "gscodec")
+    with pytest.raises(UsageError, match=r"not part of an installed wheel, and .*bench does not exist; clone"):
+        checkout.require_bench()
 
 
 def test_untracked_frames_are_said_to_be(tmp_path):

@@ -75,6 +75,14 @@ for name in (*FILES, "stream.gsv"):
     assert done.returncode == 0, done.stderr
 
 
+def test_benchmarks_ask_for_a_checkout(player):
+    for args in (("bench", "raster"), ("bench", "rd"), ("chart",)):
+        result = run(player, *args)
+        assert result.returncode == 1, args
+        assert "clone the repository" in result.stderr, (args, result.stderr)
+        assert "Traceback" not in result.stderr
+
+
 def test_the_studios_commands_name_the_extra(player):
     (player / "capture").mkdir(exist_ok=True)
     (player / "capture" / "transforms.json").write_text("{}")

@@ -1,6 +1,6 @@
-"""Peers of gscodec, each in a short file after its public description, with the settings that its users choose.
+"""Other codecs, each in a short file after its public description, with the settings that its users choose.
 
-A baseline turns the frames of one group into named files, everything that decoding needs, and back. Each module has
+A baseline codes the frames of one group into named files, which hold all that decoding needs. Each module has
 SETTINGS (name -> arguments of encode), encode(frames, ...) -> files and decode(files) -> frames.
 """
 
@@ -10,20 +10,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 
-from bench.baselines import draco, gsav, sog, spz, svt_av1, videogs, x265_anchor, zstd
-from bench.baselines.maps import order_of
 from gscodec.model.gaussians import Gaussians
+
+from . import draco, gsav, sog, spz, svt_av1, videogs, x265_anchor, zstd
+from .maps import order_of
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """One codec beside ours.
+    """One codec of the comparison.
 
     Attributes:
         module: has encode and decode.
         settings: name of a point of the curve -> arguments of encode.
-        prepare: makes and keeps what does not depend on the setting, from the first frame of a group.
-        per_frame: codes each frame alone, so that it is enough to code the frames that are measured.
+        prepare: from the first frame of a group, computes and caches the part that is equal for all settings.
+        per_frame: each frame is coded alone, so that only the measured frames need to be coded.
     """
 
     module: ModuleType

@@ -1,7 +1,7 @@
 """Draco's point cloud coder on each frame alone: positions quantized by Draco, the other attributes 8-bit integers.
 
-In Morton order with the order kept: for so many attributes Draco's sequential coder is smaller than its kd-tree, and
-much faster. Attributes have the ranges of the frame; the highest compression level.
+Points are in Morton order, which is kept: with this many attributes, Draco's sequential coder is smaller and much
+faster than its kd-tree coder. The range of an attribute is that of the frame; compression level 10, the highest.
 """
 
 from __future__ import annotations
@@ -10,16 +10,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.baselines.grid import morton_order
 from gscodec.errors import require
 from gscodec.model.gaussians import Gaussians
+
+from .grid import morton_order
 
 SETTINGS = {f"{p}/{a} bit": {"position": p, "attribute": a} for p, a in ((11, 5), (12, 6), (13, 7), (14, 8), (16, 8))}
 ATTRIBUTES = ("quats", "log_scales", "logit_opacities", "sh0", "shN")
 
 
 def encode(frames: Sequence[Gaussians], position: int, attribute: int) -> dict[str, bytes]:
-    """Codes frames with the given bits; returns their files."""
+    """Codes frames with `position` and `attribute` bits; returns their files."""
     draco, files = require("DracoPy", "the Draco baseline"), {}
     for t, frame in enumerate(frames):
         g, ranges, codes = frame.take(morton_order(frame.means)), [], {}

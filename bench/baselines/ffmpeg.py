@@ -1,7 +1,7 @@
 """Raw planes <-> video streams through the ffmpeg of the imageio-ffmpeg wheel, many small videos in one call.
 
-One call for all of a group's videos, and elementary streams without the encoder's name in them: process starts and
-MP4 headers, which a product would not pay twenty times a group either, are not charged to the peers.
+All videos of a group take one call and become elementary streams without the name of the encoder, so that the peers
+are not charged for twenty process starts and MP4 headers per group, which a product would avoid too.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gscodec.errors import UsageError, require
 
 X264 = ["-c:v", "libx264", "-bsf:v", "filter_units=remove_types=6", "-f", "h264"]
 X265 = ["-c:v", "libx265", "-f", "hevc"]
-FLAT_CHROMA = ["-pix_fmt", "yuv420p", "-color_range", "pc"]  # grey for encoders that have none; pc: values stay
+FLAT_CHROMA = ["-pix_fmt", "yuv420p", "-color_range", "pc"]  # grey for encoders without a grey format; pc: full range
 SVT_AV1 = ["-c:v", "libsvtav1", *FLAT_CHROMA, "-f", "obu"]
 VP9 = ["-c:v", "libvpx-vp9", *FLAT_CHROMA, "-f", "ivf"]
 FORMATS = {1: "gray", 3: "gbrp"}

@@ -1,9 +1,9 @@
-"""Gaussians -> the order in which attributes lie on a square grid, alike ones side by side, for image and video codecs.
+"""Gaussians -> their order on a square grid with similar neighbours, for image and video codecs.
 
 Parallel linear assignment sorting (PLAS, Morgenstern et al. 2024, "Compact 3D Scene Representation via
-Self-Organizing Gaussian Grids"), written for numpy: cells are swapped, four by four and in all 24 permutations, towards
-a blurred copy of the grid whose radius shrinks. It starts from Morton order along a Morton curve instead of a random
-order, which needs fewer rounds for the same smoothness.
+Self-Organizing Gaussian Grids") in numpy: the Gaussians of four random cells take the best of their 24 permutations
+against a blurred copy of the grid; the radius of the blur shrinks. The start is Morton order along a Morton curve
+instead of a random order, which needs fewer rounds for the same smoothness.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ POSITION_WEIGHT = 16
 
 
 def side_of(count: int) -> int:
-    """Cells along one side of the smallest square, a multiple of 8, that holds `count` of them; x265 takes no 8 x 8."""
+    """Side of the smallest square of `count` cells, a multiple of 8 and at least 16, since x265 takes no 8 x 8."""
     return max(16, 8 * int(np.ceil(np.sqrt(count) / 8)))
 
 
@@ -51,7 +51,7 @@ def grid_order(g: Gaussians, seed: int = 0) -> np.ndarray:
     cells = side * side
     features = np.concatenate([g.means, g.sh0, g.log_scales, g.quats, g.logit_opacities[:, None]], 1)
     features = (features - features.mean(0)) / np.maximum(features.std(0), 1e-6)
-    features[:, :3] *= POSITION_WEIGHT  # what lies together moves together
+    features[:, :3] *= POSITION_WEIGHT  # Gaussians close to each other move alike
     features = np.concatenate([features, np.zeros((cells - len(g), features.shape[1]))]).astype(np.float32)
     curve = np.argsort(morton(np.indices((side, side)).reshape(2, -1).T))
     held = np.empty(cells, np.int64)  # the Gaussian of each cell
@@ -72,7 +72,7 @@ def grid_order(g: Gaussians, seed: int = 0) -> np.ndarray:
 
 
 def _assign(held: np.ndarray, quad: np.ndarray, features: np.ndarray, target: np.ndarray) -> None:
-    """Permutes what each four cells hold so that the squared distance to their targets is least."""
+    """Permutes the Gaussians of each four cells to the least squared distance from the targets."""
     products = features[held[quad]] @ target[quad].swapaxes(1, 2)  # the squares are the same for all permutations
     scores = sum(products[:, PERMUTATIONS[:, j], j] for j in range(4))  # [Q, 24]
     best = PERMUTATIONS[scores.argmax(1)]

@@ -1,8 +1,9 @@
-"""What is public of GSAV (OpsiClear's gscodec): attributes as one lossless VP9 atlas, in Morton order.
+"""The public part of GSAV (OpsiClear's gscodec): attributes as one lossless VP9 atlas, in Morton order.
 
 14 channels of 8 bit (position high bytes, scales, asin of the rotation, opacity, colour as YCbCr) lie side by side in
-the luma; the low bytes of the positions go through zstd. A code that moves by at most `snap` keeps the one before it,
-which is its only control of the rate. Ranges are those of the group, the order is that of its first frame.
+the luma; zstd codes the low bytes of the positions. The only rate control is `snap`: a code that differs from that of
+the frame before by at most `snap` is replaced by it. Ranges are those of the group, the order is that of its first
+frame.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.baselines.ffmpeg import VP9, decode_videos, encode_videos
-from bench.baselines.grid import morton_order, side_of
-from bench.baselines.zstd import compress, decompress
 from gscodec.model.gaussians import Gaussians
 
+from .ffmpeg import VP9, decode_videos, encode_videos
+from .grid import morton_order, side_of
+from .zstd import compress, decompress
+
 SETTINGS = {f"snap {s}": {"snap": s} for s in (0, 1, 2, 4, 8, 16)}
-CHANNELS, WIDE = 14, 4  # channels, and how many of them lie side by side
+CHANNELS, WIDE = 14, 4  # channels, of which 4 lie side by side
 YCBCR = np.array([[0.299, 0.587, 0.114], [-0.168736, -0.331264, 0.5], [0.5, -0.418688, -0.081312]])  # BT.601
 
 
@@ -30,7 +32,7 @@ def encode(frames: Sequence[Gaussians], snap: int) -> dict[str, bytes]:
     position = np.rint(unit[..., :3] * 65535).astype(np.uint16)
     codes = np.concatenate([position >> 8, np.rint(unit[..., 3:] * 255)], 2).astype(np.uint8)
     held = codes.astype(np.int16)
-    for t in range(1, len(held)):  # low bytes belong to their high byte, which has to be exact
+    for t in range(1, len(held)):  # the high bytes of positions stay exact, since low bytes belong to them
         near = np.abs(held[t] - held[t - 1]) <= snap
         near[:, :3] = False
         held[t][near] = held[t - 1][near]
@@ -48,7 +50,7 @@ def encode(frames: Sequence[Gaussians], snap: int) -> dict[str, bytes]:
 
 
 def _columns(g: Gaussians) -> np.ndarray:
-    """[N, 14] position, scale, rotation, opacity, colour, as they are quantized."""
+    """[N, 14] position, scale, rotation, opacity and colour in the form that is quantized."""
     quats = g.quats * np.where(g.quats[:, :1] < 0, -1, 1)
     parts = (g.means, g.log_scales, np.arcsin(np.clip(quats, -1, 1)), g.logit_opacities[:, None], g.sh0 @ YCBCR.T)
     return np.concatenate(parts, 1, dtype=np.float64)

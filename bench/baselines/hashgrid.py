@@ -1,7 +1,7 @@
-"""Multi-resolution hash grid (Instant-NGP, Mueller et al. 2022) of V3's motion field: native, and the plain reference.
+"""Multi-resolution hash grid (Instant-NGP, Mueller et al. 2022) of V3's motion field: native, and a plain reference.
 
 [N, 3] in [0, 1] -> [N, levels * features]. Levels grow geometrically from base_resolution to max_resolution cells on a
-side; a level whose vertices fit the table is dense, the others are hashed. The MLP behind it stays in torch.
+side; a level whose vertices fit the table is dense, the others are hashed. The MLP after it runs in torch.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class HashGrid(torch.nn.Module):
         base_resolution, max_resolution: cells on a side of the first and the last level.
 
     Attributes:
-        table: [entries, F] f32, uniform in +-1e-4 at first, as in the paper.
+        table: [entries, F] f32, initially uniform in +-1e-4, as in the paper.
         cells: [L] cells on a side of each level.
 
     Raises:
@@ -50,7 +50,7 @@ class HashGrid(torch.nn.Module):
         self.table = torch.nn.Parameter(torch.empty(self.native.entries, features).uniform_(-1e-4, 1e-4))
 
     def forward(self, points: torch.Tensor) -> torch.Tensor:
-        """[N, 3] in [0, 1] (clamped) -> [N, L * F]; gradients for the table, and for the points if they want one."""
+        """[N, 3] in [0, 1] (clamped) -> [N, L * F]; gradients for the table, and for points that require one."""
         return _Lookup.apply(points, self.table, self.native, len(self.cells))
 
     def reference(self, points: torch.Tensor) -> torch.Tensor:

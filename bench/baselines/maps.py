@@ -1,8 +1,8 @@
-"""Attribute maps of a group for video codecs: the packing that MPEG's anchor and its AV1 twin share.
+"""Attribute maps of a group for video codecs: the packing of x265_anchor.py and svt_av1.py.
 
 As in GSCodec Studio: one order for the whole group (that of its first frame, by grid.py), ranges over all frames;
-means 16 bit as two planes, which are lossless, everything else 8 bit; values as trainers hold them (log scales, logit
-opacities). The cells that are left over repeat the Gaussian that shows least.
+means 16 bit in two lossless planes, all else 8 bit; log scales and logit opacities, as trained. Spare cells repeat the
+Gaussian with the lowest opacity.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.baselines.grid import grid_order
 from gscodec.model.gaussians import Gaussians
+
+from .grid import grid_order
 
 CHANNELS = {"means": 3, "sh0": 3, "log_scales": 3, "quats": 4, "logit_opacities": 1}
 LOSSLESS = ("means_low", "means_high")
-_orders: dict[bytes, np.ndarray] = {}  # the order is the same at each point of a curve
+_orders: dict[bytes, np.ndarray] = {}  # means -> order, which is the same at each point of a curve
 
 
 def order_of(g: Gaussians) -> np.ndarray:
@@ -51,7 +52,7 @@ def pack(frames: Sequence[Gaussians]) -> tuple[dict[str, np.ndarray], bytes]:
 
 
 def unpack(maps: dict[str, np.ndarray], ranges: bytes) -> list[Gaussians]:
-    """The mirror of `pack`; the Gaussians are in grid order, with those of the cells left over."""
+    """The mirror of `pack`; the Gaussians are in grid order and include those of the spare cells."""
     limits, parts, start = np.frombuffer(ranges, np.float32).reshape(-1, 2), {}, 0
     for name, channels in CHANNELS.items():
         low, high = limits[start : start + channels].T

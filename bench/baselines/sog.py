@@ -1,4 +1,4 @@
-"""SOG version 2 for each frame, written by splat-transform with its defaults; there is nothing to choose."""
+"""SOG version 2 for each frame, written by splat-transform with its defaults: one setting."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from bench.baselines.splat_transform import convert
 from gscodec.model.gaussians import Gaussians
 from gscodec.splats import read_splat
+
+from .splat_transform import convert
 
 SETTINGS = {"default": {}}
 

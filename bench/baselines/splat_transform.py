@@ -1,7 +1,7 @@
-"""PlayCanvas' splat-transform, the reference writer of .sog and .spz: frames in, one file for each out.
+"""PlayCanvas' splat-transform, the reference writer of .sog and .spz: frames -> one file each.
 
-Found on the PATH or where the environment variable SPLAT_TRANSFORM says: `npm i -g @playcanvas/splat-transform@3`. Its
-times contain the start of node and the reading of a .ply.
+It is on the PATH or named by the environment variable SPLAT_TRANSFORM; `npm i -g @playcanvas/splat-transform@3`
+installs it. Its times contain the start of node and the reading of a .ply.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def splat_transform() -> str:
 
 
 def convert(frames: Sequence[Gaussians], ending: str, *options: str) -> dict[str, bytes]:
-    """Each frame as a file of the format that `ending` names."""
+    """Each frame as a file of the format of `ending`, e.g. ".sog"."""
     command, files = splat_transform(), {}
     with tempfile.TemporaryDirectory() as folder:
         for t, frame in enumerate(frames):

@@ -1,4 +1,4 @@
-"""SPZ version 4 (Niantic) for each frame, written by splat-transform with its defaults; read here, by its description.
+"""SPZ version 4 (Niantic) per frame: written by splat-transform with its defaults, read here after its description.
 
 A header of 32 bytes, a table of (compressed, plain) sizes, and zstd streams of positions (24 bit fixed point), opacity,
 colour, log scales (8 bit each), rotations (xyzw, the smallest three as sign and 9 bits, the index of the largest on
@@ -13,11 +13,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from bench.baselines.splat_transform import convert
-from bench.baselines.zstd import decompress
 from gscodec.model.gaussians import SH_COUNTS, Gaussians
 from gscodec.splats.compressed_ply import logit
 from gscodec.splats.smallest_three import join_smallest_three
+
+from .splat_transform import convert
+from .zstd import decompress
 
 SETTINGS = {"default": {}}
 COLOR_SCALE = 0.15

@@ -1,7 +1,7 @@
-"""AV1 (SVT-AV1) on the maps of maps.py: the packing of MPEG's anchor with the encoder that is most used today.
+"""AV1 (SVT-AV1) on the maps of maps.py: the packing of MPEG's anchor with a current encoder.
 
-SVT-AV1 codes 4:2:0 only, so that each channel is a video of its own in the luma; chroma is flat. Preset 6 is what the
-project's guide gives for video on demand.
+SVT-AV1 codes 4:2:0 only, so that each channel is the luma of a video of its own; chroma is flat. Preset 6 is the one
+for video on demand in the project's guide.
 """
 
 from __future__ import annotations
@@ -10,9 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.baselines.ffmpeg import SVT_AV1, decode_videos, encode_videos
-from bench.baselines.maps import CHANNELS, LOSSLESS, pack, unpack
 from gscodec.model.gaussians import Gaussians
+
+from .ffmpeg import SVT_AV1, decode_videos, encode_videos
+from .maps import CHANNELS, LOSSLESS, pack, unpack
 
 SETTINGS = {f"qp {qp}": {"qp": qp} for qp in (4, 10, 18, 26, 34, 42)}
 PRESET = 6

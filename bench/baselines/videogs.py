@@ -1,10 +1,10 @@
 """The packing of VideoGS (V3, Wang et al. 2024) with x264: a grey video for each byte plane of a group.
 
-20 videos a group: positions as 16 bit in a high and a low byte plane, all else 8 bit with the minimum and maximum of
-each frame and attribute, in order of opacity. The high bytes are lossless, low bytes and opacity take `qp`, the rest
-at most 22, as in the scripts that its authors published, and so are truncation instead of rounding and the three
-planes of normals that nobody uses. Its README's script stores exp(scale) and sigmoid(opacity); another one beside it
-stores them as trained (`raw`), which is better at the same bits: both are measured.
+20 videos per group: positions as 16 bit in a high and a low byte plane, all else 8 bit with the minimum and maximum of
+each frame and attribute, in order of opacity. High bytes are lossless, low bytes and opacity have `qp`, the rest at
+most 22. All this is as in the published scripts, as are truncation instead of rounding and three unused planes of
+normals. The script of the README stores exp(scale) and sigmoid(opacity); another one stores both as trained (`raw`),
+which is better at the same bits. Both are measured.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.baselines.ffmpeg import X264, decode_videos, encode_videos
 from gscodec.model.gaussians import Gaussians
 from gscodec.splats.compressed_ply import logit, sigmoid
 
+from .ffmpeg import X264, decode_videos, encode_videos
+
 SETTINGS = {f"qp {qp}": {"qp": qp} for qp in (8, 12, 15, 18, 20, 25, 35, 45, 51)}
-SETTINGS |= {f"qp 51/{rest}": {"qp": 51, "rest": rest} for rest in (26, 30, 34)}  # below what the scripts reach
+SETTINGS |= {f"qp 51/{rest}": {"qp": 51, "rest": rest} for rest in (26, 30, 34)}  # lower rates than the scripts reach
 RAW_SETTINGS = {name: {**setting, "raw": True} for name, setting in SETTINGS.items()}
 REST_QP_MAX = 22
 EPS = 1e-6

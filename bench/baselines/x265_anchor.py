@@ -1,7 +1,8 @@
 """MPEG's video anchor for Gaussian sequences (GSCodec Studio) with x265: the maps of maps.py as seven videos a group.
 
-Three channels that belong together are one 4:4:4 video, opacity and the real part of the rotation are grey. rp0 to rp3
-are the anchor's rate points, rp4 and rp5 go on with their spacing, since the anchor starts above the range of interest.
+Means, scales, colour and the vector part of the rotation are 4:4:4 videos of three channels; opacity and the real part
+of the rotation are grey. rp0 to rp3 are the anchor's rate points; rp4 and rp5 continue their spacing, since the anchor
+starts above the range of interest.
 """
 
 from __future__ import annotations
@@ -10,9 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.baselines.ffmpeg import X265, decode_videos, encode_videos
-from bench.baselines.maps import LOSSLESS, pack, unpack
 from gscodec.model.gaussians import Gaussians
+
+from .ffmpeg import X265, decode_videos, encode_videos
+from .maps import LOSSLESS, pack, unpack
 
 QPS = {"rp0": (4, 4, 4), "rp1": (4, 10, 4), "rp2": (10, 16, 10), "rp3": (16, 22, 16), "rp4": (22, 28, 22)}
 QPS |= {"rp5": (28, 34, 28)}  # opacity; scales and rotation; colour
@@ -36,7 +38,7 @@ def _params(qp: int | None) -> str:
 
 
 def _planes(video: np.ndarray) -> np.ndarray:
-    """[T, 1 or 3, H, W] -> what ffmpeg's grey or (green, blue, red) formats want."""
+    """[T, 1 or 3, H, W] -> planes of ffmpeg's formats: grey, or green, blue, red."""
     return video[:, 0] if video.shape[1] == 1 else video[:, [1, 2, 0]]
 
 

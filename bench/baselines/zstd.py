@@ -1,7 +1,7 @@
-"""zstd on plain quantized planes: what a sequence costs without any model of it.
+"""zstd on plain quantized planes: the size of a sequence without a model.
 
-Positions 16 bit in two planes, everything else `bits` (positions twice as many), ranges over the group, frames as
-differences from the one before, planes one after the other.
+Positions have 2 x `bits`, all else `bits`, ranges are over the group. Frames are differences from the one before, split
+in a low and a high byte plane.
 """
 
 from __future__ import annotations

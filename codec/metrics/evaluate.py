@@ -1,7 +1,7 @@
-"""Decoded frames against a capture or against the splats they were made of -> the figures of `gscodec eval`.
+"""Decoded frames + a capture, or the splats that were encoded -> the measures of `gscodec eval`.
 
-One pass, frame by frame and camera by camera, with running sums: neither side is ever in memory as a whole. Views
-of a capture are composited over mid-grey, on which dark and bright haze show alike, and so are the Gaussians.
+One pass, frame by frame and camera by camera, with running sums: neither side is in memory as a whole. Views of a
+capture and renders are composited over mid-grey, which shows dark and bright haze equally.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .stability import TemporalMeter
 from .vmaf import VmafMeter
 
 BACKGROUND = (0.5, 0.5, 0.5)
-FG_ALPHA = 0.02  # of a rendered reference: the foreground of codec_psnr_fg
+FG_ALPHA = 0.02  # of a rendered reference; above it is the foreground of codec_psnr_fg
 FrameSource = Callable[[int], Gaussians]
 Progress = Callable[[int, int], None]  # (images done, images)
 
@@ -33,11 +33,12 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 
 def _report(frame_count: int, counts: list[int], size: int | None, rows: list[dict]) -> dict:
-    """The keys that both kinds of evaluation share; those that do not apply stay None.
+    """The keys of both evaluations; a key that does not apply is None.
 
     Args:
-        frame_count: frames of the stream, which is what `size` pays for; `counts` and `rows` may be of some of them.
-        counts: Gaussians of each frame that was measured.
+        frame_count: frames of the stream, whose bytes are `size`.
+        counts: Gaussians of each measured frame.
+        rows: measures of each measured frame.
     """
     gaussians = float(np.mean(counts))
     known = {k: _mean(r[k] for r in rows) for k in rows[0] if k != "frame"}
@@ -69,7 +70,7 @@ def evaluate_capture(
         frame_source: frame -> Gaussians as shown, for every frame of the capture.
         split: cameras to compare with, "test" or "train".
         size: bytes of the stream, for the rates.
-        with_vmaf: VMAF too, which takes about as long as everything else.
+        with_vmaf: also VMAF, which takes about as long as all other measures.
         progress: called with (images done, images).
 
     Returns:
@@ -104,7 +105,7 @@ def evaluate_capture(
 
 
 def _compare(g: Gaussians, camera: Camera, view: View, temporal: TemporalMeter, vmaf: VmafMeter | None) -> dict:
-    """The figures of one image; the meters remember it."""
+    """Measures of one image, which is also added to the meters."""
     from ..render.image import render_image
 
     reference, image = composite(view, BACKGROUND), render_image(g, camera, background=BACKGROUND)
@@ -129,12 +130,12 @@ def evaluate_splats(
     size: int | None = None,
     progress: Progress | None = None,
 ) -> dict:
-    """Measures decoded Gaussians against those they were made of, both rendered from the 16 codec cameras.
+    """Measures decoded Gaussians against the encoded ones, both rendered from the 16 codec cameras.
 
     Args:
         frame_source: frame -> Gaussians as shown.
         frames: the frames to compare; all by default.
-        size: bytes of the stream, for the rates; they are taken over all frames of the sequence.
+        size: bytes of the stream, for the rates over all frames of the sequence.
 
     Returns:
         The keys of evaluate_capture with codec_psnr and codec_psnr_fg instead of psnr, psnr_fg, ssim, vmaf and flicker.

@@ -1,7 +1,7 @@
 """Image pairs -> PSNR, foreground PSNR, haze, SSIM. 8-bit sRGB in, decibels or 8-bit levels out.
 
-The foreground is where the reference has any coverage, grown by 8 px, so that a blurred outline counts and an empty
-background does not flatter; what a codec paints beyond it is haze and is told apart.
+The foreground is where the reference has alpha > 0, dilated by 8 px, so that a blurred outline counts and an empty
+background does not raise the PSNR. The error outside of the foreground is haze, a measure of its own.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import UsageError, require
 
-PSNR_MAX = 100.0  # of equal images, so that means and JSON stay finite
+PSNR_MAX = 100.0  # dB of equal images, so that means and JSON are finite
 GROW = 8  # px by which the foreground is dilated
 
 

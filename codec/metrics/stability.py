@@ -1,8 +1,8 @@
 """Frames of one camera -> temporal stability and flicker.
 
-PSNR is blind to whether an error stays or dances. `stability` is the PSNR of differences of consecutive frames.
-`flicker` looks where nothing should happen: pixels whose reference stays within a range of less than 2 levels over
-5 frames, and there at the standard deviation of the image over the same frames, in 8-bit levels.
+PSNR does not tell a constant error from one that changes with time. `stability` is the PSNR of the differences of
+consecutive frames. `flicker` is the mean standard deviation over 5 frames, in 8-bit levels, of the pixels whose
+reference varies by less than 2 levels over the same frames.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ STILL = 2  # 8-bit levels
 
 
 class TemporalMeter:
-    """Takes the frames of one camera in order and keeps no more than a window of them."""
+    """Takes the frames of one camera in order and keeps a window of them in memory."""
 
     def __init__(self):
         self._references: deque[np.ndarray] = deque(maxlen=WINDOW)
@@ -30,7 +30,7 @@ class TemporalMeter:
         """Adds a frame, [H, W, 3] u8; flicker is measured where `mask` ([H, W] bool) holds in the last frame.
 
         Returns:
-            Flicker of the window that ends here, None as for `flicker`.
+            Flicker of the window that ends with this frame; None as for `flicker`.
         """
         if self._images:
             change = reference.astype(np.float32) - self._references[-1]

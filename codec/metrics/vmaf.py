@@ -1,9 +1,9 @@
 """Two videos of one camera -> VMAF (libvmaf, model v0.6.1) through the ffmpeg of the imageio-ffmpeg wheel.
 
-VMAF was trained on pictures that fill the screen. On a subject before an empty background it mostly scores the
-emptiness, so captures with masks are cropped to the subject: one crop for the whole video, with a margin, and
-enlarged by a whole factor where it is very small. Crop and factor stand in the report. Frames wait in raw files;
-nothing is compressed.
+VMAF was trained on images that fill the screen. With a subject before an empty background it mostly scores the
+background, so captures with masks are cropped to the subject: one crop for the whole video, with a margin, and
+enlarged by a whole factor where it is very small. The report has crop and factor. Frames are written to raw files,
+without compression.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ..errors import UsageError, require
 
 MODEL = "version=vmaf_v0.6.1"
 MARGIN = 16  # px around the subject
-SIDE_MIN = 192  # px: a crop grows to this, or is enlarged to it where the image is smaller
+SIDE_MIN = 192  # px: least side of a crop, which is enlarged where the image is smaller
 
 
 @cache

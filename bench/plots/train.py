@@ -12,7 +12,7 @@ LOOK = {  # recipe -> name, colour
     "v3": ("V3's recipe", "#9a9a9a"),
     "v3-coded": ("V3's recipe and packing", "#555555"),
 }
-SPAN_X, SPAN_Y = 1.6, 0.25  # around the points: a factor, dB
+SPAN_X, SPAN_Y = 1.6, 0.25  # margin around the points: a factor, dB
 PANELS = {"seconds_per_frame": "training, seconds a frame", "kb_per_frame": "kB a frame"}
 
 
@@ -20,7 +20,7 @@ def train_chart(result: dict):
     """A row for each capture, a panel for time and one for size (matplotlib)."""
     from matplotlib.figure import Figure
 
-    shown = [e for e in result["entries"] if e["frames"][0] == 0]  # a few frames in a row from the middle: for flicker
+    shown = [e for e in result["entries"] if e["frames"][0] == 0]  # others are runs of a few frames for flicker
     captures = list(dict.fromkeys(e["capture"] for e in shown))
     figure = Figure(figsize=(10, 3.4 * len(captures)), layout="constrained")
     for row, capture in zip(figure.subplots(len(captures), 2, squeeze=False), captures, strict=True):
@@ -49,7 +49,7 @@ def _panel(axes, entries: Sequence[dict], key: str) -> None:
             axes.annotate(preset, at, (4, -9), textcoords="offset points", fontsize=7, color=color)
     axes.grid(alpha=0.25)
     axes.margins(0.14)
-    if entries:  # what lies close together looks so
+    if entries:  # at least this span, so that equal results look equal
         x, y = ([e[k] for e in entries] for k in (key, "psnr_fg"))
         axes.set_xlim(min(x) / SPAN_X, max(x) * SPAN_X)
         axes.set_ylim(min(y) - SPAN_Y, max(y) + SPAN_Y)

@@ -1,10 +1,10 @@
-"""bench/results/rd.json -> charts of size, time and single frames against quality, with codecs named at their lines."""
+"""bench/results/rd.json -> charts of size, time and single frames against quality; each line has its codec's name."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .bd_rate import rising
+from gscodec.metrics import rising
 
 OURS = "gscodec"
 LOOK = {  # codec -> (name on the chart, colour)
@@ -27,12 +27,12 @@ SEQUENCES = {
     "fruit": "fruit (SH 3)",
 }
 SAVED_AGAINST = {"videogs": "VideoGS", "x265": "x265"}
-PSNR_MIN = 35  # below it nobody watches
-LABEL_GAP = 0.062  # of the height of the axes, between two names
+PSNR_MIN = 35  # dB, the lowest quality shown
+LABEL_GAP = 0.062  # between two names, in heights of the axes
 
 
 def size_chart(result: dict):
-    """kB a frame against codec PSNR, a panel for each sequence (matplotlib)."""
+    """kB per frame against codec PSNR, a panel per sequence (matplotlib)."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.5, 4.6), layout="constrained")
@@ -46,12 +46,12 @@ def size_chart(result: dict):
         _lines(axes, swapped, end_by=1)
         axes.set_title(f"{SEQUENCES[name]}\n{_saving(result, name)}", loc="left", fontsize=9.5)
     figure.suptitle("Size against quality: up and to the left is better", x=0.01, ha="left", fontsize=11, weight="bold")
-    _signed(figure, result)
+    _footer(figure, result)
     return figure
 
 
 def time_chart(result: dict):
-    """Seconds to encode and milliseconds to decode a frame against codec PSNR, on the statue (matplotlib)."""
+    """Seconds to encode and ms to decode a frame against codec PSNR, on the statue (matplotlib)."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.5, 4.6), layout="constrained")
@@ -68,7 +68,7 @@ def time_chart(result: dict):
         axes.set_title(title, loc="left", fontsize=9.5)
     heading = f"Time against quality, lower is faster ({SEQUENCES['statue']})"
     figure.suptitle(heading, x=0.01, ha="left", fontsize=11, weight="bold")
-    _signed(figure, result)
+    _footer(figure, result)
     return figure
 
 
@@ -89,7 +89,7 @@ def frames_chart(result: dict):
     axes.invert_yaxis()
     axes.set(xlabel="kB", xlim=(0, 1.25 * max((s["peer_kb"] for s in shares), default=1)))
     axes.set_title("Single frames at the same codec PSNR", loc="left", fontsize=11, weight="bold")
-    _signed(figure, result)
+    _footer(figure, result)
     return figure
 
 
@@ -99,7 +99,7 @@ def _bar(axes, y: float, size: float, label: str, color: str, *, alpha: float = 
 
 
 def _curves(entries: Sequence[dict], sequence: str, key: str) -> dict[str, list[tuple[float, float]]]:
-    """Codec -> (PSNR, value of `key`) of the points that no other point of that codec beats in size and quality."""
+    """Codec -> (PSNR, value of `key`) of the points on its Pareto front of size and quality."""
     curves = {}
     for codec in LOOK:
         of = {
@@ -112,9 +112,9 @@ def _curves(entries: Sequence[dict], sequence: str, key: str) -> dict[str, list[
 
 
 def _lines(axes, curves: dict[str, list[tuple[float, float]]], end_by: int) -> None:
-    """Draws the curves and names them: ours where it starts, the others in a column beside their ends.
+    """Draws and names the curves: ours at its start, the others in a column beside their ends.
 
-    Limits and scales of the axes have to be set before, since the places of the names depend on them.
+    Limits and scales of the axes must be set before, since the positions of the names depend on them.
 
     Args:
         end_by: the coordinate (0 or 1) that is greatest at the end of a curve.
@@ -148,7 +148,7 @@ def _lines(axes, curves: dict[str, list[tuple[float, float]]], end_by: int) -> N
 
 
 def _spread(heights: list[float]) -> list[float]:
-    """Rising heights in 0..1, moved apart by LABEL_GAP where they are closer, without leaving the axes at the top."""
+    """Rising heights in 0..1, moved apart to LABEL_GAP where they are closer, none above 1."""
     for i in range(1, len(heights)):
         heights[i] = max(heights[i], heights[i - 1] + LABEL_GAP)
     top = 1.0
@@ -159,7 +159,7 @@ def _spread(heights: list[float]) -> list[float]:
 
 
 def _limits(values: Sequence[float]) -> tuple[float, float]:
-    """With some air, for a logarithmic axis."""
+    """Range of the values with a margin, for a logarithmic axis."""
     return 0.8 * min(values), 1.25 * max(values)
 
 
@@ -177,7 +177,7 @@ def _saving(result: dict, sequence: str) -> str:
     return "BD-rate " + ", ".join(known) if known else ""
 
 
-def _signed(figure, result: dict) -> None:
+def _footer(figure, result: dict) -> None:
     machine = result["machine"]
     text = f"{machine['cpu']}, {machine['cores']} cores; PSNR on every {result['settings']['psnr_every']}th frame"
     figure.text(0.995, 0.995, text, ha="right", va="top", fontsize=7, color="#888888")

@@ -1,15 +1,16 @@
-"""Charts from results: every .json in a folder that has charts becomes their .svg and .png. matplotlib draws."""
+"""Results -> charts: each .json of a folder that is named in CHARTS is drawn as .svg and .png by matplotlib."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
-from ..errors import UsageError, require
-from .ablation_chart import ablation_chart
-from .rd_chart import frames_chart, size_chart, time_chart
-from .speed_chart import speed_chart
-from .train_chart import train_chart
+from gscodec.errors import UsageError, require
+
+from .ablation import ablation_chart
+from .raster import speed_chart
+from .rd import frames_chart, size_chart, time_chart
+from .train import train_chart
 
 CHARTS = {  # result file without .json -> chart -> function(result) that returns a matplotlib Figure
     "ablation": {"ablation": ablation_chart},

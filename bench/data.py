@@ -1,0 +1,27 @@
+"""The data folder: captures and splats that are too large for the repository, where GSCODEC_DATA says."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+from gscodec.errors import UsageError
+
+
+def data_folder() -> Path:
+    """The data folder of a script, which ends with a sentence if GSCODEC_DATA is not set."""
+    if not os.environ.get("GSCODEC_DATA"):
+        sys.exit("error: GSCODEC_DATA is not set, expected the folder with the captures and splats")
+    return Path(os.environ["GSCODEC_DATA"])
+
+
+def existing(path: Path) -> Path:
+    """`path`, which is in the data folder.
+
+    Raises:
+        UsageError: it is not.
+    """
+    if not path.exists():
+        raise UsageError(f"{path} is not there; the data folder (GSCODEC_DATA) must have it")
+    return path
