@@ -13,7 +13,7 @@ import pytest
 
 from gscodec.capture import View, composite, find_capture, open_capture
 from gscodec.capture.images import read_image, resize_area
-from gscodec.capture.undistort import undistortion
+from gscodec.capture.undistort import Undistortion
 from gscodec.capture.video import Video
 from gscodec.errors import CaptureError, UsageError, require
 from gscodec.model.camera import Camera, look_at
@@ -173,14 +173,15 @@ def break_pose(values):
 @pytest.mark.parametrize(
     ("harm", "message"),
     [
-        (lambda f: f.pop("transform_matrix"), "cam1 is left out: frame 0 has no pose"),
+        (lambda f: f.pop("transform_matrix"), "cam1 is left out: frame 0: no pose, expected transform_matrix"),
         (break_pose(np.zeros((4, 4)).tolist()), "frame 0: transform_matrix is singular"),
         (break_pose(np.diag([1, 1, -1, 1]).tolist()), "singular, sheared or mirrored"),
         (break_pose([[1, 2], [3]]), "transform_matrix is not 4x4 finite numbers"),
         (lambda f: f.__setitem__("frame", 7), "frame 0 is missing"),
         (lambda f: f.__setitem__("file_path", "images/none.png"), r"frame 0: image .*none.png is missing"),
-        (lambda f: f.__setitem__("w", 99), r"image .*000.png is 24x16, expected 99x16"),
-        (lambda f: f.__setitem__("fl_x", -1), "focal length -1 x -1 is not positive"),
+        (lambda f: f.__setitem__("w", 99), r"frame 0: image .*000.png is 24x16, expected 99x16"),
+        (lambda f: f.__setitem__("fl_x", -1), "frame 0: focal length -1 x -1 is not positive"),
+        (lambda f: f.__setitem__("cx", "left"), "frame 0: not a number"),
     ],
 )
 def test_a_broken_camera_is_left_out(rig, harm, message):
@@ -191,17 +192,91 @@ def test_a_broken_camera_is_left_out(rig, harm, message):
     assert [c.name for c in capture.cameras] == ["cam0", "cam2"]
 
 
-def test_a_moving_camera_is_left_out(rig):
+def test_a_camera_may_move(rig):
+    """Each frame has its own pose and intrinsics, also in a part of the capture and at another scale."""
     _, data, save = rig
-    data["frames"][3]["transform_matrix"] = pose(9).tolist()
-    with pytest.warns(UserWarning, match="camera cam1 is left out: it moves at frame 1"):
-        assert len(save().cameras) == 2
+    assert not save().moves
+    data["frames"][3] |= {"transform_matrix": pose(9).tolist(), "fl_x": 40.0}
+    capture = save()
+    assert (len(capture.cameras), capture.moves) == (3, True)
+    there = np.linalg.inv(pose(9) @ GL)
+    np.testing.assert_allclose(capture.camera(1, 0).viewmat, np.linalg.inv(pose(1) @ GL), atol=1e-9)
+    np.testing.assert_allclose(capture.camera(1, 1).viewmat, there, atol=1e-9)
+    assert (capture.camera(1, 0).K[0, 0], capture.camera(1, 1).K[0, 0]) == (30, 40)
+    np.testing.assert_array_equal(capture.camera(2, 0).viewmat, capture.camera(2, 1).viewmat)
+    last = capture.scaled(0.5).frames(1)
+    assert not last.moves, "it has one frame"
+    for camera in (last.camera(1, 0), last.cameras[1]):
+        np.testing.assert_allclose(camera.viewmat, there, atol=1e-9)
+        assert (camera.name, camera.width, camera.K[0, 0]) == ("cam1", 12, 20)
+    assert last.camera(2, 0).split == "test"
+    with pytest.raises(UsageError, match="no frame 2, there are 2"):
+        capture.camera(0, 2)
+    with pytest.raises(UsageError, match="no camera 3, there are 3"):
+        capture.camera(3, 0)
+
+
+def test_rounding_errors_are_no_motion(rig):
+    _, data, save = rig
+    for f in data["frames"][1::2]:
+        f["transform_matrix"] = (np.array(f["transform_matrix"]) * (1 + 1e-7)).tolist()
+        f["fl_x"] = 30.00001
+    capture = save()
+    assert not capture.moves
+    assert capture.poses is None
+    assert capture.camera(0, 1) is capture.cameras[0]
+
+
+def test_a_moving_camera_without_a_name(rig):
+    """Entries of one folder, each with its own time, are one camera."""
+    _, data, save = rig
+    for i, f in enumerate(data["frames"]):
+        del f["camera"]
+        f["transform_matrix"] = pose(i).tolist()
+    capture = save()
+    assert [c.name for c in capture.cameras] == ["images_cam0", "images_cam1", "images_cam2"]
+    assert (capture.frame_count, capture.moves) == (2, True)
+    np.testing.assert_allclose(capture.camera(1, 1).viewmat, np.linalg.inv(pose(3) @ GL), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("harm", "message"),
+    [
+        (lambda f: f.pop("transform_matrix"), "cam1 is left out: frame 1: no pose, expected transform_matrix"),
+        (lambda f: f.__setitem__("fl_x", 0), "cam1 is left out: frame 1: focal length 0 x 0 is not positive"),
+        (lambda f: f.__setitem__("h", 17), r"cam1 is left out: frame 1: image .*001.png is 24x16, expected 24x17"),
+    ],
+)
+def test_a_broken_frame_of_a_camera_is_named(rig, harm, message):
+    _, data, save = rig
+    harm(data["frames"][3])
+    with pytest.warns(UserWarning, match=message):
+        assert [c.name for c in save().cameras] == ["cam0", "cam2"]
+
+
+def test_a_lens_may_change_between_frames(rig):
+    """Each frame is undistorted with its own lens."""
+    _, data, save = rig
+    data["frames"][0] |= {"k1": -0.3, "cx": 4.0}
+    data["frames"][1] |= {"k1": -0.3, "cx": 4.0, "fl_x": 15.0}
+    capture = save()
+    for t, focal in enumerate((30.0, 15.0)):
+        K = np.array([[focal, 0, 4], [0, focal, 8], [0, 0, 1]])
+        camera = Camera("cam0", K, np.eye(4), W, H, np.array([-0.3, 0, 0, 0, 0]))
+        lens, seen = Undistortion(), pixels(0, t)
+        expected = lens.view(View(np.ascontiguousarray(seen[..., :3]), np.ascontiguousarray(seen[..., 3])), camera)
+        np.testing.assert_allclose(capture.camera(0, t).K, lens.camera(camera).K, atol=1e-9)
+        np.testing.assert_array_equal(capture.view(0, t).alpha, expected.alpha)
+    assert np.abs(capture.view(0, 0).alpha.astype(int) - capture.view(0, 1).alpha).max() > 0
 
 
 def test_no_camera_left_is_an_error(rig):
     _, data, save = rig
     del data["fl_x"]
-    with pytest.raises(CaptureError, match="no camera can be used; the last one: no focal length"), pytest.warns():
+    with (
+        pytest.raises(CaptureError, match="no camera can be used; the last one: frame 0: no focal length"),
+        pytest.warns(),
+    ):
         save()
 
 
@@ -241,6 +316,8 @@ def test_damaged_and_missing_images(rig):
         ("{", "not valid JSON"),
         ('{"frames": []}', "no 'frames'"),
         ('{"frames": [{}]}', r"frames\[0\] has no file_path"),
+        ('{"frames": [{"file_path": "a", "frame": "x"}]}', r"frame or time of frames\[0\] is not a number"),
+        ('{"fps": "fast", "frames": [{"file_path": "a"}]}', r"fps, frame or time is not a number"),
         ('{"camera_model": "OPENCV_FISHEYE", "frames": [{}]}', "camera_model OPENCV_FISHEYE is not supported"),
     ],
 )
@@ -315,14 +392,15 @@ def test_composite_blends_over_the_background():
 def test_undistortion_moves_pixels_where_opencv_projects_them():
     K = np.array([[80.0, 0, 48], [0, 80, 32], [0, 0, 1]])
     camera = Camera("a", K, np.eye(4), 96, 64, np.array([-0.2, 0.05, 0.01, -0.01]))
-    pinhole, warp = undistortion(camera)
+    lens = Undistortion()
+    pinhole = lens.camera(camera)
     assert not pinhole.distortion.size
     point = np.array([[[0.15, -0.1, 1.0]]])
     zero = np.zeros(3)
     u, v = cv2.projectPoints(point, zero, zero, K, camera.distortion)[0].ravel()  # half-integer pixel centres
     y, x = np.mgrid[:64, :96] + 0.5
     image = np.exp(-((x - u) ** 2 + (y - v) ** 2) / 8) * 255
-    out = warp(View(np.dstack([image] * 3).astype(np.uint8))).rgb[..., 0].astype(float)
+    out = lens.view(View(np.dstack([image] * 3).astype(np.uint8)), camera).rgb[..., 0].astype(float)
     at = pinhole.K @ point[0, 0]
     assert (out * x).sum() / out.sum() == pytest.approx(at[0], abs=0.15)
     assert (out * y).sum() / out.sum() == pytest.approx(at[1], abs=0.15)

@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import CaptureError
 from ..model.camera import Camera
 from .capture import Capture
-from .rig import VIDEOS, Feed, assemble, numbered, pinhole, rigid, usable
+from .rig import VIDEOS, Feed, Track, assemble, numbered, pinhole, rigid, usable
 from .video import Video
 
 
@@ -35,10 +35,11 @@ def open_n3dv(poses: Path) -> Capture:
         raise CaptureError(f"{poses}: {len(rows)} cameras, expected as many as there are videos: {len(videos)}")
     made = {v.stem: (row[:15].reshape(3, 5), v) for row, v in zip(rows, videos, strict=True)}
     first = next(iter(made))
-    cameras, feeds = usable(
-        poses, made, lambda n, item: (_camera(n, item[0], "test" if n == first else "train"), Feed(Video(item[1])))
-    )
-    return assemble(poses.parent.resolve().name, cameras, feeds)
+
+    def make(name: str, item: tuple[np.ndarray, Path]) -> tuple[Track, Feed]:
+        return [_camera(name, item[0], "test" if name == first else "train")], Feed(Video(item[1]))
+
+    return assemble(poses.parent.resolve().name, *usable(poses, made, make))
 
 
 def _camera(name: str, m: np.ndarray, split: str) -> Camera:

@@ -19,7 +19,7 @@ import numpy as np
 from ..errors import CaptureError
 from ..model.camera import Camera
 from .capture import Capture
-from .rig import Feed, assemble, find_video, numbered, pinhole, rigid, usable
+from .rig import Feed, Track, assemble, find_video, numbered, pinhole, rigid, usable
 from .video import Video
 
 UNIT = 64  # calibration units per pixel
@@ -41,9 +41,9 @@ def open_qualisys(root: Path, calibration: Path) -> Capture:
     elements = {e.get("serial", "?"): e for e in _cameras(calibration)}
     folders = [f for f in (root / "videos", root) if f.is_dir()]
 
-    def make(name: str, element: ET.Element) -> tuple[Camera, Feed]:
+    def make(name: str, element: ET.Element) -> tuple[Track, Feed]:
         camera = _camera(element, name)
-        return camera, Feed(Video(find_video(folders, name)), numbered(root / "masks" / name))
+        return [camera], Feed(Video(find_video(folders, name)), numbered(root / "masks" / name))
 
     return assemble(root.resolve().name, *usable(calibration, elements, make))
 

@@ -1,4 +1,4 @@
-"""ParametricGroup: what training makes, what fit/ makes of foreign splats, what encoding takes, what decoding gives back.
+"""ParametricGroup: training and fit/ make it, encoding takes it, decoding gives it back.
 
 One set of N Gaussians for T frames. Frame t = the canonical Gaussians, carried rigidly by the nodes of a deformation
 graph (HiFi4G), plus residual trajectories in a temporal DCT. Evaluation is native and the same for all four uses.
