@@ -27,7 +27,9 @@ def main() -> None:
     rows = []
     for t in frames:
         reference = composite(capture.view(camera, t), BACKGROUND)
-        rows.append(np.concatenate([reference, render_image(stream.frame(t), capture.cameras[camera], BACKGROUND)], 1))
+        rows.append(
+            np.concatenate([reference, render_image(stream.frame(t), capture.camera(camera, t), BACKGROUND)], 1)
+        )
     write_png(picture, np.concatenate(rows, 0))
 
 

@@ -57,7 +57,7 @@ class PictureTargets:
     its own: a haze in the colour of one that is known would pass for opacity.
 
     Args:
-        first_frame: of the capture, where the group begins. calibration: of its cameras.
+        first_frame: of the capture, where the group begins. calibration: what training found out about its cameras.
         gaussians: in the group.
 
     Attributes:
@@ -75,7 +75,7 @@ class PictureTargets:
 
     def draw(self, source: Callable[[int], Gaussians], frames: int) -> Iterator[Target]:
         """As of `DrawnTargets`; what the source looks like is not asked."""
-        largest = max(4 * c.width * c.height for c in self._calibration.cameras)
+        largest = max(4 * c.width * c.height for c in self._capture.cameras)
         read = lru_cache(max(1, CACHE_BYTES // largest))(self._read)
         random, order = np.random.default_rng(0), [[] for _ in range(frames)]
         for t in _turns(random, frames, len(self)):
@@ -88,7 +88,8 @@ class PictureTargets:
 
     def _read(self, camera: int, t: int) -> tuple[View, Camera]:
         view = self._capture.view(camera, self._first + t)
-        return cropped(view, self._calibration.cameras[camera])
+        there = self._capture.camera(camera, self._first + t)
+        return cropped(view, self._calibration.camera(there, camera))
 
 
 def targets_of(

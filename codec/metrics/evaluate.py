@@ -90,7 +90,8 @@ def evaluate_capture(
             gaussians, images = frame_source(t), []
             counts.append(len(gaussians))
             for n, index in enumerate(views):
-                images.append(_compare(gaussians, capture.cameras[index], capture.view(index, t), temporal[n], vmaf[n]))
+                view, camera = capture.view(index, t), capture.camera(index, t)
+                images.append(_compare(gaussians, camera, view, temporal[n], vmaf[n]))
                 if progress:
                     progress(t * len(views) + n + 1, capture.frame_count * len(views))
             rows.append({"frame": t} | {k: _mean(i[k] for i in images) for k in images[0]})
