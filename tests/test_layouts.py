@@ -202,10 +202,31 @@ def one_row_less(root):
     np.save(root / "poses_bounds.npy", np.load(root / "poses_bounds.npy")[1:])
 
 
+def at_another_shape(root):
+    path = root / "frame10/sparse/0/cameras.bin"
+    path.write_bytes(struct.pack("<QiiQQ4d", 1, 1, 1, 2 * W, H, FOCAL, FOCAL, W / 2, H / 2))
+
+
+def without_its_lens(root):
+    path = root / "frame10/sparse/0/cameras.bin"
+    path.write_bytes(struct.pack("<QiiQQ4d", 1, 9, 1, W, H, FOCAL, FOCAL, W / 2, H / 2))
+
+
+def without_rotation(root):
+    path = root / "colmap/sparse/0/images.txt"
+    path.write_text(path.read_text().replace(repr(quat(LATER[2])[0].item()), "nan"))
+
+
+def without_a_translation(root):
+    path = root / "cameras/cam10/extri.yml"
+    path.write_text(path.read_text().replace("T_000001", "T_000007"))
+
+
 def overwrite(name, text):
     return lambda root: (root / name).write_text(text)
 
 
+@pytest.mark.filterwarnings("ignore:.*is left out")
 @pytest.mark.parametrize(
     ("write", "harm", "message"),
     [
@@ -215,6 +236,12 @@ def overwrite(name, text):
         (n3dv, overwrite("poses_bounds.npy", "x"), r"poses_bounds.npy: not a numpy file"),
         (actorshq, overwrite("calibration.csv", "name,w\na,1\n"), r"expected a line for each camera with the columns"),
         (easyvolcap, overwrite("intri.yml", "%YAML:1.0\n---\n{"), r"intri.yml: not a calibration file of OpenCV"),
+        (
+            moving_frame_folders,
+            at_another_shape,
+            r"cam10.png is 24x16, expected 48x16 as the calibration of frame 1 says",
+        ),
+        (moving_frame_folders, without_its_lens, r"frame10/sparse/0 has no camera 1, which took image cam10.png"),
     ],
 )
 def test_a_broken_calibration_is_named(tmp_path, write, harm, message):
@@ -222,6 +249,24 @@ def test_a_broken_calibration_is_named(tmp_path, write, harm, message):
     harm(tmp_path)
     with pytest.raises(CaptureError, match=message):
         open_capture(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("write", "harm", "message"),
+    [
+        (moving_one_model, without_rotation, r"sparse/0, image cam10/1.png: its pose is singular or not a rotation"),
+        (
+            moving_easyvolcap,
+            without_a_translation,
+            r"frame 000001: .*extri.yml: T_000001 is missing or wrong, expected 3",
+        ),
+    ],
+)
+def test_a_broken_frame_of_a_camera_is_named(tmp_path, write, harm, message):
+    write(tmp_path)
+    harm(tmp_path)
+    with pytest.warns(UserWarning, match=f"camera cam10 is left out: .*{message}"):
+        assert [c.name for c in open_capture(tmp_path).cameras] == ["cam0", "cam2"]
 
 
 @pytest.mark.parametrize(

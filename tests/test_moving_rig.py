@@ -15,7 +15,7 @@ from gscodec.train.train import train_groups
 
 HANDHELD, ORBIT = (3.0, 0.06), 2.0
 TINY = TrainSettings(
-    gop=3, keyframe_steps=250, motion_steps=30, finetune_steps=10, gaussians_max=1000, initial_points=500
+    gop=2, keyframe_steps=200, motion_steps=30, finetune_steps=10, gaussians_max=800, initial_points=400
 )
 
 
@@ -96,17 +96,16 @@ def test_wrong_poses_stay_as_wrong_as_they_are():
     np.testing.assert_allclose(wrong[3], wrong[0], atol=1e-12)
 
 
-def psnr_later(capture: Capture, truth: Capture) -> float:
-    """psnr_fg on the test camera of `truth` after a short training on `capture`, over the frames after the first."""
+def psnr_of_second(capture: Capture, truth: Capture) -> float:
+    """psnr_fg on the test camera of `truth` after a short training on `capture`, in frame 1."""
     frames = [g for group in train_groups(capture, TINY) for g in group.frames]
-    rows = evaluate_capture(lambda t: frames[t], truth, with_vmaf=False)["per_frame"]
-    return float(np.mean([r["psnr_fg"] for r in rows[1:]]))
+    return evaluate_capture(lambda t: frames[t], truth, with_vmaf=False)["per_frame"][1]["psnr_fg"]
 
 
 def test_training_has_the_camera_of_each_frame():
     """The same training with the cameras of the first frame in all frames is far worse."""
     figure = lambda t: walking(t, 0.3)  # noqa: E731
-    capture = Scene(figure, frames=3, train=8, test=1, size=64, handheld=(6.0, 0.12), orbit=5.0).capture("walking")
-    moving, fixed = psnr_later(capture, capture), psnr_later(replace(capture, poses=None), capture)
+    capture = Scene(figure, frames=2, train=8, test=1, size=64, handheld=(6.0, 0.12), orbit=5.0).capture("walking")
+    moving, fixed = psnr_of_second(capture, capture), psnr_of_second(replace(capture, poses=None), capture)
     assert moving > 23.5
     assert moving > fixed + 3

@@ -76,11 +76,14 @@ class _Model:
         if lens is None:
             raise CaptureError(f"{self.folder} has no camera {i.lens}, which took image {image}")
         fx, fy, cx, cy, *distortion = lens.params
-        turns = 0 < np.linalg.norm(i.quat) < np.inf  # others are refused as no rotation
-        R = Rotation.from_quat(np.roll(i.quat, -1)).as_matrix() if turns else np.zeros((3, 3))
-        lens_terms = np.array((distortion + [0.0] * 4)[:4])
-        viewmat = rigid(R, i.translation)
-        return Camera(_name(image), pinhole(fx, fy, cx, cy), viewmat, lens.width, lens.height, lens_terms)
+        unit = 0 < np.linalg.norm(i.quat) < np.inf
+        R = Rotation.from_quat(np.roll(i.quat, -1)).as_matrix() if unit else np.zeros((3, 3))  # which `rigid` refuses
+        terms = np.array((distortion + [0.0] * 4)[:4])
+        try:
+            K, viewmat = pinhole(fx, fy, cx, cy), rigid(R, i.translation)
+        except CaptureError as e:
+            raise CaptureError(f"{self.folder}, image {image}: {e}") from e
+        return Camera(_name(image), K, viewmat, lens.width, lens.height, terms)
 
 
 def find_model(folder: Path) -> Path | None:
@@ -165,7 +168,7 @@ def _track(known: list[Camera | None], paths: list[Path]) -> Track:
 
 
 def _name(image: str) -> str:
-    """The camera's: the folder of the image where it has one."""
+    """The camera of an image: its folder, or its own name where it has no folder."""
     path = Path(image)
     return path.parent.as_posix() if path.parent.name else path.stem
 
@@ -177,7 +180,7 @@ def _there(path: Path) -> Path:
 
 
 def _mask(folder: Path, image: Path) -> Path | None:
-    """Of the image of that name, also with its suffix and .png behind it (as COLMAP wants masks)."""
+    """The mask of an image: the same name with any suffix, or the whole name with .png appended (COLMAP's way)."""
     names = [image.with_suffix(s) for s in SUFFIXES] + [image.with_name(image.name + ".png")]
     return next((folder / n for n in names if (folder / n).is_file()), None)
 

@@ -35,13 +35,13 @@ class _Yaml:
             raise CaptureError(f"{path}: not a calibration file of OpenCV")
 
     def names(self) -> list[str]:
-        """The list `names`; numbers may stand there without quotes."""
+        """The list `names`, of strings or integers."""
         node = self._file.getNode("names")
         items = [node.at(i) for i in range(node.size())]
         return [i.string() if i.isString() else str(int(i.real())) for i in items]
 
     def matrix(self, key: str, *shape: int) -> np.ndarray:
-        """Raises CaptureError where it is missing or has another shape."""
+        """[*shape] f64. Raises CaptureError: it is missing, has another shape, or is not finite."""
         m = self._file.getNode(key).mat()
         if m is None or m.size != np.prod(shape) or not np.isfinite(m).all():
             size = " x ".join(map(str, shape))
@@ -52,7 +52,7 @@ class _Yaml:
         return not self._file.getNode(key).empty()
 
     def number(self, key: str) -> int:
-        """0 where it is missing."""
+        """An integer, 0 where it is missing."""
         return int(self._file.getNode(key).real())
 
 
@@ -87,7 +87,13 @@ def open_easyvolcap(root: Path, calibration: Path) -> Capture:
     def moving(name: str, folder: Path) -> tuple[Track, Feed]:
         pair, footage = _pair(folder), feed(name)
         frames = sorted(pair[0].names(), key=lambda frame: by_number(Path(frame)))
-        return [replace(_camera(frame, *pair, footage), name=name) for frame in frames], footage
+        track = []
+        for frame in frames:
+            try:
+                track.append(replace(_camera(frame, *pair, footage), name=name))
+            except CaptureError as e:
+                raise CaptureError(f"frame {frame}: {e}") from e
+        return track, footage
 
     def fixed(name: str, pair: tuple[_Yaml, _Yaml]) -> tuple[Track, Feed]:
         footage = feed(name)

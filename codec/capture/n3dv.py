@@ -1,8 +1,8 @@
 """Neural 3D Video (Li et al. 2022) -> Capture: one camNN.mp4 a camera and poses_bounds.npy.
 
-A row of poses_bounds.npy (LLFF, Mildenhall et al. 2019) has a [3, 5] matrix, camera-to-world with the axes down, right
-and back, then height, width and focal length in pixels, and two depths that are not used. Rows are in the order of the
-videos' names. The first camera is the test camera, as every paper on the dataset has it.
+A row of poses_bounds.npy (LLFF, Mildenhall et al. 2019) has a [3, 5] matrix and two depths, which are not used. The
+matrix is camera-to-world with the axes down, right and back; its last column has height, width and focal length in
+pixels. Rows are in the order of the videos' names. The first camera is the test camera, as in papers on the dataset.
 """
 
 from __future__ import annotations

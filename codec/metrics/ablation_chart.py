@@ -1,4 +1,4 @@
-"""bench/results/ablation.json -> what the training loses, and what it costs, without each of its losses and tools."""
+"""bench/results/ablation.json -> change of quality, size and flicker when a loss or a tool of the training is off."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ LESS, MORE = "#1f5fb4", "#c76f14"
 
 
 def ablation_chart(result: dict):
-    """A row for each capture, bars of the difference to the whole recipe (matplotlib)."""
+    """A matplotlib figure: a row for each capture, a bar for each variant, its difference from the whole recipe."""
     from matplotlib.figure import Figure
 
     captures = list(dict.fromkeys(e["capture"] for e in result["entries"]))

@@ -1,6 +1,6 @@
 """Two rate-distortion curves -> Bjontegaard delta rate (VCEG-M33), piecewise cubic (PCHIP) as in JCT-VC.
 
-PCHIP instead of one cubic: it does not swing between points, so that four or forty points give sensible areas.
+PCHIP does not overshoot between points, as one cubic through all of them does.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def bd_rate(
 
     Args:
         anchor, test: (rate, PSNR) points, any unit of rate, in any order.
-        within: the PSNR that matters; the mean is over what of it both curves reach.
+        within: a range of PSNR; the mean is over the part of it that both curves reach.
 
     Returns:
         Per cent; negative where `test` needs fewer bits than `anchor`.
@@ -51,7 +51,8 @@ def shared_psnr(
 
 
 def rising(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The (rate, PSNR) points that no other one beats at its rate or below, in rising order: what `bd_rate` takes."""
+    """The (rate, PSNR) points without those that another point beats at the same or a lower rate, in rising order, as
+    `bd_rate` takes them."""
     best: list[tuple[float, float]] = []
     for rate, quality in sorted(points, key=lambda p: (p[0], -p[1])):
         if not best or quality > best[-1][1]:

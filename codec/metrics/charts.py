@@ -1,4 +1,4 @@
-"""Charts from results: every .json in a folder that has charts becomes their .svg and .png. matplotlib draws."""
+"""Result files (.json) -> charts as .svg and .png, by matplotlib."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def draw_charts(results: Path, charts: Path) -> list[Path]:
     """Draws the charts of the results in a folder; returns the files written.
 
     Raises:
-        UsageError: there is nothing to draw, or matplotlib is not installed.
+        UsageError: no result has a chart, or matplotlib is not installed.
     """
     require("matplotlib", "drawing charts", "charts")
     from matplotlib import rc_context
@@ -38,7 +38,7 @@ def draw_charts(results: Path, charts: Path) -> list[Path]:
     for path in found:
         result = json.loads(path.read_text())
         for name, draw in CHARTS[path.stem].items():
-            # a fixed salt and no date: the same results give the same bytes
+            # with a fixed salt and no date the same results give the same bytes
             with rc_context({"svg.hashsalt": name, "svg.fonttype": "none", **STYLE}):
                 figure = draw(result)
                 for suffix, options in ((".svg", {"metadata": {"Date": None}}), (".png", {"dpi": 110})):

@@ -1,4 +1,4 @@
-"""Gaussians -> the 16 cameras from which stream and source are compared where there is no capture.
+"""Gaussians -> the 16 cameras of codec_psnr, which compares a stream with the splats that it was made of.
 
 Directions on a Fibonacci sphere around the box of the 1st to 99th percentile of positions; even cameras have its
 bounding sphere just in frame, odd ones stand at half that distance. 512 x 512, focal length 1.2 x width.
@@ -18,10 +18,10 @@ COUNT = 16
 
 
 def codec_cameras(frames: Sequence[Gaussians]) -> list[Camera]:
-    """The cameras around what the given frames hold together.
+    """The cameras around the Gaussians of all given frames.
 
     Raises:
-        UsageError: the frames hold no Gaussians.
+        UsageError: the frames have no Gaussians.
     """
     means = np.concatenate([g.means for g in frames]) if frames else np.zeros((0, 3))
     if not len(means):

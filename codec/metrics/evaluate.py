@@ -1,7 +1,8 @@
-"""Decoded frames against a capture or against the splats they were made of -> the figures of `gscodec eval`.
+"""Decoded frames and their reference, a capture or splats -> the figures of `gscodec eval`.
 
-One pass, frame by frame and camera by camera, with running sums: neither side is ever in memory as a whole. Views
-of a capture are composited over mid-grey, on which dark and bright haze show alike, and so are the Gaussians.
+One pass over frames and cameras: one frame of each side is in memory. Views of a capture and rendered Gaussians are
+composited over mid-grey, on which dark and bright haze have the same contrast. Each view is compared with the picture
+of its camera in its frame, since cameras may move.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from .stability import TemporalMeter
 from .vmaf import VmafMeter
 
 BACKGROUND = (0.5, 0.5, 0.5)
-FG_ALPHA = 0.02  # of a rendered reference: the foreground of codec_psnr_fg
+FG_ALPHA = 0.02  # foreground of codec_psnr_fg: alpha of the rendered reference is above this
 FrameSource = Callable[[int], Gaussians]
 Progress = Callable[[int, int], None]  # (images done, images)
 
@@ -32,11 +33,13 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 
 def _report(frame_count: int, counts: list[int], size: int | None, rows: list[dict]) -> dict:
-    """The keys that both kinds of evaluation share; those that do not apply stay None.
+    """The report of both kinds of evaluation; keys that do not apply are None.
 
     Args:
-        frame_count: frames of the stream, which is what `size` pays for; `counts` and `rows` may be of some of them.
+        frame_count: frames of the stream, over which `size` is divided; more than are measured where only some are.
         counts: Gaussians of each frame that was measured.
+        size: bytes of the stream, or None.
+        rows: the figures of each frame that was measured.
     """
     gaussians = float(np.mean(counts))
     known = {k: _mean(r[k] for r in rows) for k in rows[0] if k != "frame"}
@@ -68,7 +71,7 @@ def evaluate_capture(
         frame_source: frame -> Gaussians as shown, for every frame of the capture.
         split: cameras to compare with, "test" or "train".
         size: bytes of the stream, for the rates.
-        with_vmaf: VMAF too, which takes about as long as everything else.
+        with_vmaf: measure VMAF too, which doubles the time.
         progress: called with (images done, images).
 
     Returns:
@@ -104,7 +107,7 @@ def evaluate_capture(
 
 
 def _compare(g: Gaussians, camera: Camera, view: View, temporal: TemporalMeter, vmaf: VmafMeter | None) -> dict:
-    """The figures of one image; the meters remember it."""
+    """The figures of one image, which is also added to the meters."""
     from ..render.image import render_image
 
     reference, image = composite(view, BACKGROUND), render_image(g, camera, background=BACKGROUND)
@@ -134,7 +137,7 @@ def evaluate_splats(
     Args:
         frame_source: frame -> Gaussians as shown.
         frames: the frames to compare; all by default.
-        size: bytes of the stream, for the rates; they are taken over all frames of the sequence.
+        size: bytes of the stream, for the rates, which are over all frames of the sequence.
 
     Returns:
         The keys of evaluate_capture with codec_psnr and codec_psnr_fg instead of psnr, psnr_fg, ssim, vmaf and flicker.

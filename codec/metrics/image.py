@@ -1,7 +1,7 @@
 """Image pairs -> PSNR, foreground PSNR, haze, SSIM. 8-bit sRGB in, decibels or 8-bit levels out.
 
-The foreground is where the reference has any coverage, grown by 8 px, so that a blurred outline counts and an empty
-background does not flatter; what a codec paints beyond it is haze and is told apart.
+The foreground is where the alpha of the reference is above 0, dilated by 8 px: blurred outlines are measured, the empty
+background does not raise the PSNR. The error outside of it is reported as haze.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import UsageError, require
 
-PSNR_MAX = 100.0  # of equal images, so that means and JSON stay finite
+PSNR_MAX = 100.0  # dB, of equal images: means and JSON stay finite
 GROW = 8  # px by which the foreground is dilated
 
 
@@ -28,7 +28,7 @@ def psnr_of_mse(mse: float, peak: float = 255.0) -> float:
 
 
 def psnr(reference: np.ndarray, image: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """PSNR in dB of [H, W, 3] u8 images, or of the pixels in `mask` [H, W] bool; 100 where it is empty."""
+    """PSNR in dB of [H, W, 3] u8 images, or of their pixels in `mask` [H, W] bool; 100 if the mask is empty."""
     _check(reference, image)
     d = reference.astype(np.float32) - image
     d = d if mask is None else d[mask]
@@ -43,12 +43,12 @@ def foreground(alpha: np.ndarray, grow: int = GROW) -> np.ndarray:
 
 
 def psnr_fg(reference: np.ndarray, image: np.ndarray, alpha: np.ndarray | None) -> float:
-    """PSNR of the foreground; of the whole image where the reference has no alpha."""
+    """PSNR in dB of the foreground; of the whole image if `alpha` is None."""
     return psnr(reference, image, None if alpha is None else foreground(alpha))
 
 
 def haze(reference: np.ndarray, image: np.ndarray, alpha: np.ndarray | None) -> float:
-    """Mean absolute error outside the foreground in 8-bit levels; 0 where there is no outside."""
+    """Mean absolute error outside the foreground, 8-bit levels; 0 if the foreground is everything."""
     _check(reference, image)
     outside = np.zeros(reference.shape[:2], bool) if alpha is None else ~foreground(alpha)
     d = np.abs(reference.astype(np.int16) - image)[outside]

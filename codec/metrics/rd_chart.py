@@ -1,4 +1,4 @@
-"""bench/results/rd.json -> charts of size, time and single frames against quality, with codecs named at their lines."""
+"""bench/results/rd.json -> charts of size, time and single frames against quality; each line has the codec's name."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SEQUENCES = {
     "fruit": "fruit (SH 3)",
 }
 SAVED_AGAINST = {"videogs": "VideoGS", "x265": "x265"}
-PSNR_MIN = 35  # below it nobody watches
+PSNR_MIN = 35  # dB; points below are not drawn
 LABEL_GAP = 0.062  # of the height of the axes, between two names
 
 
@@ -112,9 +112,9 @@ def _curves(entries: Sequence[dict], sequence: str, key: str) -> dict[str, list[
 
 
 def _lines(axes, curves: dict[str, list[tuple[float, float]]], end_by: int) -> None:
-    """Draws the curves and names them: ours where it starts, the others in a column beside their ends.
+    """Draws the curves and their names: ours at its start, the others in a column beside their ends.
 
-    Limits and scales of the axes have to be set before, since the places of the names depend on them.
+    The limits and scales of the axes must be set before: the positions of the names depend on them.
 
     Args:
         end_by: the coordinate (0 or 1) that is greatest at the end of a curve.
@@ -148,7 +148,7 @@ def _lines(axes, curves: dict[str, list[tuple[float, float]]], end_by: int) -> N
 
 
 def _spread(heights: list[float]) -> list[float]:
-    """Rising heights in 0..1, moved apart by LABEL_GAP where they are closer, without leaving the axes at the top."""
+    """Rising heights in 0..1, moved apart to at least LABEL_GAP, none above 1."""
     for i in range(1, len(heights)):
         heights[i] = max(heights[i], heights[i - 1] + LABEL_GAP)
     top = 1.0
@@ -159,7 +159,7 @@ def _spread(heights: list[float]) -> list[float]:
 
 
 def _limits(values: Sequence[float]) -> tuple[float, float]:
-    """With some air, for a logarithmic axis."""
+    """Limits of a logarithmic axis: the range of the values and a margin."""
     return 0.8 * min(values), 1.25 * max(values)
 
 

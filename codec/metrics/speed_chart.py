@@ -33,7 +33,7 @@ def speed_chart(result: dict):
 
 
 def _usual(entries: list[dict]) -> list[dict]:
-    """Those that the capsule covers as in the entry of 100,000 Gaussians."""
+    """The entries whose covered share of the image is that of the entry with 100,000 Gaussians."""
     share = next((e["covered"] for e in entries if e["gaussians"] == 100_000), None)
     return [e for e in entries if share is None or abs(e["covered"] - share) < 0.25 * share]
 

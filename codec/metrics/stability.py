@@ -1,8 +1,8 @@
 """Frames of one camera -> temporal stability and flicker.
 
-PSNR is blind to whether an error stays or dances. `stability` is the PSNR of differences of consecutive frames.
-`flicker` looks where nothing should happen: pixels whose reference stays within a range of less than 2 levels over
-5 frames, and there at the standard deviation of the image over the same frames, in 8-bit levels.
+PSNR does not tell a constant error from one that changes in each frame. `stability` is the PSNR of differences of
+consecutive frames. `flicker` is measured at still pixels, whose reference changes by less than 2 levels over 5 frames:
+it is the standard deviation of the image over these frames, in 8-bit levels. A moving camera has few still pixels.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ STILL = 2  # 8-bit levels
 
 
 class TemporalMeter:
-    """Takes the frames of one camera in order and keeps no more than a window of them."""
+    """Takes the frames of one camera in order; keeps the last WINDOW of them."""
 
     def __init__(self):
         self._references: deque[np.ndarray] = deque(maxlen=WINDOW)
@@ -27,10 +27,10 @@ class TemporalMeter:
         self._deviation, self._samples = 0.0, 0
 
     def add(self, reference: np.ndarray, image: np.ndarray, mask: np.ndarray | None = None) -> float | None:
-        """Adds a frame, [H, W, 3] u8; flicker is measured where `mask` ([H, W] bool) holds in the last frame.
+        """Adds a frame, [H, W, 3] u8; flicker is measured inside `mask` ([H, W] bool) of the last frame.
 
         Returns:
-            Flicker of the window that ends here, None as for `flicker`.
+            Flicker over the last WINDOW frames; None: there are fewer, or no pixel is still.
         """
         if self._images:
             change = reference.astype(np.float32) - self._references[-1]
@@ -56,5 +56,5 @@ class TemporalMeter:
 
     @property
     def flicker(self) -> float | None:
-        """8-bit levels; None where fewer than 5 frames or no still pixel were seen."""
+        """8-bit levels, over all frames; None: fewer than 5 frames, or no pixel was still."""
         return self._deviation / self._samples if self._samples else None

@@ -1,4 +1,4 @@
-"""bench/results/train.json -> quality of training against its time and its size, by recipe and preset."""
+"""bench/results/train.json -> quality of training against its time and against the size of the stream."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ PANELS = {"seconds_per_frame": "training, seconds a frame", "kb_per_frame": "kB 
 
 
 def train_chart(result: dict):
-    """A row for each capture, a panel for time and one for size (matplotlib)."""
+    """A matplotlib figure: a row for each capture, a panel for time and one for size."""
     from matplotlib.figure import Figure
 
-    shown = [e for e in result["entries"] if e["frames"][0] == 0]  # a few frames in a row from the middle: for flicker
+    shown = [
+        e for e in result["entries"] if e["frames"][0] == 0
+    ]  # the others, from the middle of a capture, measure flicker
     captures = list(dict.fromkeys(e["capture"] for e in shown))
     figure = Figure(figsize=(10, 3.4 * len(captures)), layout="constrained")
     for row, capture in zip(figure.subplots(len(captures), 2, squeeze=False), captures, strict=True):
@@ -49,7 +51,7 @@ def _panel(axes, entries: Sequence[dict], key: str) -> None:
             axes.annotate(preset, at, (4, -9), textcoords="offset points", fontsize=7, color=color)
     axes.grid(alpha=0.25)
     axes.margins(0.14)
-    if entries:  # what lies close together looks so
+    if entries:  # minimum ranges, so that small differences look small
         x, y = ([e[k] for e in entries] for k in (key, "psnr_fg"))
         axes.set_xlim(min(x) / SPAN_X, max(x) * SPAN_X)
         axes.set_ylim(min(y) - SPAN_Y, max(y) + SPAN_Y)

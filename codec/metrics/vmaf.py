@@ -1,9 +1,8 @@
 """Two videos of one camera -> VMAF (libvmaf, model v0.6.1) through the ffmpeg of the imageio-ffmpeg wheel.
 
-VMAF was trained on pictures that fill the screen. On a subject before an empty background it mostly scores the
-emptiness, so captures with masks are cropped to the subject: one crop for the whole video, with a margin, and
-enlarged by a whole factor where it is very small. Crop and factor stand in the report. Frames wait in raw files;
-nothing is compressed.
+VMAF was trained on pictures that fill the screen; an empty background would dominate the score. So captures with masks
+are cropped to the subject: one crop for the whole video, around the subject in all frames, with a margin. A small crop
+is enlarged by an integer factor. Crop and factor are in the report. Frames are stored in raw files until `score`.
 """
 
 from __future__ import annotations
@@ -21,19 +20,19 @@ from ..errors import UsageError, require
 
 MODEL = "version=vmaf_v0.6.1"
 MARGIN = 16  # px around the subject
-SIDE_MIN = 192  # px: a crop grows to this, or is enlarged to it where the image is smaller
+SIDE_MIN = 192  # px: a smaller crop grows to this, or is enlarged to it if the image is smaller
 
 
 @cache
 def _ffmpeg() -> str | None:
-    """The binary, or None if it has no libvmaf."""
+    """Path of the binary; None: it has no libvmaf."""
     path = require("imageio_ffmpeg", "VMAF").get_ffmpeg_exe()
     filters = subprocess.run([path, "-hide_banner", "-filters"], capture_output=True, text=True, check=False).stdout
     return path if " libvmaf " in filters else None
 
 
 class VmafMeter:
-    """Takes the frames of one camera in order; `score` runs ffmpeg. A context manager: it owns temporary files."""
+    """Takes the frames of one camera in order; `score` runs ffmpeg. A context manager, which removes its files."""
 
     def __init__(self, fps: float):
         self._fps = fps
@@ -68,7 +67,7 @@ class VmafMeter:
                          *(max(a, b) for a, b in zip(box[2:], own[2:], strict=True))]  # fmt: skip
 
     def crop(self) -> dict[str, int]:
-        """x, y, width, height of the crop and the whole factor `scale` by which it is enlarged."""
+        """x, y, width, height of the crop, pixels, and the integer factor `scale` that it is enlarged by."""
         width, height = self._size or (0, 0)
         box = self._box or [0, 0, width, height]
         x, w = _span(box[0], box[2], width)
@@ -103,7 +102,7 @@ class VmafMeter:
 
 
 def _span(low: int, high: int, size: int) -> tuple[int, int]:
-    """Start and length of a crop along one axis: with margin, at least SIDE_MIN, inside the image."""
+    """Start and length of a crop along one axis: low to high with margin, at least SIDE_MIN, inside the image."""
     low, high = max(0, int(low) - MARGIN), min(size, int(high) + MARGIN)
     length = min(size, max(high - low, SIDE_MIN))
     return int(np.clip((low + high - length) // 2, 0, size - length)), length
