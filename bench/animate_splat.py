@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.model.rotations import quat_multiply, rotate
 from gscodec.errors import CaptureError
+from gscodec.model.rotations import quat_multiply, rotate
 from gscodec.splats.ply import FIELDS
 from gscodec.splats.ply_table import read_table, write_table
 

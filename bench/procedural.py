@@ -1,14 +1,17 @@
 """Small captures with exact ground truth: balls and boxes that move, traced ray by ray, without Gaussians.
 
-A `Scene` holds the shapes and the light of each frame and the errors of its cameras; `capture` makes it a Capture
-whose images are traced on demand. Metres, z upwards, the subject about 1.3 m tall around the origin.
+A `Scene` has the shapes and the light of each frame, and the errors and the motion of its cameras. `Scene.capture`
+makes it a Capture whose images are traced on demand, `write_transforms` writes a capture to files. Metres, z upwards,
+the subject about 1.3 m tall around the origin.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +23,9 @@ FOCAL = 1.9  # image widths
 DISTANCE = 3.0
 HEIGHTS = (-0.3, 0.5, 1.3)  # of the rings of cameras
 AMBIENT = 0.45
+OPENGL = np.diag([1.0, -1, -1, 1])  # OpenCV camera axes -> OpenGL's
+WAVES = 3  # sines of which the motion of a handheld camera is made
+PERIODS = (7.0, 30.0)  # frames, of these sines
 
 
 @dataclass(frozen=True)
@@ -54,10 +60,12 @@ class Scene:
     """One capture.
 
     Attributes:
-        shapes: frame -> shapes.
-        light: frame -> light.
-        exposure: lowest and highest gain of the images of a training camera.
-        pose_noise: error of the calibration of each training camera, degrees and metres.
+        shapes: what is there at a frame.
+        light: at a frame.
+        exposure: of the images of each training camera, a range (lowest, highest) of gains.
+        pose_noise: degrees and metres by which the calibration of each training camera is wrong.
+        handheld: degrees and metres (root mean square) by which each camera shakes, each in its own way.
+        orbit: degrees a frame by which all cameras go around the subject.
         masks: the views have alpha.
     """
 
@@ -69,24 +77,57 @@ class Scene:
     size: int = 128
     exposure: tuple[float, float] = (1.0, 1.0)
     pose_noise: tuple[float, float] = (0.0, 0.0)
+    handheld: tuple[float, float] = (0.0, 0.0)
+    orbit: float = 0.0
     masks: bool = True
 
     def capture(self, name: str) -> Capture:
         """The scene as its cameras see it."""
-        true = _rig(self.train, self.test, self.size)
+        rig = _rig(self.train, self.test, self.size)
         rng = np.random.default_rng(0)
-        told = [_disturbed(c, *self.pose_noise, rng) if c.split == "train" else c for c in true]
-        gains = np.where([c.split == "train" for c in true], rng.uniform(*self.exposure, len(true)), 1)
+        wrong = [_error(*self.pose_noise, rng) if c.split == "train" else np.eye(4) for c in rig]
+        gains = np.where([c.split == "train" for c in rig], rng.uniform(*self.exposure, len(rig)), 1)
+        shaken = [_shake(*self.handheld, np.random.default_rng([1, i])) for i in range(len(rig))]
+
+        @cache
+        def true(camera: int, frame: int) -> Camera:
+            around = np.eye(4)
+            around[:3, :3] = rotation((0, 0, 1), np.radians(self.orbit * frame))
+            return replace(rig[camera], viewmat=shaken[camera](frame) @ rig[camera].viewmat @ around)
+
+        def told(camera: int, frame: int) -> Camera:
+            there = true(camera, frame)
+            return replace(there, viewmat=wrong[camera] @ there.viewmat)
 
         @cache
         def read(camera: int, frame: int) -> View:
-            rgba = trace(self.shapes(frame), self.light(frame), true[camera])
+            rgba = trace(self.shapes(frame), self.light(frame), true(camera, frame))
             rgb, alpha = rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6), rgba[..., 3]
             if not self.masks:
                 return View(_u8(gains[camera] * rgba[..., :3]))
             return View(_u8(gains[camera] * rgb), _u8(alpha))
 
-        return Capture(name, 25.0, told, self.frames, self.masks, read)
+        poses = told if self.orbit or any(self.handheld) else None
+        cameras = [told(i, 0) for i in range(len(rig))]
+        return Capture(name, 25.0, cameras, self.frames, self.masks, read, poses=poses)
+
+
+def write_transforms(capture: Capture, folder: Path) -> None:
+    """Writes a capture as transforms.json and PNG files, with the pose and the intrinsics of each frame."""
+    import cv2
+
+    entries = []
+    for i, reference in enumerate(capture.cameras):
+        for t in range(capture.frame_count):
+            view, camera, name = capture.view(i, t), capture.camera(i, t), f"{reference.name}_{t}.png"
+            rgb = view.rgb[..., ::-1]
+            cv2.imwrite(str(folder / name), rgb if view.alpha is None else np.dstack([rgb, view.alpha]))
+            (fl_x, _, cx), (_, fl_y, cy) = camera.K[:2].tolist()
+            entry = {"file_path": name, "camera": camera.name, "frame": t, "split": camera.split}
+            entry |= {"w": camera.width, "h": camera.height, "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
+            pose = np.linalg.inv(camera.viewmat) @ OPENGL
+            entries.append(entry | {"transform_matrix": pose.tolist()})
+    (folder / "transforms.json").write_text(json.dumps({"fps": capture.fps, "frames": entries}))
 
 
 def _u8(x: np.ndarray) -> np.ndarray:
@@ -110,13 +151,30 @@ def _rig(train: int, test: int, size: int) -> list[Camera]:
     return cameras
 
 
-def _disturbed(camera: Camera, degrees: float, metres: float, rng: np.random.Generator) -> Camera:
-    """The camera with a wrong rotation and position, of these sizes, in random directions."""
+def _error(degrees: float, metres: float, rng: np.random.Generator) -> np.ndarray:
+    """[4, 4]: a rotation and a translation of these sizes, in random directions, in the camera's axes."""
     axis, shift = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
     wrong = np.eye(4)
     wrong[:3, :3] = rotation(axis, np.radians(degrees))
     wrong[:3, 3] = metres * shift
-    return replace(camera, viewmat=wrong @ camera.viewmat)
+    return wrong
+
+
+def _shake(degrees: float, metres: float, rng: np.random.Generator) -> Callable[[int], np.ndarray]:
+    """The motion of a handheld camera: frame -> [4, 4], smooth, in the camera's axes; of these sizes on average (root
+    mean square)."""
+    period = rng.uniform(*PERIODS, (6, WAVES))
+    phase = rng.uniform(0, 2 * np.pi, (6, WAVES))
+
+    def at(frame: int) -> np.ndarray:
+        waves = np.sin(2 * np.pi * frame / period + phase).sum(1) / np.sqrt(1.5 * WAVES)  # [6], each of power 1/3
+        angle = np.linalg.norm(waves[:3])
+        moved = np.eye(4)
+        moved[:3, :3] = rotation(waves[:3] / max(angle, 1e-9), np.radians(degrees) * angle)
+        moved[:3, 3] = metres * waves[3:]
+        return moved
+
+    return at
 
 
 def rotation(axis: Sequence[float], angle: float) -> np.ndarray:

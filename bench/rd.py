@@ -21,7 +21,7 @@ from gscodec.encode.encode import REFINE, EncodeSettings, encode_groups, stream_
 from gscodec.errors import UsageError
 from gscodec.metrics import bd_rate, evaluate_splats, rising
 from gscodec.metrics.bd_rate import shared_psnr
-from gscodec.model.gaussian_sequence import GaussianSequence, DenseGroup
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.model.gaussians import Gaussians
 
 from .baselines import BASELINES, Baseline

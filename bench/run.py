@@ -94,7 +94,7 @@ def beside(stream: Path, source: Path, frames: tuple[int, ...]) -> np.ndarray:
     views = [capture.view(test, t) for t in frames]
     covered = np.max([v.alpha for v in views], 0)
     for t, view in zip(frames, views, strict=True):
-        reference, camera = cropped(View(composite(view, BACKGROUND), covered), capture.cameras[test])
+        reference, camera = cropped(View(composite(view, BACKGROUND), covered), capture.camera(test, t))
         pictures += [reference.rgb, render_image(decoded.frame(t), camera, BACKGROUND)]
     return np.hstack(pictures)
 

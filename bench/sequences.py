@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from gscodec.errors import UsageError
-from gscodec.model.gaussian_sequence import GaussianSequence, DenseGroup
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.splats import open_sequence
 
 from .animate_splat import animate_splat

@@ -83,7 +83,8 @@ def held_out(capture: Capture, names: tuple[str, ...]) -> Capture:
         raise UsageError(f"{capture.name}: no camera {', '.join(sorted(unknown))}, there are {known}")
     kept = [i for i, c in enumerate(capture.cameras) if c.name in names or c.split == "train"]
     cameras = [replace(c, split="test" if c.name in names else "train") for c in (capture.cameras[i] for i in kept)]
-    return replace(capture, cameras=cameras, read=lambda camera, t: capture.read(kept[camera], t))
+    poses = capture.poses and (lambda camera, t: capture.poses(kept[camera], t))
+    return replace(capture, cameras=cameras, read=lambda camera, t: capture.read(kept[camera], t), poses=poses)
 
 
 @dataclass(frozen=True)
@@ -223,13 +224,16 @@ def every_frame_alone(capture: Capture, frames: range, settings) -> tuple[list[G
 
 
 def part(capture: Capture, frames: range) -> Capture:
-    """The capture with only these frames; fps follows their step."""
+    """The capture with only these frames."""
+    at = lambda t: capture.first_frame + frames[t]  # noqa: E731
     return replace(
         capture,
+        cameras=[capture.camera(i, frames[0]) for i in range(len(capture.cameras))],
         first_frame=0,
         frame_count=len(frames),
         fps=capture.fps / frames.step,
-        read=lambda camera, t: capture.read(camera, capture.first_frame + frames[t]),
+        read=lambda camera, t: capture.read(camera, at(t)),
+        poses=capture.poses and (lambda camera, t: capture.poses(camera, at(t))),
     )
 
 

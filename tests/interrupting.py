@@ -4,18 +4,16 @@ Moments are (where, n): the n-th step of a stage of training ("keyframe", "track
 the n-th write of a file ("state", "checkpoint", "fragment", "index", "sequence").
 """
 
-import json
 import os
 import signal
 import sys
 from multiprocessing import get_context
 
-import cv2
-import numpy as np
+import cv2  # noqa: F401
 import scipy.spatial  # noqa: F401
 import torch._dynamo  # noqa: F401  (what an optimizer imports; here it is imported once, not in every process)
 
-from bench.procedural import Scene
+from bench.procedural import Scene, write_transforms
 from bench.stress_scenes import walking
 from gscodec import _native, progress
 from gscodec import atomic_write as part_file
@@ -26,22 +24,11 @@ from gscodec.splats import sequence_writer
 from gscodec.train import settings, train
 
 TINY = {"keyframe_steps": 40, "motion_steps": 8, "finetune_steps": 4, "gaussians_max": 200, "initial_points": 150}
-GL = np.diag([1.0, -1, -1, 1])
 
 
 def write_capture(folder, frames=7):
     """A walking figure, 6 cameras, as transforms.json and PNG files."""
-    capture = Scene(walking, frames=frames, train=5, test=1, size=48).capture("walking")
-    first, entries = capture.cameras[0], []
-    for i, camera in enumerate(capture.cameras):
-        for t in range(frames):
-            view, name = capture.view(i, t), f"{camera.name}_{t}.png"
-            cv2.imwrite(str(folder / name), np.dstack([view.rgb[..., ::-1], view.alpha]))
-            pose = (np.linalg.inv(camera.viewmat) @ GL).tolist()
-            entry = {"file_path": name, "camera": camera.name, "frame": t, "split": camera.split}
-            entries.append(entry | {"transform_matrix": pose})
-    head = {"w": 48, "h": 48, "fl_x": first.K[0, 0], "cx": first.K[0, 2], "cy": first.K[1, 2], "fps": 25}
-    (folder / "transforms.json").write_text(json.dumps(head | {"frames": entries}))
+    write_transforms(Scene(walking, frames=frames, train=5, test=1, size=48).capture("walking"), folder)
 
 
 def gscodec(*args, at=None, by=signal.SIGKILL) -> int:

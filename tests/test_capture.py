@@ -2,7 +2,6 @@
 
 import json
 import sys
-import threading
 import warnings
 from pathlib import Path
 
@@ -11,10 +10,8 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from gscodec.capture import View, composite, find_capture, open_capture
-from gscodec.capture.images import read_image, resize_area
-from gscodec.capture.undistort import undistortion
-from gscodec.capture.video import Video
+from gscodec.capture import View, find_capture, open_capture
+from gscodec.capture.undistort import Undistortion
 from gscodec.errors import CaptureError, UsageError, require
 from gscodec.model.camera import Camera, look_at
 
@@ -173,14 +170,15 @@ def break_pose(values):
 @pytest.mark.parametrize(
     ("harm", "message"),
     [
-        (lambda f: f.pop("transform_matrix"), "cam1 is left out: frame 0 has no pose"),
+        (lambda f: f.pop("transform_matrix"), "cam1 is left out: frame 0: no pose, expected transform_matrix"),
         (break_pose(np.zeros((4, 4)).tolist()), "frame 0: transform_matrix is singular"),
         (break_pose(np.diag([1, 1, -1, 1]).tolist()), "singular, sheared or mirrored"),
         (break_pose([[1, 2], [3]]), "transform_matrix is not 4x4 finite numbers"),
         (lambda f: f.__setitem__("frame", 7), "frame 0 is missing"),
         (lambda f: f.__setitem__("file_path", "images/none.png"), r"frame 0: image .*none.png is missing"),
-        (lambda f: f.__setitem__("w", 99), r"image .*000.png is 24x16, expected 99x16"),
-        (lambda f: f.__setitem__("fl_x", -1), "focal length -1 x -1 is not positive"),
+        (lambda f: f.__setitem__("w", 99), r"frame 0: image .*000.png is 24x16, expected 99x16"),
+        (lambda f: f.__setitem__("fl_x", -1), "frame 0: focal length -1 x -1 is not positive"),
+        (lambda f: f.__setitem__("cx", "left"), "frame 0: not a number"),
     ],
 )
 def test_a_broken_camera_is_left_out(rig, harm, message):
@@ -191,17 +189,91 @@ def test_a_broken_camera_is_left_out(rig, harm, message):
     assert [c.name for c in capture.cameras] == ["cam0", "cam2"]
 
 
-def test_a_moving_camera_is_left_out(rig):
+def test_a_camera_may_move(rig):
+    """Each frame has its own pose and intrinsics, also in a part of the capture and at another scale."""
     _, data, save = rig
-    data["frames"][3]["transform_matrix"] = pose(9).tolist()
-    with pytest.warns(UserWarning, match="camera cam1 is left out: it moves at frame 1"):
-        assert len(save().cameras) == 2
+    assert not save().moves
+    data["frames"][3] |= {"transform_matrix": pose(9).tolist(), "fl_x": 40.0}
+    capture = save()
+    assert (len(capture.cameras), capture.moves) == (3, True)
+    there = np.linalg.inv(pose(9) @ GL)
+    np.testing.assert_allclose(capture.camera(1, 0).viewmat, np.linalg.inv(pose(1) @ GL), atol=1e-9)
+    np.testing.assert_allclose(capture.camera(1, 1).viewmat, there, atol=1e-9)
+    assert (capture.camera(1, 0).K[0, 0], capture.camera(1, 1).K[0, 0]) == (30, 40)
+    np.testing.assert_array_equal(capture.camera(2, 0).viewmat, capture.camera(2, 1).viewmat)
+    last = capture.scaled(0.5).frames(1)
+    assert not last.moves, "it has one frame"
+    for camera in (last.camera(1, 0), last.cameras[1]):
+        np.testing.assert_allclose(camera.viewmat, there, atol=1e-9)
+        assert (camera.name, camera.width, camera.K[0, 0]) == ("cam1", 12, 20)
+    assert last.camera(2, 0).split == "test"
+    with pytest.raises(UsageError, match="no frame 2, there are 2"):
+        capture.camera(0, 2)
+    with pytest.raises(UsageError, match="no camera 3, there are 3"):
+        capture.camera(3, 0)
+
+
+def test_rounding_errors_are_no_motion(rig):
+    _, data, save = rig
+    for f in data["frames"][1::2]:
+        f["transform_matrix"] = (np.array(f["transform_matrix"]) * (1 + 1e-7)).tolist()
+        f["fl_x"] = 30.00001
+    capture = save()
+    assert not capture.moves
+    assert capture.poses is None
+    assert capture.camera(0, 1) is capture.cameras[0]
+
+
+def test_a_moving_camera_without_a_name(rig):
+    """Entries of one folder, each with its own time, are one camera."""
+    _, data, save = rig
+    for i, f in enumerate(data["frames"]):
+        del f["camera"]
+        f["transform_matrix"] = pose(i).tolist()
+    capture = save()
+    assert [c.name for c in capture.cameras] == ["images_cam0", "images_cam1", "images_cam2"]
+    assert (capture.frame_count, capture.moves) == (2, True)
+    np.testing.assert_allclose(capture.camera(1, 1).viewmat, np.linalg.inv(pose(3) @ GL), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("harm", "message"),
+    [
+        (lambda f: f.pop("transform_matrix"), "cam1 is left out: frame 1: no pose, expected transform_matrix"),
+        (lambda f: f.__setitem__("fl_x", 0), "cam1 is left out: frame 1: focal length 0 x 0 is not positive"),
+        (lambda f: f.__setitem__("h", 17), r"cam1 is left out: frame 1: image .*001.png is 24x16, expected 24x17"),
+    ],
+)
+def test_a_broken_frame_of_a_camera_is_named(rig, harm, message):
+    _, data, save = rig
+    harm(data["frames"][3])
+    with pytest.warns(UserWarning, match=message):
+        assert [c.name for c in save().cameras] == ["cam0", "cam2"]
+
+
+def test_a_lens_may_change_between_frames(rig):
+    """Each frame is undistorted with its own lens."""
+    _, data, save = rig
+    data["frames"][0] |= {"k1": -0.3, "cx": 4.0}
+    data["frames"][1] |= {"k1": -0.3, "cx": 4.0, "fl_x": 15.0}
+    capture = save()
+    for t, focal in enumerate((30.0, 15.0)):
+        K = np.array([[focal, 0, 4], [0, focal, 8], [0, 0, 1]])
+        camera = Camera("cam0", K, np.eye(4), W, H, np.array([-0.3, 0, 0, 0, 0]))
+        lens, seen = Undistortion(), pixels(0, t)
+        expected = lens.view(View(np.ascontiguousarray(seen[..., :3]), np.ascontiguousarray(seen[..., 3])), camera)
+        np.testing.assert_allclose(capture.camera(0, t).K, lens.camera(camera).K, atol=1e-9)
+        np.testing.assert_array_equal(capture.view(0, t).alpha, expected.alpha)
+    assert np.abs(capture.view(0, 0).alpha.astype(int) - capture.view(0, 1).alpha).max() > 0
 
 
 def test_no_camera_left_is_an_error(rig):
     _, data, save = rig
     del data["fl_x"]
-    with pytest.raises(CaptureError, match="no camera can be used; the last one: no focal length"), pytest.warns():
+    with (
+        pytest.raises(CaptureError, match="no camera can be used; the last one: frame 0: no focal length"),
+        pytest.warns(),
+    ):
         save()
 
 
@@ -241,6 +313,8 @@ def test_damaged_and_missing_images(rig):
         ("{", "not valid JSON"),
         ('{"frames": []}', "no 'frames'"),
         ('{"frames": [{}]}', r"frames\[0\] has no file_path"),
+        ('{"frames": [{"file_path": "a", "frame": "x"}]}', r"frame or time of frames\[0\] is not a number"),
+        ('{"fps": "fast", "frames": [{"file_path": "a"}]}', r"fps, frame or time is not a number"),
         ('{"camera_model": "OPENCV_FISHEYE", "frames": [{}]}', "camera_model OPENCV_FISHEYE is not supported"),
     ],
 )
@@ -267,200 +341,24 @@ def test_missing_library_names_the_extra(monkeypatch):
         require("cv2", "reading videos")
 
 
-# -- images
-
-
-@pytest.mark.parametrize(
-    ("suffix", "dtype"), [("png", "uint8"), ("png", "uint16"), ("tif", "uint16"), ("webp", "uint8")]
-)
-def test_integer_images_are_srgb_and_unassociated(tmp_path, suffix, dtype):
-    source = np.dstack([np.full((8, 8), v, np.uint8) for v in (200, 100, 50, 128)])
-    scaled = source if dtype == "uint8" else (source.astype(np.uint16) * 257)
-    write_image(tmp_path / f"a.{suffix}", scaled, dtype)
-    view = read_image(tmp_path / f"a.{suffix}")
-    assert np.abs(view.rgb.astype(int) - source[..., :3]).max() <= (6 if suffix == "webp" else 0)
-    assert (view.alpha == 128).all()
-
-
-def test_exr_is_linear_and_premultiplied(tmp_path):
-    linear = np.array([0.5, 0.2, 0.01, 1.0], np.float32)
-    image = np.tile(linear * 0.5, (4, 4, 1)).astype(np.float32)  # premultiplied with alpha 0.5
-    write_image(tmp_path / "a.exr", image, "half", unassociated=False)
-    view = read_image(tmp_path / "a.exr")
-    np.testing.assert_array_equal(view.rgb[0, 0], [188, 124, 25])
-    assert view.alpha[0, 0] == 128
-
-
-def test_grey_image(tmp_path):
-    write_image(tmp_path / "a.png", np.full((4, 4, 1), 90, np.uint8))
-    view = read_image(tmp_path / "a.png")
-    assert (view.rgb == 90).all()
-    assert view.alpha is None
-
-
-def test_area_filter_ignores_colour_under_alpha_zero():
-    rgb = np.zeros((2, 2, 3), np.uint8)
-    rgb[0, 0], rgb[1, 1] = (200, 100, 40), (255, 255, 255)
-    small = resize_area(View(rgb, np.array([[255, 0], [0, 0]], np.uint8)), 1, 1)
-    np.testing.assert_array_equal(small.rgb[0, 0], (200, 100, 40))
-    assert small.alpha[0, 0] == 64
-
-
-def test_composite_blends_over_the_background():
-    view = View(np.full((1, 1, 3), 200, np.uint8), np.array([[51]], np.uint8))
-    assert composite(view, (0.5, 0.0, 1.0))[0, 0].tolist() == [142, 40, 244]
-    assert composite(View(view.rgb), (1, 1, 1)) is view.rgb
+# -- undistortion
 
 
 def test_undistortion_moves_pixels_where_opencv_projects_them():
     K = np.array([[80.0, 0, 48], [0, 80, 32], [0, 0, 1]])
     camera = Camera("a", K, np.eye(4), 96, 64, np.array([-0.2, 0.05, 0.01, -0.01]))
-    pinhole, warp = undistortion(camera)
+    lens = Undistortion()
+    pinhole = lens.camera(camera)
     assert not pinhole.distortion.size
     point = np.array([[[0.15, -0.1, 1.0]]])
     zero = np.zeros(3)
     u, v = cv2.projectPoints(point, zero, zero, K, camera.distortion)[0].ravel()  # half-integer pixel centres
     y, x = np.mgrid[:64, :96] + 0.5
     image = np.exp(-((x - u) ** 2 + (y - v) ** 2) / 8) * 255
-    out = warp(View(np.dstack([image] * 3).astype(np.uint8))).rgb[..., 0].astype(float)
+    out = lens.view(View(np.dstack([image] * 3).astype(np.uint8)), camera).rgb[..., 0].astype(float)
     at = pinhole.K @ point[0, 0]
     assert (out * x).sum() / out.sum() == pytest.approx(at[0], abs=0.15)
     assert (out * y).sum() / out.sum() == pytest.approx(at[1], abs=0.15)
-
-
-# -- Qualisys
-
-CALIBRATION = """<calibration><cameras>{}</cameras></calibration>"""
-CAMERA = """<camera serial="{name}"><fov_video bottom="{b}" left="0" right="63" top="0"/>
-<transform x="{x}" y="0" z="0" r11="{r}" r12="0" r13="0" r21="0" r22="1" r23="0" r31="0" r32="0" r33="1"/>
-<intrinsic focalLengthU="{f}" focalLengthV="6400" centerPointU="2016" centerPointV="1504" radialDistortion1="0"
-radialDistortion2="0" tangentalDistortion1="0" tangentalDistortion2="0"/></camera>"""
-
-
-def write_video(path, frames, size=(64, 48)):
-    path.parent.mkdir(exist_ok=True)
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 50, size)
-    for t in range(frames):
-        video.write(np.full((size[1], size[0], 3), (0, 0, 4 * t), np.uint8))
-    video.release()
-
-
-@pytest.fixture
-def qualisys(tmp_path):
-    def save(**cameras):
-        values = {"b": 47, "x": 1000, "r": 1, "f": 6400}
-        text = "".join(CAMERA.format(name=n, **(values | c)) for n, c in cameras.items())
-        (tmp_path / "calibration").mkdir(exist_ok=True)
-        (tmp_path / "calibration" / "Calib.qca.txt").write_text(CALIBRATION.format(text))
-        return lambda: open_capture(tmp_path)
-
-    for n in ("a", "b"):
-        write_video(tmp_path / f"videos/{n}.mp4", 60)
-    return tmp_path, save
-
-
-def test_qualisys_units_and_axes(qualisys):
-    capture = qualisys[1](a={}, b={"x": -500})()
-    camera = capture.cameras[0]
-    assert (capture.fps, capture.frame_count, capture.has_alpha) == (50, 60, False)
-    assert camera.K.tolist() == [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
-    np.testing.assert_allclose(camera.center, (1, 0, 0))
-    x, y, z, _ = camera.viewmat @ (1, 2, -10, 1)  # y up and z back in the calibration
-    assert (x, y, z) == (0, -2, 10)
-
-
-def test_video_frames_in_any_order(qualisys):
-    video = Video(qualisys[0] / "videos/a.mp4")
-    order = [0, 1, 2, 1, 59, 3, 30, 30, 4, 58]
-    for t in order:
-        assert abs(int(video.frame(t)[24, 32, 0]) - 4 * t) <= 6, t
-    with pytest.raises(CaptureError, match=r"a.mp4: frame 99 cannot be decoded, the header promises 60"):
-        video.frame(99)
-    assert abs(int(video.frame(5)[24, 32, 0]) - 20) <= 6
-
-
-def test_views_from_threads(qualisys):
-    capture = qualisys[1](a={}, b={})()
-    wrong = []
-
-    def check(camera):
-        for t in range(0, 20):
-            if abs(int(capture.view(camera, t).rgb[24, 32, 0]) - 4 * t) > 6:
-                wrong.append((camera, t))
-
-    threads = [threading.Thread(target=check, args=(i % 2,)) for i in range(4)]
-    for t in threads:
-        t.start()
-    for t in threads:
-        t.join()
-    assert not wrong
-
-
-def test_short_videos_are_named(qualisys):
-    path, save = qualisys
-    write_video(path / "videos/a.mp4", 40)
-    with pytest.warns(UserWarning, match=r"a.mp4: short, 40 of 60 frames; the capture ends at frame 40"):
-        assert save(a={}, b={})().frame_count == 40
-    write_video(path / "videos/a.mp4", 20)
-    with pytest.warns(UserWarning, match=r"a.mp4: short, 20 of 60 frames; the camera is left out"):
-        capture = save(a={}, b={})()
-    assert (capture.frame_count, len(capture.cameras)) == (60, 1)
-
-
-def test_video_at_another_scale(qualisys):
-    path, save = qualisys
-    write_video(path / "videos/a.mp4", 60, (32, 24))
-    capture = save(a={}, b={})()
-    assert capture.cameras[0].K[0].tolist() == [50, 0, 16]
-    assert capture.view(0, 3).rgb.shape == (24, 32, 3)
-
-
-@pytest.mark.parametrize(
-    ("harm", "message"),
-    [
-        ({"b": 9}, "a.mp4 is 64x48, expected 64x10"),
-        ({"r": 0}, "its pose is singular"),
-        ({"x": "nan"}, "<transform> is missing or incomplete"),
-        ({"f": ""}, "<intrinsic> is missing or incomplete, expected numbers focalLengthU"),
-        ({"f": -1}, "focal length .* is not positive"),
-    ],
-)
-def test_a_broken_qualisys_camera_is_left_out(qualisys, harm, message):
-    with pytest.warns(UserWarning, match=message):
-        assert len(qualisys[1](a=harm, b={})().cameras) == 1
-
-
-def test_missing_and_damaged_videos(qualisys):
-    path, save = qualisys
-    (path / "videos/a.mp4").write_bytes(b"nothing")
-    with pytest.warns(UserWarning, match="left out") as seen:
-        save(a={}, b={}, c={})()
-    text = " ".join(str(w.message) for w in seen)
-    assert "a.mp4: not a readable video" in text
-    assert "camera c is left out: no video, looked for c with .mp4" in text
-    with pytest.raises(CaptureError, match="no camera can be used"), pytest.warns():
-        save(c={})()
-    with pytest.raises(CaptureError, match="video is missing"):
-        Video(path / "none.mp4")
-
-
-@pytest.mark.parametrize(("text", "message"), [("<a>", "not valid XML"), ("<a/>", "no cameras, expected a Qualisys")])
-def test_bad_calibration_files(tmp_path, text, message):
-    (tmp_path / "x.qca.txt").write_text(text)
-    with pytest.raises(CaptureError, match=message):
-        open_capture(tmp_path)
-
-
-def test_qualisys_masks(qualisys):
-    path, save = qualisys
-    for t in range(60):
-        write_image(path / f"masks/a/{t:03}.png", np.full((48, 64, 1), t, np.uint8))
-    capture = save(a={}, b={})()
-    assert capture.has_alpha
-    assert (capture.view(0, 7).alpha == 7).all()
-    (path / "masks/a/000.png").unlink()
-    with pytest.warns(UserWarning, match="camera a is left out: .*: 59 masks for 60 frames"):
-        save(a={}, b={})()
 
 
 def test_nothing_warns_on_a_sound_capture(rig):

@@ -1,4 +1,4 @@
-"""The same rig written in every layout that there is a reader for: the same cameras and pictures come back."""
+"""One rig written in each layout that has a reader: the same cameras and pictures come back, also of a moving rig."""
 
 import struct
 
@@ -16,6 +16,7 @@ NAMES = ("cam0", "cam2", "cam10")  # in the order of their numbers
 FRAMES = 2
 FOCAL = 30.0
 VIEWS = [look_at((3 * np.cos(k), 3 * np.sin(k), 1), (0, 0, 0), (0, 0, 1)) for k in range(len(NAMES))]
+LATER = [look_at((3 * np.cos(k + 0.1), 3 * np.sin(k + 0.1), 1.2), (0, 0, 0), (0, 0, 1)) for k in range(len(NAMES))]
 
 
 def write_images(pattern, channels=4):
@@ -36,11 +37,11 @@ def colmap_txt(folder, name=lambda n: f"{n}.png"):
     (folder / "images.txt").write_text("# list\n" + "\n".join(images) + "\n")
 
 
-def colmap_bin(folder, number=1):
+def colmap_bin(folder, number=1, views=VIEWS):
     folder.mkdir(parents=True)
     (folder / "cameras.bin").write_bytes(struct.pack("<QiiQQ4d", 1, 1, number, W, H, FOCAL, FOCAL, W / 2, H / 2))
     out = struct.pack("<Q", len(NAMES))
-    for k, (name, view) in enumerate(zip(NAMES, VIEWS, strict=True)):
+    for k, (name, view) in enumerate(zip(NAMES, views, strict=True)):
         out += struct.pack("<i7di", k, *quat(view), *view[:3, 3], 1) + f"{name}.png".encode() + b"\0"
         out += struct.pack("<Q2dq", 1, 3.0, 4.0, -1)
     (folder / "images.bin").write_bytes(out)
@@ -59,6 +60,21 @@ def one_model(root):
     colmap_txt(root / "colmap/sparse/0", lambda n: f"{n}/0.png")
 
 
+def moving_frame_folders(root):
+    frame_folders(root)
+    colmap_bin(root / "frame10/sparse/0", views=LATER)
+
+
+def moving_one_model(root):
+    one_model(root)
+    path = root / "colmap/sparse/0/images.txt"
+    poses = [[*quat(v).tolist(), *v[:3, 3].tolist()] for v in LATER]
+    more = [
+        f"{9 + k} {' '.join(map(repr, p))} 1 {n}/1.png\n" for k, (p, n) in enumerate(zip(poses, NAMES, strict=True))
+    ]
+    path.write_text(path.read_text() + "\n".join(more) + "\n")
+
+
 def actorshq(root):
     write_images(lambda name, t: root / f"rgbs/{name}/{name}_rgb{t:06}.png", channels=3)
     for k, name in enumerate(NAMES):
@@ -73,13 +89,26 @@ def actorshq(root):
 
 def easyvolcap(root):
     write_images(lambda name, t: root / f"images/{name}/{t:06}.png")
+    yaml_pair(root, dict(zip(NAMES, VIEWS, strict=True)))
+
+
+def moving_easyvolcap(root):
+    write_images(lambda name, t: root / f"images/{name}/{t:06}.png")
+    for k, name in enumerate(NAMES):
+        folder = root / "cameras" / name
+        folder.mkdir(parents=True)
+        yaml_pair(folder, {"000000": VIEWS[k], "000001": LATER[k]})
+
+
+def yaml_pair(folder, views):
+    """intri.yml and extri.yml with the viewmats `views`, by name."""
     K = np.array([[FOCAL, 0, W / 2 - 0.5], [0, FOCAL, H / 2 - 0.5], [0, 0, 1]])
-    intrinsics, extrinsics = (cv2.FileStorage(str(root / f), 1) for f in ("intri.yml", "extri.yml"))
+    intrinsics, extrinsics = (cv2.FileStorage(str(folder / f), 1) for f in ("intri.yml", "extri.yml"))
     intrinsics.startWriteStruct("names", cv2.FileNode_SEQ)
-    for name in NAMES:
+    for name in views:
         intrinsics.write("", name)
     intrinsics.endWriteStruct()
-    for name, view in zip(NAMES, VIEWS, strict=True):
+    for name, view in views.items():
         intrinsics.write(f"K_{name}", K)
         intrinsics.write(f"dist_{name}", np.zeros((5, 1)))
         extrinsics.write(f"R_{name}", cv2.Rodrigues(view[:3, :3])[0])
@@ -130,6 +159,31 @@ def test_the_same_rig_comes_back(tmp_path, layout):
             seen, truth = capture.view(k, t), pixels(k, t)
             assert np.abs(seen.rgb[::scale, ::scale].astype(int) - truth[..., :3]).max() <= apart
             assert video or np.array_equal(seen.alpha, truth[..., 3])
+    assert not capture.moves
+    assert capture.camera(2, 1) is capture.cameras[2]
+
+
+MOVING = {
+    "colmap, a folder each frame": ("colmap", moving_frame_folders),
+    "colmap, one folder": ("colmap", moving_one_model),
+    "easyvolcap": ("easyvolcap", moving_easyvolcap),
+}
+
+
+@pytest.mark.parametrize("layout", MOVING)
+def test_a_moving_rig_comes_back(tmp_path, layout):
+    name, write = MOVING[layout]
+    write(tmp_path)
+    assert find_capture(tmp_path) == name
+    capture = open_capture(tmp_path)
+    assert [c.name for c in capture.cameras] == list(NAMES)
+    assert (capture.frame_count, capture.moves) == (FRAMES, True)
+    for t, views in enumerate((VIEWS, LATER)):
+        for k, view in enumerate(views):
+            camera = capture.camera(k, t)
+            np.testing.assert_allclose(camera.viewmat, view, atol=1e-6)
+            assert (camera.name, camera.K[0, 0]) == (NAMES[k], FOCAL)
+            np.testing.assert_array_equal(capture.view(k, t).rgb, pixels(k, t)[..., :3])
 
 
 def truncated(root):
@@ -148,10 +202,31 @@ def one_row_less(root):
     np.save(root / "poses_bounds.npy", np.load(root / "poses_bounds.npy")[1:])
 
 
+def at_another_shape(root):
+    path = root / "frame10/sparse/0/cameras.bin"
+    path.write_bytes(struct.pack("<QiiQQ4d", 1, 1, 1, 2 * W, H, FOCAL, FOCAL, W / 2, H / 2))
+
+
+def without_its_lens(root):
+    path = root / "frame10/sparse/0/cameras.bin"
+    path.write_bytes(struct.pack("<QiiQQ4d", 1, 9, 1, W, H, FOCAL, FOCAL, W / 2, H / 2))
+
+
+def without_rotation(root):
+    path = root / "colmap/sparse/0/images.txt"
+    path.write_text(path.read_text().replace(repr(quat(LATER[2])[0].item()), "nan"))
+
+
+def without_a_translation(root):
+    path = root / "cameras/cam10/extri.yml"
+    path.write_text(path.read_text().replace("T_000001", "T_000007"))
+
+
 def overwrite(name, text):
     return lambda root: (root / name).write_text(text)
 
 
+@pytest.mark.filterwarnings("ignore:.*is left out")
 @pytest.mark.parametrize(
     ("write", "harm", "message"),
     [
@@ -161,6 +236,12 @@ def overwrite(name, text):
         (n3dv, overwrite("poses_bounds.npy", "x"), r"poses_bounds.npy: not a numpy file"),
         (actorshq, overwrite("calibration.csv", "name,w\na,1\n"), r"expected a line for each camera with the columns"),
         (easyvolcap, overwrite("intri.yml", "%YAML:1.0\n---\n{"), r"intri.yml: not a calibration file of OpenCV"),
+        (
+            moving_frame_folders,
+            at_another_shape,
+            r"cam10.png is 24x16, expected 48x16 as the calibration of frame 1 says",
+        ),
+        (moving_frame_folders, without_its_lens, r"frame10/sparse/0 has no camera 1, which took image cam10.png"),
     ],
 )
 def test_a_broken_calibration_is_named(tmp_path, write, harm, message):
@@ -171,12 +252,31 @@ def test_a_broken_calibration_is_named(tmp_path, write, harm, message):
 
 
 @pytest.mark.parametrize(
+    ("write", "harm", "message"),
+    [
+        (moving_one_model, without_rotation, r"sparse/0, image cam10/1.png: its pose is singular or not a rotation"),
+        (
+            moving_easyvolcap,
+            without_a_translation,
+            r"frame 000001: .*extri.yml: T_000001 is missing or wrong, expected 3",
+        ),
+    ],
+)
+def test_a_broken_frame_of_a_camera_is_named(tmp_path, write, harm, message):
+    write(tmp_path)
+    harm(tmp_path)
+    with pytest.warns(UserWarning, match=f"camera cam10 is left out: .*{message}"):
+        assert [c.name for c in open_capture(tmp_path).cameras] == ["cam0", "cam2"]
+
+
+@pytest.mark.parametrize(
     ("write", "gone", "message"),
     [
         (frame_folders, "frame10/images/cam2.png", "cam2 is left out: image .* is missing"),
         (one_model, "masks/cam2/1.png.png", "cam2 is left out: .*: 1 masks for 2 frames"),
         (actorshq, "masks/cam2/cam2_mask000001.png", "cam2 is left out: .*: 1 masks for 2 frames"),
         (easyvolcap, "images/cam2", "cam2 is left out: no video, looked for cam2"),
+        (moving_easyvolcap, "images/cam2/000001.png", r"cam2 is left out: .*: 1 frames, but poses of 2; expected one"),
     ],
 )
 def test_a_broken_camera_is_left_out(tmp_path, write, gone, message):
@@ -185,3 +285,18 @@ def test_a_broken_camera_is_left_out(tmp_path, write, gone, message):
     path.rename(tmp_path / "gone")
     with pytest.warns(UserWarning, match=message):
         assert [c.name for c in open_capture(tmp_path).cameras] == ["cam0", "cam10"]
+
+
+@pytest.mark.filterwarnings("ignore:.*is left out")
+@pytest.mark.parametrize(
+    ("write", "image"),
+    [(moving_frame_folders, "frame11/images/{}.png"), (moving_one_model, "images/{}/2.png")],
+)
+def test_a_moving_camera_needs_every_pose(tmp_path, write, image):
+    write(tmp_path)
+    for name in NAMES:
+        write_image(tmp_path / image.format(name), pixels(0, 2))
+        write_image(tmp_path / f"masks/{name}/2.png.png", pixels(0, 2)[..., 3:])
+    gone = f"frame 2: the camera moves, but no model has a pose of image .*{image.format('cam10')}"
+    with pytest.raises(CaptureError, match=f"no camera can be used; the last one: {gone}"):
+        open_capture(tmp_path)

@@ -1,4 +1,4 @@
-"""Input layouts -> Capture: one reader file per layout, and the detector that picks it by what lies in the folder."""
+"""Input layouts -> Capture. Each layout has a reader file; detect.py picks the reader by the files of the folder."""
 
 from .capture import Capture, blend, composite, cropped
 from .detect import find_capture, open_capture

@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import CaptureError, require
 from ..model.camera import Camera
 from .capture import Capture
-from .rig import Feed, assemble, numbered, pinhole, rigid, usable
+from .rig import Feed, Track, assemble, numbered, pinhole, rigid, usable
 
 NUMBERS = ("w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
 FPS = 25.0
@@ -29,11 +29,11 @@ def open_actorshq(calibration: Path) -> Capture:
     root = calibration.parent
     made = {line["name"]: line for line in _lines(calibration)}
 
-    def make(name: str, line: dict) -> tuple[Camera, Feed]:
+    def make(name: str, line: dict) -> tuple[Track, Feed]:
         images = numbered(root / "rgbs" / name)
         if not images:
             raise CaptureError(f"no images in {root / 'rgbs' / name}")
-        return _camera(name, line), Feed(images, numbered(root / "masks" / name))
+        return [_camera(name, line)], Feed(images, numbered(root / "masks" / name))
 
     return assemble(root.resolve().name, *usable(calibration, made, make), FPS)
 

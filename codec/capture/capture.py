@@ -1,8 +1,8 @@
-"""A multi-view capture as the later stages see it: fixed pinhole cameras and a lazy view per camera and frame.
+"""A multi-view capture as the later stages see it: a pinhole camera and a view for each camera and frame.
 
-Layout (reader) -> Capture -> train, metrics. Views are decoded on request and never kept, so a capture larger than
-memory works, and any number of threads may ask at once. Colours are 8-bit sRGB and not premultiplied: compositing
-happens in the file's own space on a background that the caller names.
+Layout (reader) -> Capture -> train, metrics. A view is decoded when it is asked for and is not kept, so a capture may
+be larger than memory; any number of threads may ask at once. Colours are 8-bit sRGB, not premultiplied. They are
+composited in sRGB, on a background that the caller names.
 """
 
 from __future__ import annotations
@@ -17,20 +17,23 @@ from ..model.camera import Camera
 from .images import View, resize_area
 
 MARGIN = 24  # pixels of background kept around the subject
+STILL = 1e-6  # a camera whose values change by less, relatively, stands still
 
 
 @dataclass(frozen=True)
 class Capture:
-    """Synchronised images of fixed cameras.
+    """Synchronised images of cameras that stand still or move.
 
     Attributes:
         name: of the folder, for messages and reports.
         fps: frames a second.
-        cameras: undistorted pinhole cameras; each has an image of every frame.
+        cameras: undistorted pinhole cameras, as they are in frame 0; each has an image of every frame.
         frame_count: frames of this (possibly restricted) capture.
-        has_alpha: views carry an alpha channel (from the images or from masks).
+        has_alpha: views have an alpha channel (from the images or from masks).
         read: (camera index, frame of the source) -> View at the source's size, undistorted; thread-safe.
         first_frame: source frame that is frame 0 here.
+        poses: (camera index, frame of the source) -> the camera in that frame, of which K (at the source's size) and
+            viewmat are used; thread-safe. None: no camera moves.
     """
 
     name: str
@@ -40,6 +43,7 @@ class Capture:
     has_alpha: bool
     read: Callable[[int, int], View]
     first_frame: int = 0
+    poses: Callable[[int, int], Camera] | None = None
 
     def view(self, camera_index: int, frame: int) -> View:
         """The image of a camera at a frame, at the camera's size.
@@ -48,12 +52,40 @@ class Capture:
             UsageError: there is no such camera or frame.
             CaptureError: the image cannot be read or has another size than the calibration says.
         """
+        self._check(camera_index, frame)
+        camera = self.cameras[camera_index]
+        return resize_area(self.read(camera_index, self.first_frame + frame), camera.width, camera.height)
+
+    def camera(self, camera_index: int, frame: int) -> Camera:
+        """The camera that took `view(camera_index, frame)`. Name, size and split are the same in all frames.
+
+        Raises:
+            UsageError: there is no such camera or frame.
+        """
+        self._check(camera_index, frame)
+        reference = self.cameras[camera_index]
+        if self.poses is None:
+            return reference
+        there = self.poses(camera_index, self.first_frame + frame).resized(reference.width, reference.height)
+        return replace(reference, K=there.K, viewmat=there.viewmat)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the pose or the intrinsics of any camera change between frames."""
+        if self.poses is None:
+            return False
+        scale = extent(self.cameras)
+        return any(
+            differs(self.camera(i, t), reference, scale)
+            for i, reference in enumerate(self.cameras)
+            for t in range(1, self.frame_count)
+        )
+
+    def _check(self, camera_index: int, frame: int) -> None:
         if not 0 <= camera_index < len(self.cameras):
             raise UsageError(f"{self.name}: no camera {camera_index}, there are {len(self.cameras)} (0 to n - 1)")
         if not 0 <= frame < self.frame_count:
             raise UsageError(f"{self.name}: no frame {frame}, there are {self.frame_count} (0 to n - 1)")
-        camera = self.cameras[camera_index]
-        return resize_area(self.read(camera_index, self.first_frame + frame), camera.width, camera.height)
 
     def indices(self, split: str) -> list[int]:
         """Indices of the cameras of a split, "train" or "test"."""
@@ -68,7 +100,8 @@ class Capture:
         a, b, _ = slice(start, stop).indices(self.frame_count)
         if b <= a:
             raise UsageError(f"{self.name}: frames {start}:{stop} is empty, the capture has {self.frame_count} frames")
-        return replace(self, first_frame=self.first_frame + a, frame_count=b - a)
+        cameras = [self.camera(i, a) for i in range(len(self.cameras))]
+        return replace(self, cameras=cameras, first_frame=self.first_frame + a, frame_count=b - a)
 
     def scaled(self, scale: float) -> Capture:
         """The capture with images `scale` times the size (area filter), at least 1 pixel.
@@ -82,8 +115,26 @@ class Capture:
         return replace(self, cameras=[c.resized(w, h) for c, (w, h) in zip(self.cameras, size, strict=True)])
 
 
+def extent(cameras: Sequence[Camera]) -> float:
+    """Largest distance of a camera from the origin, world units: the scale that `differs` needs."""
+    return max(float(np.linalg.norm(c.viewmat[:3, 3])) for c in cameras)
+
+
+def differs(a: Camera, b: Camera, scale: float) -> bool:
+    """Whether two cameras differ in pose, intrinsics or distortion by more than rounding errors (`STILL`).
+
+    Args:
+        scale: length that errors of positions are relative to, world units.
+    """
+    if a.distortion.shape != b.distortion.shape:
+        return True
+    pairs = ((a.viewmat[:3, :3], b.viewmat[:3, :3], 1.0), (a.viewmat[:3, 3], b.viewmat[:3, 3], scale))
+    pairs += ((a.K, b.K, a.width), (a.distortion, b.distortion, 1.0))
+    return any(np.abs(x - y).max(initial=0) > STILL * size for x, y, size in pairs)
+
+
 def cropped(view: View, camera: Camera) -> tuple[View, Camera]:
-    """The part of a view with the subject and MARGIN pixels around it; all of it where nothing tells them apart."""
+    """The part of a view with the subject and MARGIN pixels around it; the whole view without alpha or subject."""
     if view.alpha is None or not view.alpha.any():
         return View(np.ascontiguousarray(view.rgb), view.alpha), camera
     (height, width), alpha = view.alpha.shape, view.alpha

@@ -1,14 +1,20 @@
 """COLMAP sparse models -> Capture, one frame a folder or all frames in one.
 
-A folder has images/ and a model in sparse/0, sparse or colmap/sparse/0 (cameras and images, .bin or .txt). Either the
-capture is a folder of such folders, one a frame in the order of their numbers (V3's layout, SpacetimeGaussians'), where
-an image's name is the camera's and the first frame's model holds for all; or it is one such folder, where images of
-the model named CAMERA/FRAME have the other frames beside them, and images without a folder are single frames. Masks lie
-in masks/ under the same names. Poses are world-to-camera, OpenCV axes, pixel centres at half-integers, as ours.
+A folder has images/ and a model in sparse/0, sparse or colmap/sparse/0 (cameras and images, .bin or .txt). There are
+two kinds of captures:
+
+- One folder for each frame, in the order of their numbers (the layout of V3 and SpacetimeGaussians). The name of an
+  image is its camera's.
+- One folder with all frames. Images named CAMERA/FRAME are the frames of a camera, images without a folder are single
+  frames.
+
+A camera whose known poses agree stands still, and one known pose is enough. A camera that moves needs a pose in every
+frame. Masks are in masks/ under the same names. Poses are world-to-camera, OpenCV axes, pixel centres at half-integers.
 """
 
 from __future__ import annotations
 
+import mmap
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,9 +24,9 @@ import numpy as np
 
 from ..errors import CaptureError
 from ..model.camera import Camera
-from .capture import Capture
+from .capture import Capture, differs, extent
 from .images import SUFFIXES
-from .rig import Feed, assemble, by_number, numbered, pinhole, rigid, usable
+from .rig import Feed, Track, assemble, by_number, numbered, pinhole, rigid, usable
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
 # number and name of the camera model -> which parameter is fx, fy, cx, cy, k1, k2, p1, p2 (None: 0)
@@ -49,15 +55,47 @@ class _Image:
     translation: np.ndarray
 
 
+@dataclass(frozen=True)
+class _Model:
+    folder: Path
+    lenses: dict[int, _Lens]
+    images: dict[str, _Image]
+
+    def camera(self, image: str) -> Camera | None:
+        """The camera that took `image`; None where the model does not have the image.
+
+        Raises:
+            CaptureError: its lens is not in the model, or its pose is not a rotation.
+        """
+        from scipy.spatial.transform import Rotation
+
+        if image not in self.images:
+            return None
+        i = self.images[image]
+        lens = self.lenses.get(i.lens)
+        if lens is None:
+            raise CaptureError(f"{self.folder} has no camera {i.lens}, which took image {image}")
+        fx, fy, cx, cy, *distortion = lens.params
+        unit = 0 < np.linalg.norm(i.quat) < np.inf
+        R = Rotation.from_quat(np.roll(i.quat, -1)).as_matrix() if unit else np.zeros((3, 3))  # which `rigid` refuses
+        terms = np.array((distortion + [0.0] * 4)[:4])
+        try:
+            K, viewmat = pinhole(fx, fy, cx, cy), rigid(R, i.translation)
+        except CaptureError as e:
+            raise CaptureError(f"{self.folder}, image {image}: {e}") from e
+        return Camera(_name(image), K, viewmat, lens.width, lens.height, terms)
+
+
 def find_model(folder: Path) -> Path | None:
     """The folder of the model in `folder`, or in the first frame's."""
     if not folder.is_dir():
         return None
-    for place in (folder, *frames_of(folder)[:1]):
-        for model in MODELS:
-            if any((place / model / f"images{s}").is_file() for s in (".bin", ".txt")):
-                return place / model
-    return None
+    return _model_in(folder) or next((m for f in frames_of(folder)[:1] if (m := _model_in(f))), None)
+
+
+def _model_in(folder: Path) -> Path | None:
+    places = (folder / model for model in MODELS)
+    return next((p for p in places if any((p / f"images{s}").is_file() for s in (".bin", ".txt"))), None)
 
 
 def frames_of(root: Path) -> list[Path]:
@@ -69,28 +107,68 @@ def open_colmap(root: Path) -> Capture:
     """Reads the capture in `root`. All cameras are for training.
 
     Raises:
-        CaptureError: the model is damaged or of a lens that is not supported, or no camera can be used.
+        CaptureError: a model is damaged or of a lens that is not supported, or no camera can be used.
     """
-    model = find_model(root)
-    lenses, images = _read_model(model)
-    frames = [] if (root / "images").is_dir() else frames_of(root)
+    found = find_model(root)
+    model = _read_model(found)
+    if (root / "images").is_dir():
+        made, make = _one_folder(root, model)
+    else:
+        made, make = _frame_folders(frames_of(root), model)
+    return assemble(root.resolve().name, *usable(found, dict(sorted(made.items(), key=_by_number)), make))
 
-    def make(name: str, image: _Image) -> tuple[Camera, Feed]:
-        if frames:
-            paths = [_there(f / "images" / image.name) for f in frames]
-            masks = [_mask(f / "masks", Path(image.name)) for f in frames]
-        else:
-            paths = numbered((root / "images" / image.name).parent) if "/" in image.name else []
-            paths = paths or [_there(root / "images" / image.name)]
-            masks = [_mask(root / "masks", p.relative_to(root / "images")) for p in paths]
-        return _camera(name, image, lenses.get(image.lens)), Feed(paths, masks)
 
-    made = {_name(i.name): i for i in sorted(images, key=lambda i: by_number(Path(i.name)))}
-    return assemble(root.resolve().name, *usable(model, made, make))
+def _by_number(item: tuple[str, object]) -> list:
+    return by_number(Path(item[0]))
+
+
+def _frame_folders(frames: list[Path], first: _Model):
+    """`made` and `make` of `usable`, for one folder for each frame; `first`: the model of the first one."""
+    models = [first, *(_read_model(own) if (own := _model_in(f)) else None for f in frames[1:])]
+
+    def make(name: str, image: str) -> tuple[Track, Feed]:
+        paths = [_there(f / "images" / image) for f in frames]
+        masks = [_mask(f / "masks", Path(image)) for f in frames]
+        return _track([m and m.camera(image) for m in models], paths), Feed(paths, masks)
+
+    return {_name(image): image for image in first.images}, make
+
+
+def _one_folder(root: Path, model: _Model):
+    """`made` and `make` of `usable`, for one folder with all frames."""
+    made: dict[str, list[str]] = {}
+    for image in sorted(model.images, key=lambda i: by_number(Path(i))):
+        made.setdefault(_name(image), []).append(image)
+
+    def make(name: str, images: list[str]) -> tuple[Track, Feed]:
+        paths = numbered((root / "images" / images[0]).parent) if "/" in images[0] else []
+        paths = paths or [_there(root / "images" / images[0])]
+        names = [p.relative_to(root / "images") for p in paths]
+        masks = [_mask(root / "masks", n) for n in names]
+        known = [model.camera(n.as_posix()) for n in names]
+        return _track(known if any(known) else [model.camera(images[0])], paths), Feed(paths, masks)
+
+    return made, make
+
+
+def _track(known: list[Camera | None], paths: list[Path]) -> Track:
+    """One camera in each frame (image of `paths`), from the frames where it is known.
+
+    Raises:
+        CaptureError: it moves, and a frame has no pose.
+    """
+    poses = [c for c in known if c is not None]
+    if len(poses) == len(known):
+        return poses
+    moved = next((c for c in poses[1:] if differs(c, poses[0], extent(poses[:1]))), None)
+    if moved is not None:
+        t = known.index(None)
+        raise CaptureError(f"frame {t}: the camera moves, but no model has a pose of image {paths[t]}")
+    return poses[:1]
 
 
 def _name(image: str) -> str:
-    """The camera's: the folder of the image where it has one."""
+    """The camera of an image: its folder, or its own name where it has no folder."""
     path = Path(image)
     return path.parent.as_posix() if path.parent.name else path.stem
 
@@ -102,36 +180,24 @@ def _there(path: Path) -> Path:
 
 
 def _mask(folder: Path, image: Path) -> Path | None:
-    """Of the image of that name, also with its suffix and .png behind it (as COLMAP wants masks)."""
+    """The mask of an image: the same name with any suffix, or the whole name with .png appended (COLMAP's way)."""
     names = [image.with_suffix(s) for s in SUFFIXES] + [image.with_name(image.name + ".png")]
     return next((folder / n for n in names if (folder / n).is_file()), None)
 
 
-def _camera(name: str, image: _Image, lens: _Lens | None) -> Camera:
-    from scipy.spatial.transform import Rotation
-
-    if lens is None:
-        raise CaptureError(f"the model has no camera {image.lens}")
-    fx, fy, cx, cy, *distortion = lens.params
-    turns = 0 < np.linalg.norm(image.quat) < np.inf  # others are refused as no rotation
-    R = Rotation.from_quat(np.roll(image.quat, -1)).as_matrix() if turns else np.zeros((3, 3))
-    viewmat = rigid(R, image.translation)
-    lens_terms = np.array((distortion + [0.0] * 4)[:4])
-    return Camera(name, pinhole(fx, fy, cx, cy), viewmat, lens.width, lens.height, lens_terms)
-
-
-def _read_model(folder: Path) -> tuple[dict[int, _Lens], list[_Image]]:
+def _read_model(folder: Path) -> _Model:
     binary = (folder / "images.bin").is_file()
     suffix, lenses, images = (".bin", _lenses_bin, _images_bin) if binary else (".txt", _lenses_txt, _images_txt)
     out = []
     for path, read in ((folder / f"cameras{suffix}", lenses), (folder / f"images{suffix}", images)):
         try:
-            out.append(list(read(path.read_bytes())))
+            with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                out.append(list(read(data)))  # the points of images.bin, most of the file, are never loaded
         except FileNotFoundError:
             raise CaptureError(f"{path}: the file is missing, expected a COLMAP model") from None
         except (struct.error, ValueError, IndexError, UnicodeDecodeError) as e:
             raise CaptureError(f"{path}: damaged ({e}), expected a COLMAP model") from e
-    return dict(out[0]), out[1]
+    return _Model(folder, dict(out[0]), {image.name: image for image in out[1]})
 
 
 def _lens(number: int, width: int, height: int, params: list[float]) -> _Lens:
@@ -146,7 +212,7 @@ def _known(number: int | None, shown: object) -> int:
     return number
 
 
-def _lenses_bin(data: bytes) -> Iterator[tuple[int, _Lens]]:
+def _lenses_bin(data: mmap.mmap) -> Iterator[tuple[int, _Lens]]:
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         index, number, width, height = struct.unpack_from("<iiQQ", data, at)
@@ -156,28 +222,30 @@ def _lenses_bin(data: bytes) -> Iterator[tuple[int, _Lens]]:
         yield index, _lens(number, width, height, list(params))
 
 
-def _images_bin(data: bytes) -> Iterator[_Image]:
+def _images_bin(data: mmap.mmap) -> Iterator[_Image]:
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         _, *pose, lens = struct.unpack_from("<i7di", data, at)
-        end = data.index(b"\0", at + 64)
+        end = data.find(b"\0", at + 64)
+        if end < 0:
+            raise ValueError("a name does not end")
         (points,) = struct.unpack_from("<Q", data, end + 1)
         yield _Image(data[at + 64 : end].decode(), lens, np.array(pose[:4]), np.array(pose[4:]))
         at = end + 9 + 24 * points
 
 
-def _rows(data: bytes) -> list[list[str]]:
-    lines = data.decode().splitlines()
+def _rows(data: mmap.mmap) -> list[list[str]]:
+    lines = data[:].decode().splitlines()
     return [line.split() for line in lines if not line.startswith("#")]
 
 
-def _lenses_txt(data: bytes) -> Iterator[tuple[int, _Lens]]:
+def _lenses_txt(data: mmap.mmap) -> Iterator[tuple[int, _Lens]]:
     for index, name, width, height, *params in filter(None, _rows(data)):
         number = _known(NUMBERS.get(name), name)
         yield int(index), _lens(number, int(width), int(height), [float(p) for p in params])
 
 
-def _images_txt(data: bytes) -> Iterator[_Image]:
+def _images_txt(data: mmap.mmap) -> Iterator[_Image]:
     for row in _rows(data)[::2]:  # every second line has the points
         if row:
             pose = np.array([float(v) for v in row[1:8]])

@@ -1,4 +1,4 @@
-"""What layout a folder has: the files that give each away, and the one list of what was looked for."""
+"""Path -> Capture: which layout a folder has is seen from the files that only this layout has."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ..errors import CaptureError
 from .actorshq import open_actorshq
 from .capture import Capture
 from .colmap import find_model, open_colmap
-from .easyvolcap import open_easyvolcap
+from .easyvolcap import find_calibration, open_easyvolcap
 from .n3dv import open_n3dv
 from .qualisys import open_qualisys
 from .transforms import open_transforms
@@ -40,7 +40,7 @@ def _file(path: Path, *names: str) -> Path | None:
     return path / names[0] if all((path / n).is_file() for n in names) else None
 
 
-# layout -> what gives it away, path -> its calibration if that is there, (path, calibration) -> Capture
+# layout -> its files in words, path -> calibration or None, (path, calibration) -> Capture
 LAYOUTS = {
     "transforms": (
         "transforms.json or transforms_train.json (nerfstudio, instant-ngp)",
@@ -53,9 +53,9 @@ LAYOUTS = {
         lambda _, poses: open_n3dv(poses),
     ),
     "easyvolcap": (
-        "intri.yml and extri.yml with images/ or videos/ (EasyVolcap, EasyMocap)",
-        lambda path: _file(path, "intri.yml", "extri.yml"),
-        lambda path, _: open_easyvolcap(path),
+        "intri.yml and extri.yml, here or in cameras/CAMERA/, with images/ or videos/ (EasyVolcap, EasyMocap)",
+        find_calibration,
+        open_easyvolcap,
     ),
     "actorshq": (
         "calibration.csv with rgbs/ (ActorsHQ)",
@@ -73,7 +73,7 @@ LOOKED_FOR = tuple(what for what, _, _ in LAYOUTS.values())
 
 
 def find_capture(path: Path) -> str | None:
-    """The layout of `path`, a key of `LAYOUTS`; None if it is not a capture."""
+    """The layout of `path`, a key of `LAYOUTS`; None: not a capture."""
     return next((name for name, (_, find, _) in LAYOUTS.items() if find(Path(path))), None)
 
 

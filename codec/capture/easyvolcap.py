@@ -1,12 +1,15 @@
 """EasyVolcap and EasyMocap -> Capture: intri.yml and extri.yml (OpenCV's), images/CAMERA/* or videos/CAMERA.mp4.
 
+Cameras that stand still are the names of one pair of files in the folder. Cameras that move have a pair each in
+cameras/CAMERA/, whose names are the frames. Masks are masks/CAMERA/*.
+
 World-to-camera, OpenCV axes: K_name [3, 3] in pixels with pixel centres at integers, D_name or dist_name as in OpenCV,
 Rot_name [3, 3] or R_name (a rotation vector), T_name; W_name and H_name where the calibration was of another size.
-Masks are masks/CAMERA/*.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +17,7 @@ import numpy as np
 from ..errors import CaptureError, require
 from ..model.camera import Camera
 from .capture import Capture
-from .rig import Feed, assemble, find_video, numbered, pinhole, rigid, usable
+from .rig import Feed, Track, assemble, by_number, find_video, numbered, pinhole, rigid, usable
 from .video import Video
 
 
@@ -22,6 +25,7 @@ class _Yaml:
     """OpenCV's YAML files, which no YAML library reads."""
 
     def __init__(self, path: Path):
+        self.path = path
         cv2 = require("cv2", "reading calibrations")
         try:
             self._file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
@@ -31,40 +35,80 @@ class _Yaml:
             raise CaptureError(f"{path}: not a calibration file of OpenCV")
 
     def names(self) -> list[str]:
-        """The list `names`; numbers may stand there without quotes."""
+        """The list `names`, of strings or integers."""
         node = self._file.getNode("names")
         items = [node.at(i) for i in range(node.size())]
         return [i.string() if i.isString() else str(int(i.real())) for i in items]
 
     def matrix(self, key: str, *shape: int) -> np.ndarray:
-        """Raises CaptureError where it is missing or has another shape."""
+        """[*shape] f64. Raises CaptureError: it is missing, has another shape, or is not finite."""
         m = self._file.getNode(key).mat()
         if m is None or m.size != np.prod(shape) or not np.isfinite(m).all():
-            raise CaptureError(f"{key} is missing, expected {' x '.join(map(str, shape))} finite numbers")
+            size = " x ".join(map(str, shape))
+            raise CaptureError(f"{self.path}: {key} is missing or wrong, expected {size} finite numbers")
         return m.reshape(shape).astype(np.float64)
 
     def has(self, key: str) -> bool:
         return not self._file.getNode(key).empty()
 
     def number(self, key: str) -> int:
-        """0 where it is missing."""
+        """An integer, 0 where it is missing."""
         return int(self._file.getNode(key).real())
 
 
-def open_easyvolcap(root: Path) -> Capture:
-    """Reads intri.yml and extri.yml in `root` and the images or videos beside them. All cameras are for training.
+def find_calibration(root: Path) -> Path | None:
+    """The folder of intri.yml and extri.yml: `root`, or `root`/cameras where each camera has its own pair there."""
+    if _has_pair(root):
+        return root
+    return root / "cameras" if moving_cameras(root) else None
+
+
+def moving_cameras(root: Path) -> list[Path]:
+    """The folders of cameras that move, in the order of the numbers in their names."""
+    folder = root / "cameras"
+    return sorted(filter(_has_pair, folder.iterdir()), key=by_number) if folder.is_dir() else []
+
+
+def _has_pair(folder: Path) -> bool:
+    return (folder / "intri.yml").is_file() and (folder / "extri.yml").is_file()
+
+
+def open_easyvolcap(root: Path, calibration: Path) -> Capture:
+    """Reads the images or videos in `root` and their `calibration` (`find_calibration`). All cameras are for training.
 
     Raises:
         CaptureError: a file is not a calibration, or no camera can be used.
     """
-    intrinsics, extrinsics = _Yaml(root / "intri.yml"), _Yaml(root / "extri.yml")
 
-    def make(name: str, _) -> tuple[Camera, Feed]:
+    def feed(name: str) -> Feed:
         images = numbered(root / "images" / name)
-        feed = Feed(images or Video(find_video([root / "videos"], name)), numbered(root / "masks" / name))
-        return _camera(name, intrinsics, extrinsics, feed), feed
+        return Feed(images or Video(find_video([root / "videos"], name)), numbered(root / "masks" / name))
 
-    return assemble(root.resolve().name, *usable(root / "intri.yml", dict.fromkeys(intrinsics.names()), make))
+    def moving(name: str, folder: Path) -> tuple[Track, Feed]:
+        pair, footage = _pair(folder), feed(name)
+        frames = sorted(pair[0].names(), key=lambda frame: by_number(Path(frame)))
+        track = []
+        for frame in frames:
+            try:
+                track.append(replace(_camera(frame, *pair, footage), name=name))
+            except CaptureError as e:
+                raise CaptureError(f"frame {frame}: {e}") from e
+        return track, footage
+
+    def fixed(name: str, pair: tuple[_Yaml, _Yaml]) -> tuple[Track, Feed]:
+        footage = feed(name)
+        return [_camera(name, *pair, footage)], footage
+
+    if calibration == root:
+        pair = _pair(root)
+        found = usable(root / "intri.yml", dict.fromkeys(pair[0].names(), pair), fixed)
+    else:
+        found = usable(calibration, {f.name: f for f in moving_cameras(root)}, moving)
+    return assemble(root.resolve().name, *found)
+
+
+def _pair(folder: Path) -> tuple[_Yaml, _Yaml]:
+    return _Yaml(folder / "intri.yml"), _Yaml(folder / "extri.yml")
 
 
 def _camera(name: str, intrinsics: _Yaml, extrinsics: _Yaml, feed: Feed) -> Camera:

@@ -1,9 +1,8 @@
-"""One image file -> View: 8-bit sRGB colour, not premultiplied, and its alpha; filters that respect the alpha.
+"""One image file -> View: 8-bit sRGB colour, not premultiplied, and alpha; resampling that weights colour by alpha.
 
-OpenImageIO reads every format. It premultiplies by alpha unless told not to, and formats that are premultiplied by
-nature (EXR) it leaves so: both end up unassociated here. Float images are linear light and get the sRGB curve;
-integers are taken to be sRGB already. Resampling filters premultiplied colours, or the colour hidden under alpha 0
-would bleed into the edges.
+OpenImageIO reads every format. It is told not to premultiply by alpha; formats that are stored premultiplied (EXR)
+are divided by alpha here. Float images are linear light and get the sRGB curve, integer images are taken as sRGB.
+Resampling works on premultiplied colour: otherwise colour under alpha 0 would bleed into the edges.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import numpy as np
 
 from ..errors import CaptureError, require
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr", ".tif", ".tiff")  # what a name without one is tried with
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr", ".tif", ".tiff")  # tried in this order for a name without suffix
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ def image_size(path: Path) -> tuple[int, int, bool]:
 
 
 def _channels(names: tuple[str, ...]) -> tuple[list[int], int | None]:
-    """Which channels are red, green, blue and alpha; grey images repeat their one colour channel."""
+    """Indices of red, green and blue (a grey image: one channel three times), and of alpha or None."""
     at = {n.rsplit(".", 1)[-1].upper(): i for i, n in reversed(list(enumerate(names)))}
     colour = [at[c] for c in "RGB"] if all(c in at for c in "RGB") else [0, 0, 0]
     return colour, at.get("A")
@@ -103,7 +102,7 @@ def _u8(x: np.ndarray) -> np.ndarray:
 
 
 def _divide(rgb: np.ndarray, alpha: np.ndarray, top: float) -> np.ndarray:
-    """Premultiplied f32 colour -> unassociated, rounded to nearest where it is an integer scale; 0 under alpha 0."""
+    """Premultiplied f32 colour -> not premultiplied; 0 where alpha is 0. Adds 0.5 for rounding if `top` is 255."""
     out = rgb / np.maximum(alpha, 1e-6)[..., None] * (alpha > 0)[..., None]
     return np.clip(out + (0.5 if top == 255 else 0), 0, top)
 

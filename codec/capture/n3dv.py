@@ -1,8 +1,8 @@
 """Neural 3D Video (Li et al. 2022) -> Capture: one camNN.mp4 a camera and poses_bounds.npy.
 
-A row of poses_bounds.npy (LLFF, Mildenhall et al. 2019) has a [3, 5] matrix, camera-to-world with the axes down, right
-and back, then height, width and focal length in pixels, and two depths that are not used. Rows are in the order of the
-videos' names. The first camera is the test camera, as every paper on the dataset has it.
+A row of poses_bounds.npy (LLFF, Mildenhall et al. 2019) has a [3, 5] matrix and two depths, which are not used. The
+matrix is camera-to-world with the axes down, right and back; its last column has height, width and focal length in
+pixels. Rows are in the order of the videos' names. The first camera is the test camera, as in papers on the dataset.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import CaptureError
 from ..model.camera import Camera
 from .capture import Capture
-from .rig import VIDEOS, Feed, assemble, numbered, pinhole, rigid, usable
+from .rig import VIDEOS, Feed, Track, assemble, numbered, pinhole, rigid, usable
 from .video import Video
 
 
@@ -35,10 +35,11 @@ def open_n3dv(poses: Path) -> Capture:
         raise CaptureError(f"{poses}: {len(rows)} cameras, expected as many as there are videos: {len(videos)}")
     made = {v.stem: (row[:15].reshape(3, 5), v) for row, v in zip(rows, videos, strict=True)}
     first = next(iter(made))
-    cameras, feeds = usable(
-        poses, made, lambda n, item: (_camera(n, item[0], "test" if n == first else "train"), Feed(Video(item[1])))
-    )
-    return assemble(poses.parent.resolve().name, cameras, feeds)
+
+    def make(name: str, item: tuple[np.ndarray, Path]) -> tuple[Track, Feed]:
+        return [_camera(name, item[0], "test" if name == first else "train")], Feed(Video(item[1]))
+
+    return assemble(poses.parent.resolve().name, *usable(poses, made, make))
 
 
 def _camera(name: str, m: np.ndarray, split: str) -> Camera:

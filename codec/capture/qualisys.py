@@ -2,11 +2,11 @@
 
 Layout: calibration/*.qca.txt and videos/<serial>.mp4. Intrinsics are in 1/64 pixel with pixel centres at integers,
 positions in mm, distortion k1 k2 p1 p2 k3 as in OpenCV. The rows of the rotation r11..r33 are the camera's axes in
-the world, x right, y up, z back (OpenGL): x_cv = diag(1, -1, -1) R (X - T). Of the four readings of that matrix (it
-or its transpose, OpenGL or OpenCV axes) it is the one under which what four cameras see meets: in a recording of a
-man on a treadmill the centre of his cap is met within 9 px in front of all cameras (the other readings: 134 to 470
-px), and four bolts in the floor within 10 px and 10 mm of z = 0. Those 10 px (of 1920) are the calibration's own
-error; no change of sign or order makes them fewer.
+the world, x right, y up, z back (OpenGL): x_cv = diag(1, -1, -1) R (X - T).
+
+The format is not documented; the matrix could also be its transpose, or have OpenCV axes. In a recording with four
+cameras, a point triangulated with this reading is reprojected within 9 px, with the other three within 134 to 470 px.
+Four bolts in the floor are within 10 px and 10 mm of z = 0. The rest (10 of 1920 px) is the error of the calibration.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from ..errors import CaptureError
 from ..model.camera import Camera
 from .capture import Capture
-from .rig import Feed, assemble, find_video, numbered, pinhole, rigid, usable
+from .rig import Feed, Track, assemble, find_video, numbered, pinhole, rigid, usable
 from .video import Video
 
 UNIT = 64  # calibration units per pixel
@@ -41,9 +41,9 @@ def open_qualisys(root: Path, calibration: Path) -> Capture:
     elements = {e.get("serial", "?"): e for e in _cameras(calibration)}
     folders = [f for f in (root / "videos", root) if f.is_dir()]
 
-    def make(name: str, element: ET.Element) -> tuple[Camera, Feed]:
+    def make(name: str, element: ET.Element) -> tuple[Track, Feed]:
         camera = _camera(element, name)
-        return camera, Feed(Video(find_video(folders, name)), numbered(root / "masks" / name))
+        return [camera], Feed(Video(find_video(folders, name)), numbered(root / "masks" / name))
 
     return assemble(root.resolve().name, *usable(calibration, elements, make))
 

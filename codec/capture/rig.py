@@ -1,27 +1,29 @@
 """Calibrated cameras and what each has recorded -> Capture: the part that all layouts share.
 
-A `Feed` is the footage of one camera: an image file a frame or a video, with mask files beside it or none. A camera
-whose footage is a smaller copy of what was calibrated is scaled with it.
+A `Feed` is the footage of one camera: a video or one image file a frame, with or without mask files. A `Track` is the
+calibration of one camera. Where the footage is a smaller copy of the calibrated size, the camera is scaled to it.
 """
 
 from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..errors import CaptureError
 from ..model.camera import Camera
-from .capture import Capture
+from .capture import Capture, differs, extent
 from .images import SUFFIXES, View, image_size, read_image, read_mask
-from .undistort import undistortion
+from .undistort import Undistortion
 from .video import Video
 
 FPS = 30.0  # where nothing says it
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
+Track = Sequence[Camera]  # one camera in each frame of its feed; a single entry holds for all frames
 
 
 class Feed:
@@ -79,28 +81,48 @@ class Feed:
         return self.path if isinstance(self._source, Video) else self._source[t]
 
 
-def assemble(name: str, cameras: Sequence[Camera], feeds: Sequence[Feed], fps: float | None = None) -> Capture:
-    """The capture of `cameras`, which may have distortion, and their `feeds`; `fps` is that of the videos where it is
-    None. It ends with the shortest feed, unless that one is under half as long as usual: then its camera is left out.
+def assemble(name: str, tracks: Sequence[Track], feeds: Sequence[Feed], fps: float | None = None) -> Capture:
+    """The capture of what `usable` found. It ends with the shortest feed; a camera whose feed is less than half as long
+    as the median is left out.
+
+    Args:
+        tracks: each camera, with or without distortion. feeds: what each camera has recorded.
+        fps: frames a second; None: as the first feed says.
 
     Raises:
         CaptureError: the feeds have no frames.
     """
-    cameras, feeds, frame_count = _same_length(cameras, feeds)
-    cameras = [_at_size(c, f) for c, f in zip(cameras, feeds, strict=True)]
-    pinholes, warps = zip(*(undistortion(c) for c in cameras), strict=True)
+    tracks, feeds, frame_count = _same_length(tracks, feeds)
+    tracks = _still(tracks)
+    lenses = [Undistortion() for _ in tracks]
+    pinholes = [[lens.camera(c) for c in track] for lens, track in zip(lenses, tracks, strict=True)]
 
     def read(index: int, frame: int) -> View:
-        view, camera = feeds[index].view(frame), cameras[index]
+        view, camera = feeds[index].view(frame), _at(tracks[index], frame)
         if view.rgb.shape[:2] != (camera.height, camera.width):
             raise CaptureError(
                 f"{feeds[index].name(frame)}: camera {camera.name}, frame {frame} is {_size(view.rgb.shape)}, "
                 f"expected {camera.width}x{camera.height} as the calibration says"
             )
-        return warps[index](view)
+        return lenses[index].view(view, camera)
+
+    def poses(index: int, frame: int) -> Camera:
+        return _at(pinholes[index], frame)
 
     alpha = any(f.has_alpha for f in feeds)
-    return Capture(name, fps or feeds[0].fps, list(pinholes), frame_count, alpha, read)
+    moving = any(len(track) > 1 for track in tracks)
+    cameras = [track[0] for track in pinholes]
+    return Capture(name, fps or feeds[0].fps, cameras, frame_count, alpha, read, poses=poses if moving else None)
+
+
+def _at(track: Track, frame: int) -> Camera:
+    return track[frame if len(track) > 1 else 0]
+
+
+def _still(tracks: Sequence[Track]) -> list[Track]:
+    """The tracks, with a single entry for each camera that stands still."""
+    scale = extent([track[0] for track in tracks])
+    return [track if any(differs(c, track[0], scale) for c in track[1:]) else track[:1] for track in tracks]
 
 
 def rigid(R: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -127,25 +149,45 @@ def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
-def usable(source: Path, made: dict, make) -> tuple[list[Camera], list[Feed]]:
-    """`make(name, item)` -> (camera, feed) of every item of `made`; those that cannot be used are left out.
+def usable(source: Path, made: dict, make: Callable[[str, Any], tuple[Track, Feed]]) -> tuple[list[Track], list[Feed]]:
+    """Makes the cameras of a capture. A camera that cannot be used is left out with a warning.
+
+    Args:
+        source: the calibration, for messages.
+        made: camera name -> what `make` needs.
+        make: (name, item of `made`) -> track and feed; raises CaptureError where the camera cannot be used.
+
+    Returns:
+        The tracks, at the size of their feeds, and the feeds.
 
     Raises:
-        CaptureError: none can be used.
+        CaptureError: no camera can be used.
     """
     found, reason = [], "there are no cameras"
     for name, item in made.items():
         try:
-            camera, feed = make(name, item)
-            _at_size(camera, feed)
-            found.append((camera, feed))
+            found.append(_fitted(*make(name, item)))
         except CaptureError as e:
             warnings.warn(f"{source}: camera {name} is left out: {e}", stacklevel=4)
             reason = str(e)
     if not found:
         raise CaptureError(f"{source}: no camera can be used; the last one: {reason}")
-    cameras, feeds = zip(*found, strict=True)
-    return list(cameras), list(feeds)
+    tracks, feeds = zip(*found, strict=True)
+    return list(tracks), list(feeds)
+
+
+def _fitted(track: Track, feed: Feed) -> tuple[Track, Feed]:
+    """The track at the size of its feed, which may be a smaller copy of what was calibrated."""
+    if len(track) not in (1, len(feed)):
+        raise CaptureError(f"{feed.path}: {len(feed)} frames, but poses of {len(track)}; expected one for each frame")
+    for t, camera in enumerate(track):
+        if abs(feed.width * camera.height - feed.height * camera.width) > max(camera.width, camera.height):
+            calibration = "the calibration" + (f" of frame {t}" if t else "")
+            raise CaptureError(
+                f"{feed.path} is {feed.width}x{feed.height}, expected {camera.width}x{camera.height} "
+                f"as {calibration} says, or that shape at another scale"
+            )
+    return [camera.resized(feed.width, feed.height) for camera in track], feed
 
 
 def numbered(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> list[Path]:
@@ -173,17 +215,8 @@ def find_video(folders: Sequence[Path], name: str) -> Path:
     raise CaptureError(f"no video, looked for {name} with {', '.join(VIDEOS)} in {where}")
 
 
-def _at_size(camera: Camera, feed: Feed) -> Camera:
-    """The camera at the size of its feed, which may be a smaller copy of what was calibrated."""
-    if abs(feed.width * camera.height - feed.height * camera.width) > max(camera.width, camera.height):
-        raise CaptureError(
-            f"{feed.path} is {feed.width}x{feed.height}, expected {camera.width}x{camera.height} "
-            "as the calibration says, or that shape at another scale"
-        )
-    return camera.resized(feed.width, feed.height)
-
-
-def _same_length(cameras: Sequence[Camera], feeds: Sequence[Feed]) -> tuple[list[Camera], list[Feed], int]:
+def _same_length(tracks: Sequence[Track], feeds: Sequence[Feed]) -> tuple[list[Track], list[Feed], int]:
+    """Without the cameras whose feed is far too short; and the number of frames that all the others have."""
     usual = sorted(map(len, feeds))[len(feeds) // 2]
     keep = [i for i, f in enumerate(feeds) if 2 * len(f) >= usual]
     for i, f in enumerate(feeds):
@@ -193,7 +226,7 @@ def _same_length(cameras: Sequence[Camera], feeds: Sequence[Feed]) -> tuple[list
     count = min(len(feeds[i]) for i in keep)
     if count < 1:
         raise CaptureError(f"{feeds[keep[0]].path}: the videos have no frames")
-    return [cameras[i] for i in keep], [feeds[i] for i in keep], count
+    return [tracks[i] for i in keep], [feeds[i] for i in keep], count
 
 
 def _size(shape: tuple[int, ...]) -> str:

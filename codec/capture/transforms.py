@@ -1,8 +1,8 @@
 """transforms.json (instant-ngp, nerfstudio) -> Capture.
 
-The format lists images, we need cameras with all their frames: entries are grouped by `camera` (without it by pose,
-as in a static rig), and ordered by `frame` or `time`. Poses are OpenGL camera-to-world (x right, y up, z back) and
-become OpenCV world-to-camera. A camera that cannot be used is left out with a warning as long as others remain.
+The format lists images, a capture has cameras with all their frames: entries are grouped by `camera` and ordered by
+`frame` or `time`. Each entry has its own pose and may have its own intrinsics, so cameras may move. Poses are OpenGL
+camera-to-world (x right, y up, z back) and become OpenCV world-to-camera.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,17 +19,23 @@ from ..errors import CaptureError
 from ..model.camera import Camera
 from .capture import Capture
 from .images import SUFFIXES, image_size
-from .rig import FPS, Feed, assemble, pinhole, usable
+from .rig import FPS, Feed, Track, assemble, pinhole, rigid, usable
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")  # OpenCV's order
 
 
 @dataclass
 class Entry:
-    """One item of `frames` with the file's defaults filled in."""
+    """One item of `frames`, completed from the head of the file.
 
-    camera: str
-    time: float  # frame number, or seconds where there is none: only the order matters
+    Attributes:
+        camera: its name; None until `_name_cameras` where the file has none.
+        time: frame number, or seconds where there is none: only the order matters.
+        values: the item over the head of the file.
+    """
+
+    camera: str | None
+    time: float
     split: str
     image: Path
     mask: Path | None
@@ -48,19 +54,19 @@ def open_transforms(files: list[tuple[Path, str]]) -> Capture:
     entries, fps = [], FPS
     for path, split in files:
         data = _load(path)
-        fps = float(data.get("fps") or _fps(data["frames"]) or FPS)
         entries += _entries(data, path, split)
+        fps = _fps(data, path)
     source = files[0][0]
     times = _common_times(entries)
 
-    def make(name: str, own: list[Entry]) -> tuple[Camera, Feed]:
-        camera, by_time = _camera(name, own, times), {e.time: e for e in own}
-        return camera, Feed([by_time[t].image for t in times], [by_time[t].mask for t in times])
+    def make(name: str, own: list[Entry]) -> tuple[Track, Feed]:
+        of_camera = _at_times(own, times)
+        return _track(name, of_camera), Feed([e.image for e in of_camera], [e.mask for e in of_camera])
 
-    cameras, feeds = usable(source, _by_camera(entries), make)
-    if not any(c.split == "train" for c in cameras):
-        raise CaptureError(f"{source}: all {len(cameras)} cameras are test cameras, training needs split 'train' too")
-    return assemble(source.parent.resolve().name, cameras, feeds, fps)
+    tracks, feeds = usable(source, _by_camera(entries), make)
+    if not any(track[0].split == "train" for track in tracks):
+        raise CaptureError(f"{source}: all {len(tracks)} cameras are test cameras, training needs split 'train' too")
+    return assemble(source.parent.resolve().name, tracks, feeds, fps)
 
 
 def _load(path: Path) -> dict:
@@ -76,13 +82,17 @@ def _load(path: Path) -> dict:
     return data
 
 
-def _fps(frames: list[dict]) -> float | None:
-    """From entries that have both a frame number and a time in seconds."""
-    both = {int(f["frame"]): float(f["time"]) for f in frames if "frame" in f and "time" in f}
-    if len(both) < 2:
-        return None
+def _fps(data: dict, path: Path) -> float:
+    """Frames a second: `fps` of the file, or from entries that have both a frame number and a time in seconds."""
+    try:
+        both = {int(f["frame"]): float(f["time"]) for f in data["frames"] if "frame" in f and "time" in f}
+        fps = float(data.get("fps") or 0)
+    except (TypeError, ValueError) as e:
+        raise CaptureError(f"{path}: fps, frame or time is not a number ({e})") from e
+    if fps > 0 or not both:
+        return fps if fps > 0 else FPS
     a, b = min(both), max(both)
-    return (b - a) / (both[b] - both[a]) if both[b] > both[a] else None
+    return (b - a) / (both[b] - both[a]) if both[b] > both[a] else FPS
 
 
 def _entries(data: dict, path: Path, split: str) -> list[Entry]:
@@ -95,25 +105,53 @@ def _entries(data: dict, path: Path, split: str) -> list[Entry]:
         values = {**shared, **f}
         image = _with_suffix(path.parent / f["file_path"])
         own = str(f.get("split", listed.get(f["file_path"], split)))
+        try:
+            time = float(f.get("frame", f.get("time", 0)))
+        except (TypeError, ValueError):
+            raise CaptureError(f"{path}: frame or time of frames[{i}] is not a number") from None
         out.append(
             Entry(
-                camera=str(f["camera"]) if "camera" in f else _pose_name(f, out),
-                time=float(f.get("frame", f.get("time", 0))),
+                camera=str(f["camera"]) if "camera" in f else None,
+                time=time,
                 split="train" if own == "train" else "test",
                 image=image,
                 mask=_mask(path.parent, image, f),
                 values=values,
             )
         )
-    return out
+    return _name_cameras(out)
 
 
-def _pose_name(f: dict, before: list[Entry]) -> str:
-    """The camera of an entry that does not name one: entries with the same pose share it."""
-    for e in before:
-        if "camera" not in e.values and e.values.get("transform_matrix") == f.get("transform_matrix"):
-            return e.camera
-    return Path(f["file_path"]).with_suffix("").as_posix().removeprefix("./").replace("/", "_")
+def _name_cameras(entries: list[Entry]) -> list[Entry]:
+    """The entries of a file, each with a camera.
+
+    Entries without `camera` in one folder are one camera if all have a frame or time of their own: it may move.
+    Otherwise entries with the same pose are one camera, which stands still.
+    """
+    folders: dict[Path, list[Entry]] = {}
+    for e in entries:
+        if e.camera is None:
+            folders.setdefault(Path(e.values["file_path"]).parent, []).append(e)
+    one = {
+        folder
+        for folder, own in folders.items()
+        if 1 < len(own) == len({e.time for e in own}) and all("frame" in e.values or "time" in e.values for e in own)
+    }
+    by_pose: dict[str, str] = {}
+    named = []
+    for e in entries:
+        path = Path(e.values["file_path"])
+        name = e.camera
+        if name is None and path.parent in one:
+            name = _joined(path.parent)
+        elif name is None:
+            name = by_pose.setdefault(str(e.values.get("transform_matrix")), _joined(path.with_suffix("")))
+        named.append(replace(e, camera=name))
+    return named
+
+
+def _joined(path: Path) -> str:
+    return path.as_posix().replace("/", "_")
 
 
 def _with_suffix(path: Path) -> Path:
@@ -148,30 +186,48 @@ def _by_camera(entries: list[Entry]) -> dict[str, list[Entry]]:
     return dict(sorted(out.items()))
 
 
-def _camera(name: str, entries: list[Entry], times: list[float]) -> Camera:
-    """One camera of the capture, with all that could make it unusable checked.
+def _at_times(entries: list[Entry], times: list[float]) -> list[Entry]:
+    """The entries of one camera, one for each of `times`.
 
     Raises:
-        CaptureError: a frame or an image is missing, the pose is missing, singular or moves, or a size is wrong.
+        CaptureError: a frame or its image is missing.
     """
     have = {e.time: e for e in entries}
     missing = [t for t in times if t not in have]
     if missing:
         raise CaptureError(f"frame {missing[0]:g} is missing ({len(missing)} of {len(times)} frames)")
+    for t in times:
+        if not have[t].image.is_file():
+            raise CaptureError(f"frame {t:g}: image {have[t].image} is missing")
+    return [have[t] for t in times]
+
+
+def _track(name: str, entries: list[Entry]) -> Track:
+    """One camera in each of its frames.
+
+    Raises:
+        CaptureError: names the frame whose pose, intrinsics or size are missing or wrong.
+    """
+    width, height, _ = image_size(entries[0].image)
+    track = []
     for e in entries:
-        if not e.image.is_file():
-            raise CaptureError(f"frame {e.time:g}: image {e.image} is missing")
-    first = have[times[0]]
-    viewmat = _viewmat(first)
-    for e in entries:
-        if not np.allclose(_viewmat(e), viewmat, atol=1e-5):
-            raise CaptureError(f"it moves at frame {e.time:g}; only fixed cameras are supported")
-    width, height, _ = image_size(first.image)
-    v = first.values
+        try:
+            camera = _camera(name, e, width, height)
+        except (TypeError, ValueError) as error:
+            raise CaptureError(f"frame {e.time:g}: not a number ({error})") from error
+        except CaptureError as error:
+            raise CaptureError(f"frame {e.time:g}: {error}") from error
+        track.append(replace(camera, split=entries[0].split))
+    return track
+
+
+def _camera(name: str, e: Entry, width: int, height: int) -> Camera:
+    """The camera of one entry, whose image is `width` x `height` pixels."""
+    v = e.values
     if (int(v.get("w", width)), int(v.get("h", height))) != (width, height):
-        raise CaptureError(f"image {first.image} is {width}x{height}, expected {v.get('w')}x{v.get('h')} (w, h)")
+        raise CaptureError(f"image {e.image} is {width}x{height}, expected {v.get('w')}x{v.get('h')} (w, h)")
     distortion = np.array([float(v.get(k, 0)) for k in DISTORTION])
-    return Camera(name, _intrinsics(v, width, height), viewmat, width, height, distortion, first.split)
+    return Camera(name, _intrinsics(v, width, height), _viewmat(v), width, height, distortion)
 
 
 def _intrinsics(v: dict, width: int, height: int) -> np.ndarray:
@@ -185,21 +241,18 @@ def _intrinsics(v: dict, width: int, height: int) -> np.ndarray:
     return pinhole(fx, fy, float(v.get("cx", width / 2)), float(v.get("cy", height / 2)))
 
 
-def _viewmat(e: Entry) -> np.ndarray:
-    """[4, 4] world-to-camera, OpenCV axes, out of the OpenGL camera-to-world matrix (a uniform scale is removed)."""
-    if "transform_matrix" not in e.values:
-        raise CaptureError(f"frame {e.time:g} has no pose (transform_matrix)")
+def _viewmat(v: dict) -> np.ndarray:
+    """[4, 4] world-to-camera, OpenCV axes, from the OpenGL camera-to-world matrix (a uniform scale is removed)."""
+    if "transform_matrix" not in v:
+        raise CaptureError("no pose, expected transform_matrix")
     try:
-        m = np.array(e.values["transform_matrix"], np.float64)
-    except ValueError:
+        m = np.array(v["transform_matrix"], np.float64)
+    except (TypeError, ValueError):
         m = np.zeros(0)
     if m.shape not in ((4, 4), (3, 4)) or not np.isfinite(m).all():
-        raise CaptureError(f"frame {e.time:g}: transform_matrix is not 4x4 finite numbers")
+        raise CaptureError("transform_matrix is not 4x4 finite numbers")
     u, s, vt = np.linalg.svd(m[:3, :3])
     if s[2] < 1e-6 or s[0] > 1.01 * s[2] or np.linalg.det(m[:3, :3]) < 0:
-        raise CaptureError(f"frame {e.time:g}: transform_matrix is singular, sheared or mirrored, expected a rotation")
+        raise CaptureError("transform_matrix is singular, sheared or mirrored, expected a rotation")
     R = (u @ vt) * [1, -1, -1]  # columns: OpenGL camera axes -> OpenCV
-    out = np.eye(4)
-    out[:3, :3] = R.T
-    out[:3, 3] = -R.T @ m[:3, 3]
-    return out
+    return rigid(R.T, -R.T @ m[:3, 3])

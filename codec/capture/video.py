@@ -1,8 +1,8 @@
 """One video file -> frames by number, decoded in order where possible.
 
-Training asks for frames nearly in order, and decoding forward is far cheaper than seeking, so the decoder stays
-open at its position, a short way ahead is decoded and dropped, and only a jump seeks. The last frames are kept for
-the threads that run a little behind.
+Training asks for frames nearly in order, and decoding forward is far cheaper than seeking. So the decoder stays open at
+its position: for a frame a short way ahead it decodes and drops those between, otherwise it seeks. The last frames are
+kept for threads that are a little behind.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Quality and rate: images in, figures out, and the evaluations that `gscodec eval` prints."""
+"""Quality and rate: measures of images and of rate-distortion curves, and the evaluations of `gscodec eval`."""
 
 from .bd_rate import bd_rate, rising
 from .codec_cameras import codec_cameras

@@ -1,7 +1,8 @@
-"""Decoded frames + a capture, or the splats that were encoded -> the measures of `gscodec eval`.
+"""Decoded frames and their reference, a capture or splats -> the figures of `gscodec eval`.
 
-One pass, frame by frame and camera by camera, with running sums: neither side is in memory as a whole. Views of a
-capture and renders are composited over mid-grey, which shows dark and bright haze equally.
+One pass over frames and cameras: one frame of each side is in memory. Views of a capture and rendered Gaussians are
+composited over mid-grey, on which dark and bright haze have the same contrast. Each view is compared with the picture
+of its camera in its frame, since cameras may move.
 """
 
 from __future__ import annotations
@@ -92,7 +93,8 @@ def evaluate_capture(
             gaussians, images = frame_source(t), []
             counts.append(len(gaussians))
             for n, index in enumerate(views):
-                images.append(_compare(gaussians, capture.cameras[index], capture.view(index, t), temporal[n], vmaf[n]))
+                view, camera = capture.view(index, t), capture.camera(index, t)
+                images.append(_compare(gaussians, camera, view, temporal[n], vmaf[n]))
                 if progress:
                     progress(t * len(views) + n + 1, capture.frame_count * len(views))
             rows.append({"frame": t} | {k: _mean(i[k] for i in images) for k in images[0]})
@@ -105,7 +107,7 @@ def evaluate_capture(
 
 
 def _compare(g: Gaussians, camera: Camera, view: View, temporal: TemporalMeter, vmaf: VmafMeter | None) -> dict:
-    """Measures of one image, which is also added to the meters."""
+    """The figures of one image, which is also added to the meters."""
     from ..render.image import render_image
 
     reference, image = composite(view, BACKGROUND), render_image(g, camera, background=BACKGROUND)

@@ -51,15 +51,19 @@ class Camera:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a trainer has found of the cameras of a capture.
+    """What training has found out about the C cameras of a capture. It holds for all frames, also of moving cameras.
 
     Attributes:
-        cameras: each of them where it really stands.
-        gains: [C, 3] f32, by which what they show is brighter than the scene.
+        corrections: [C, 4, 4] f64, rigid motions of the world: the true viewmat is viewmat @ correction.
+        gains: [C, 3] f32, by which the images of a camera are brighter than the scene.
     """
 
-    cameras: list[Camera]
+    corrections: np.ndarray
     gains: np.ndarray
+
+    def camera(self, camera: Camera, index: int) -> Camera:
+        """`camera`, which is camera `index` of the capture in any frame or a crop of it, with the true viewmat."""
+        return replace(camera, viewmat=camera.viewmat @ self.corrections[index])
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:

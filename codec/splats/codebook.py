@@ -1,15 +1,14 @@
 """Vector quantization for the formats that index codebooks: values -> a small table and indices into it.
 
-Scalars get Lloyd's algorithm on sorted values, where every step is a search and a prefix sum. SH vectors get a
-palette by repeated median cuts: a nearest-centroid search over 65,536 entries would take minutes for what the eye
-cannot tell apart.
+Scalars: Lloyd's algorithm on sorted values, where each iteration is a binary search and a prefix sum. SH vectors: a
+palette by repeated median cuts; k-means with 65,536 entries would take minutes and not be visibly better.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-STEPS = 8  # of Lloyd's algorithm; more gain less than 1 %
+STEPS = 8  # iterations of Lloyd's algorithm; more reduce the error by less than 1 %
 
 
 def codebook(values: np.ndarray, size: int = 256) -> tuple[list[float], np.ndarray]:
@@ -30,14 +29,15 @@ def codebook(values: np.ndarray, size: int = 256) -> tuple[list[float], np.ndarr
 
 
 def _start(flat: np.ndarray, size: int) -> np.ndarray:
-    """[size] levels as dense as the cube root of the values' density, the best for squared error (Bennett 1948)."""
+    """[size] initial levels; their density is the cube root of that of the values, the optimum for squared error
+    (Bennett 1948)."""
     count, edges = np.histogram(flat, size)
     share = np.concatenate([[0], np.cumsum(np.cbrt(count))])
     return np.interp((np.arange(size) + 0.5) / size, share / share[-1], edges)
 
 
 def palette(vectors: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """[N, D] -> at most `size` entries [P, D] and labels [N]; exact where there are no more distinct vectors."""
+    """[N, D] -> at most `size` entries [P, D] and labels [N]; exact if there are at most `size` distinct vectors."""
     entries, label = np.unique(vectors, axis=0, return_inverse=True)
     if len(entries) <= size:
         return entries, label.ravel()

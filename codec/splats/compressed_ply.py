@@ -2,8 +2,8 @@
 
 Each chunk has its range of positions, log scales and colours; a Gaussian has four words: position and scale in
 11+10+11 bits, the three smallest quaternion components in 10 bits each behind the index of the largest (wxyz),
-colour and opacity in 8 bits. SH coefficients are bytes over -4..4 in an element of their own. The order of
-Gaussians is kept (other writers sort; an index that means the same Gaussian in every frame is worth more here).
+colour and opacity in 8 bits. SH coefficients are bytes over -4..4 in an element of their own. Other writers sort the
+Gaussians; this one keeps their order, so that index i is the same Gaussian in all frames of a sequence.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ RANGES = {
     "scale": [f"{m}_scale_{a}" for m in ("min", "max") for a in "xyz"],
     "color": [f"{m}_{a}" for m in ("min", "max") for a in "rgb"],
 }
-SCALE_LIMIT = 20.0  # log scales beyond it are not finite to the eye, and would cost all others their precision
+SCALE_LIMIT = 20.0  # log scales are clipped to +- this: one outlier would take the precision of its whole chunk
 OPACITY_LIMIT = 1e-6  # distance of decoded opacities from 0 and 1, whose logits are not finite
 
 
@@ -65,7 +65,7 @@ def gaussians_of_compressed(table: dict[str, np.ndarray], path: Path) -> Gaussia
         raise CaptureError(f"{path}: {len(chunks)} chunks for {len(rows)} Gaussians, expected {expected} of {CHUNK}")
     position, rotation, scale, color = (rows[w].astype(np.uint32) for w in WORDS)
     rgba = np.stack([color >> s & 255 for s in (24, 16, 8, 0)], 1) / 255
-    ranged = RANGES["color"][0] in chunks.dtype.names  # files of before 2024 have colours in 0..1
+    ranged = RANGES["color"][0] in chunks.dtype.names  # files written before 2024 have colours in 0..1
     rgb = _unscale(rgba[:, :3], chunks, "color") if ranged else rgba[:, :3]
     small = (np.stack([rotation >> s & 1023 for s in (20, 10, 0)], 1) / 1023 - 0.5) * np.sqrt(2)
     return Gaussians(

@@ -1,6 +1,7 @@
-"""Draco point clouds (.drc) <-> Gaussians: the positions only, for what reads and writes nothing else.
+"""Draco point clouds (.drc) <-> Gaussians: positions only.
 
-Points become light opaque balls as wide as the distance to their neighbours, as splat training starts from.
+A point that is read becomes a light, opaque ball as wide as the mean distance to its nearest neighbours, like the
+initial Gaussians of 3DGS.
 """
 
 from __future__ import annotations
@@ -13,13 +14,18 @@ from ..atomic_write import part_file
 from ..errors import CaptureError, require
 from ..model.gaussians import Gaussians
 
-BITS, LEVEL = 16, 10  # quantization of an axis; effort
-OPACITY, LIGHT = 4.0, 1.0  # logit; coefficient of the colour
+BITS, LEVEL = 16, 10  # quantization of an axis, bits; compression level of Draco, 0 to 10
+OPACITY, LIGHT = 4.0, 1.0  # logit; sh0
 NEIGHBORS = 3
 
 
 def read_drc(path: Path) -> Gaussians:
-    """Raises CaptureError: not a Draco file. UsageError: DracoPy is not installed."""
+    """Reads the points as Gaussians.
+
+    Raises:
+        CaptureError: not a Draco point cloud.
+        UsageError: DracoPy is not installed.
+    """
     draco = require("DracoPy", "reading a .drc")
     try:
         points = np.asarray(draco.decode(path.read_bytes()).points, np.float32).reshape(-1, 3)
@@ -35,7 +41,7 @@ def read_drc(path: Path) -> Gaussians:
 
 
 def write_drc(path: Path, gaussians: Gaussians) -> None:
-    """Positions of `gaussians`, 16 bits an axis, in an order of Draco's; of equal ones it keeps one."""
+    """Writes the positions, 16 bits an axis. Draco changes their order and drops duplicates."""
     draco = require("DracoPy", "writing a .drc")
     data = draco.encode(gaussians.means, quantization_bits=BITS, compression_level=LEVEL, preserve_order=False)
     with part_file(path) as part:
@@ -43,7 +49,7 @@ def write_drc(path: Path, gaussians: Gaussians) -> None:
 
 
 def _spacing(points: np.ndarray) -> np.ndarray:
-    """[N] distance to the nearest neighbours, the mean of three; 0.01 for a single point."""
+    """[N] mean distance to the three nearest neighbours; 0.01 for a single point."""
     from scipy.spatial import cKDTree
 
     k = min(NEIGHBORS, len(points) - 1)

@@ -1,4 +1,4 @@
-"""A splat file of any known format <-> Gaussians; the name's ending and, for .ply, the header decide which."""
+"""A splat file of any known format <-> Gaussians. The ending of the name tells the format, for .ply also the header."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def read_splat(path: str | Path) -> Gaussians:
 
 
 def read_means(path: Path) -> np.ndarray:
-    """[N, 3] f32, the positions of one frame; of a .ply nothing else is read, where there is nothing to complain about.
+    """[N, 3] f32, the positions of one frame; of a valid 3DGS .ply only these are converted.
 
     Raises:
-        As `read_splat`.
+        CaptureError, UsageError: see `read_splat`.
     """
     rows = read_table(path).get("vertex") if path.suffix.lower() == ".ply" else None
     if rows is not None and {"x", "y", "z"} <= set(rows.dtype.names or ()):
@@ -69,7 +69,7 @@ def splat_size(path: Path) -> tuple[int, int]:
         names = elements["sh"][1].names if "sh" in elements else dtype.names if dtype else ()
         return count, sh_count(names or (), path)
     if path.suffix.lower() == ".drc":
-        return len(read_drc(path)), 0  # it does not say before it is decoded
+        return len(read_drc(path)), 0  # its header does not have the count
     meta, _ = read_sog_meta(path)
     return int(meta.get("count", 0)), SH_BANDS.get(meta.get("shN", {}).get("bands", 0), 0)
 

@@ -1,8 +1,8 @@
 """3D Gaussian Splatting .ply <-> Gaussians (the layout of Kerbl et al. 2023 that every splat tool knows).
 
-One element `vertex`; properties are found by name, so order, float width and unknown extra ones do not matter.
-f_rest is channel-major: all coefficients of red, then green, then blue. Values are stored as they are in Gaussians
-(log scales, logit opacities, quaternions wxyz), so that writing and reading back is exact.
+One element `vertex`. Properties are found by name: their order, their float width and unknown ones do not matter.
+f_rest is channel-major: all coefficients of red, then green, then blue. Values are stored as in Gaussians (log scales,
+logit opacities, quaternions wxyz), so that writing and reading back is exact.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def sh_count(names: tuple[str, ...], where: Path) -> int:
     """K, the number of SH coefficients per channel, from the names of the f_rest properties.
 
     Raises:
-        CaptureError: it is no whole SH degree up to 3.
+        CaptureError: no SH degree from 0 to 3 has that many.
     """
     rest = sum(n.startswith("f_rest_") for n in names)
     if rest % 3 or rest // 3 not in SH_COUNTS or any(f"f_rest_{i}" not in names for i in range(rest)):
@@ -55,7 +55,7 @@ def read_ply(path: Path) -> Gaussians:
     """Reads a 3DGS .ply, ascii or binary.
 
     Raises:
-        CaptureError: not a PLY, not of Gaussian splats, truncated, or with values that are not finite.
+        CaptureError: not a PLY, no Gaussian splats, truncated, or a value is not finite.
     """
     return gaussians_of(read_table(path), path)
 
@@ -80,7 +80,7 @@ def gaussians_of(table: dict[str, np.ndarray], path: Path) -> Gaussians:
 def write_ply(path: Path, gaussians: Gaussians) -> None:
     """Writes binary little-endian 3DGS .ply with the properties in the reference implementation's order."""
     g, rest = gaussians, join_rest(gaussians.shN)
-    normals = np.zeros((len(g), 3), np.float32)  # unused, but old loaders insist on them
+    normals = np.zeros((len(g), 3), np.float32)  # unused, but old loaders need the properties
     columns = [g.means, normals, g.sh0, rest, g.logit_opacities[:, None], g.log_scales, g.quats]
     names = [*FIELDS["means"], "nx", "ny", "nz", *FIELDS["sh0"], *(f"f_rest_{i}" for i in range(rest.shape[1]))]
     names += [*FIELDS["logit_opacities"], *FIELDS["log_scales"], *FIELDS["quats"]]

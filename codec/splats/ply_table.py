@@ -1,7 +1,7 @@
-"""The PLY container itself: header and element tables. ply.py and compressed_ply.py give them meaning.
+"""The PLY container: header and element tables. ply.py and compressed_ply.py know what the properties mean.
 
-Plain numpy, so that the player's side can read and write it. Elements with list properties (faces of a mesh) end
-the reading: nothing that a splat needs comes after them.
+Plain numpy, so that the player's side can read and write it. Reading stops at the first element with a list property
+(the faces of a mesh): splats do not need it.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ TYPES = {
     "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
-NAMES = {"u1": "uchar", "u4": "uint", "f4": "float"}  # what we write
+NAMES = {"u1": "uchar", "u4": "uint", "f4": "float"}  # the types that are written
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 HEADER_MAX = 1 << 20  # bytes; a file whose header does not end by then is not a PLY
 
 
 def read_header(path: Path) -> tuple[str, dict[str, tuple[int, np.dtype]], int]:
-    """Reads the header alone.
+    """Reads the header.
 
     Returns:
-        The byte order ("" for ascii, "<", ">"), element name -> (count, row dtype) in file order, where data starts.
+        The byte order ("" for ascii, "<", ">"), element name -> (count, row dtype) in file order, and the offset of the
+        data in bytes.
 
     Raises:
         CaptureError: the file is missing or not a PLY.

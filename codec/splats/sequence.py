@@ -1,8 +1,8 @@
 """A folder of splats -> GaussianSequence with lazy frames; sequence_writer.py is its mirror.
 
-With a sequence.json (ours) groups, lifetimes and nodes are as written. Without one the folder is somebody else's:
-it is a tracked sequence only where that is verified, a matched one where Gaussians can be matched from frame to
-frame, and otherwise every frame is a group of its own. Frames are read when asked for; a few stay in memory.
+A folder with sequence.json has its groups, lifetimes and nodes in it. A folder without it comes from another tool:
+either index i is verified to be the same Gaussian from frame to frame (tracked), or the Gaussians are matched, or each
+frame is a group of its own. Frames are read when they are asked for; a few stay in memory.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ..model.gaussians import GOP, Gaussians
 from .files import EXPECTED, is_splat, read_means, read_splat, splat_size
 from .tracking import relate
 
-FPS = 30.0  # of folders that do not say
+FPS = 30.0  # of folders without sequence.json
 KEEP = 4  # frames in memory
 
 
@@ -35,8 +35,8 @@ class SplatSequence(GaussianSequence):
     """A sequence read from files.
 
     Attributes:
-        mode: "stored" (sequence.json says which index is what), "tracked" (verified), "matched" (frames were reordered)
-            or "independent" (groups of one frame).
+        mode: "stored" (groups of sequence.json), "tracked" (index i is verified to be the same Gaussian), "matched"
+            (Gaussians of some frames were reordered) or "independent" (groups of one frame).
         names: file name of each frame.
     """
 
@@ -45,10 +45,14 @@ class SplatSequence(GaussianSequence):
 
 
 class Frames(Sequence):
-    """Lazy frames of a folder: reads, reorders and keeps the last few; thread-safe."""
+    """Lazy frames of a folder: reads and reorders a frame when asked for, keeps the last few; thread-safe."""
 
     def __init__(self, paths: list[Path], orders: dict[int, np.ndarray], hidden: dict[int, tuple] | None = None):
-        """`orders`: frame -> [N] order; `hidden`: frame -> ([N] bool, logit opacities of those that are not shown)."""
+        """
+        Args:
+            orders: frame -> [N] int, index in the file of each Gaussian.
+            hidden: frame -> ([N] bool, Gaussians outside their lifetime; their logit opacities [H]).
+        """
         self._paths, self._orders, self._hidden = paths, orders, hidden or {}
         self._kept: OrderedDict[int, Gaussians] = OrderedDict()
         self._lock = threading.Lock()
@@ -86,7 +90,7 @@ class Frames(Sequence):
 
 
 class FrameRange(Sequence):
-    """Some of the frames of a `Frames`, as lazy as it."""
+    """A range of the frames of a `Frames`, as lazy as it."""
 
     def __init__(self, frames: Frames, index: range):
         self._frames, self._index = frames, index
@@ -109,7 +113,7 @@ def splat_paths(path: Path) -> list[Path]:
 
 
 def detect_input(path: str | Path) -> str:
-    """What encode has been given.
+    """What kind of input `path` is.
 
     Returns:
         "capture" or "splats".
@@ -139,7 +143,7 @@ def open_sequence(
 
     Args:
         gop: frames of a group at most, where there is no sequence.json.
-        fps: frames a second; by default as sequence.json says, or 30.
+        fps: frames a second; None: that of sequence.json, or 30.
         progress: called with (pairs of frames checked, pairs) while tracking is verified.
 
     Raises:

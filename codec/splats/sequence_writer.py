@@ -1,9 +1,9 @@
 """GaussianSequence -> a folder with one .ply per frame and sequence.json; the mirror of sequence.py.
 
-Other tools see plain 3DGS files; a Gaussian outside its lifetime is there with an opacity that shows nothing, so
-that every frame of a group has the same indices, and its true opacity lies beside the nodes in an .npz. Groups can
-be added one by one: sequence.json is replaced after each, so that what is finished can be used and a stopped run
-can go on.
+Other tools see plain 3DGS files. All frames of a group have the same indices: a Gaussian outside its lifetime is
+written with an opacity that shows nothing, and its true opacity is in the .npz of the group, beside the nodes. Groups
+are added one by one. sequence.json is replaced after each group: finished groups can be used, and a stopped run can
+resume.
 """
 
 from __future__ import annotations
@@ -29,17 +29,20 @@ class SequenceWriter:
     """Adds groups to a folder.
 
     Attributes:
-        groups: descriptions of the groups that are complete, as in sequence.json; more than none after a resume.
+        groups: the complete groups, as in sequence.json; after a resume, also those of the earlier run.
         frame_count: frames of those groups.
     """
 
     def __init__(self, folder: str | Path, fps: float, cameras: Sequence[Camera] = (), *, resume: bool = False):
-        """Starts afresh, or with `resume` goes on after the groups that sequence.json lists."""
+        """
+        Args:
+            resume: continue after the groups of an existing sequence.json; otherwise it is removed.
+        """
         self._folder = Path(folder)
         self._folder.mkdir(parents=True, exist_ok=True)
         listed = self._folder / NAME
         if not resume:
-            listed.unlink(missing_ok=True)  # the folder is no longer what it says
+            listed.unlink(missing_ok=True)  # its frames will be overwritten
         self.groups = json.loads(listed.read_text())["groups"] if listed.is_file() else []
         self._head = {"fps": fps, "cameras": [_camera(c) for c in cameras]}
 

@@ -1,14 +1,14 @@
 """Unit quaternions <-> their three smallest components and the index of the largest.
 
-The largest follows from the unit length. Shared by the formats that quantize rotations this way (compressed.ply,
-SOG); component order is wxyz in both.
+The largest component follows from the unit length. compressed.ply and SOG quantize rotations this way; component order
+is wxyz in both.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the components that stay, by the largest
+OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # row: index of the largest component; the other three
 
 
 def split_smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,10 +1,16 @@
 """SOG version 2 (PlayCanvas) <-> Gaussians: attribute maps as lossless WebP with codebooks in meta.json.
 
-A .sog is a zip of meta.json and the maps; unpacked it is a folder. Positions are 16 bit (two maps) of sign(x) ln(1
-+ |x|), rotations the three smallest components with the index of the largest in alpha (252 + index), scales and
-colours 8-bit indices into codebooks, SH an index into a palette. Data in alpha is why maps go through OpenCV, which
-never touches colour for it; its lossless WebP does forget the colour under alpha 0, so opacity is written as 1 to
-255.
+A .sog is a zip of meta.json and the maps; unpacked it is a folder.
+
+| attribute | in the maps |
+|---|---|
+| positions | sign(x) ln(1 + abs(x)) in 16 bits, low and high bytes in two maps |
+| rotations | the three smallest components in 8 bits, 252 + index of the largest in alpha |
+| scales, colours | 8-bit indices into codebooks; opacity in the alpha of the colours |
+| SH | an index into a palette, whose entries are indices into a codebook |
+
+OpenCV reads and writes the maps, since it does not premultiply by alpha. Its lossless WebP drops colour under alpha 0,
+so opacity is written as 1 to 255.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
-"""Two frames of splats -> is index i the same Gaussian in both, or which index of the second is it, or neither?
+"""Two frames of splats -> the same Gaussian at index i (identity), a matching of the indices, or neither.
 
-Positions alone decide. The displacement of a tracked Gaussian is far below the distance of random pairs; but so is
-that of frames that were each sorted along a space-filling curve (SOG), where a third of the indices may be swapped
-locally. What tells them apart is that the displacements of spatial neighbours are alike on a body that moves, and
-are not where indices are swapped. So identity and nearest-neighbour matching are compared by how rough their
-displacement fields are.
+Only positions are compared. Under identity, displacements must be far below the distances of random pairs. This also
+holds for frames that were each sorted along a space-filling curve (SOG), where a third of the indices may be swapped
+locally. But on a moving body spatial neighbours have similar displacements, and swapped indices do not. So identity
+and nearest-neighbour matching are compared by the roughness of their displacement fields.
 """
 
 from __future__ import annotations
@@ -14,12 +13,12 @@ import numpy as np
 from ..errors import require
 
 FAR_BELOW = 0.1  # median displacement of tracked Gaussians over that of random pairs, at most
-ROUGH = 1.5  # roughness from which a displacement field is no motion any more
-SMOOTH = 0.1  # roughness below which nothing else needs to be tried
-BETTER = 0.5  # a matching replaces identity if its field is at most this much as rough
-MUTUAL = 0.9  # share of Gaussians that must be each other's nearest for a matching
-SAMPLES = 4000
-LEFT_MAX = 3000  # Gaussians that may be left to the (cubic) assignment
+ROUGH = 1.5  # displacement fields at least this rough are no motion
+SMOOTH = 0.1  # identity is taken without trying a matching up to this roughness
+BETTER = 0.5  # a matching replaces identity if its roughness is below this share of identity's
+MUTUAL = 0.9  # least share of mutual nearest neighbours in a matching
+SAMPLES = 4000  # Gaussians that roughness is measured on
+LEFT_MAX = 3000  # Gaussians at most that are matched by assignment, whose time is cubic
 
 
 def relate(a: np.ndarray, b: np.ndarray) -> np.ndarray | bool:
@@ -29,16 +28,17 @@ def relate(a: np.ndarray, b: np.ndarray) -> np.ndarray | bool:
         a, b: [N, 3] positions of the two frames.
 
     Returns:
-        True if index i is the same in both, an order ([N] int, b[order[i]] is a[i] moved) if they had to be matched, or
-        False if neither holds.
+        True: index i is the same Gaussian in both. An order [N] int: b[order[i]] is a[i] moved. False: neither.
     """
     tree = require("scipy.spatial", "checking whether splats are tracked").cKDTree
     if len(a) < 8:
         return bool(np.array_equal(a, b))
     rng = np.random.default_rng(0)
     pick = rng.permutation(len(a))[:SAMPLES]
-    near = tree(a, balanced_tree=False, compact_nodes=False).query(a[pick], k=2)  # for few queries, half of the time
-    other = np.where(near[1][:, 0] == pick, near[1][:, 1], near[1][:, 0])  # of two at one place either may come first
+    near = tree(a, balanced_tree=False, compact_nodes=False).query(a[pick], k=2)  # twice as fast for few queries
+    other = np.where(
+        near[1][:, 0] == pick, near[1][:, 1], near[1][:, 0]
+    )  # two Gaussians in one place may come in either order
     spacing = np.median(near[0][:, 1]) + 1e-9 * np.ptp(a, axis=0).max() + 1e-30
 
     def roughness(moved: np.ndarray) -> float:
@@ -57,7 +57,8 @@ def relate(a: np.ndarray, b: np.ndarray) -> np.ndarray | bool:
 
 
 def match(a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
-    """A one-to-one matching of two sets of N positions, nearest first; None if too few are each other's nearest."""
+    """[N] int, a one-to-one matching of two sets of N positions: mutual nearest neighbours, then the least sum of
+    squared distances for the rest. None: too few mutual nearest neighbours."""
     tree = require("scipy.spatial", "matching splats").cKDTree
     forward, backward = tree(b).query(a)[1], tree(a).query(b)[1]
     mutual = backward[forward] == np.arange(len(a))

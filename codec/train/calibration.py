@@ -100,12 +100,16 @@ class Extrinsics(_Learned):
         """`camera` (the view of the capture's camera `index`, or a crop of it) where it really stands."""
         if not self.values[index].any():
             return camera
+        return replace(camera, viewmat=camera.viewmat @ self.correction(index))
+
+    def correction(self, index: int) -> np.ndarray:
+        """[4, 4] f64, the motion that camera `index` sees."""
         from scipy.spatial.transform import Rotation
 
         R, t = Rotation.from_rotvec(self.values[index, :3]).as_matrix(), self.radius * self.values[index, 3:]
         moved = np.eye(4)
         moved[:3, :3], moved[:3, 3] = R, self.middle + t - R @ self.middle
-        return replace(camera, viewmat=camera.viewmat @ moved)
+        return moved
 
     def learn(self, camera: int, params: dict, grads: dict, fade: float) -> None:
         """As of `_Learned`, from the loss's gradients by the Gaussians: to first order the motion moves them all."""

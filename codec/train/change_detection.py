@@ -74,18 +74,18 @@ class Changes:
             if alpha is None:
                 return np.zeros(len(means), bool)
             masks.append(_grown(cv2.resize(alpha, fitted.shape[1::-1], interpolation=cv2.INTER_AREA) > 0))
-        return ~self.behind(masks, means, [np.ones(len(means), bool)] * len(masks))
+        return ~self.behind(masks, frame, means, [np.ones(len(means), bool)] * len(masks))
 
-    def behind(self, masks: list[np.ndarray], means: np.ndarray, visible: list[np.ndarray]) -> np.ndarray:
+    def behind(self, masks: list[np.ndarray], frame: int, means: np.ndarray, visible: list[np.ndarray]) -> np.ndarray:
         """[N] bool: Gaussians at `means` ([N, 3]) that enough of the cameras that see them have in changed pixels.
 
         Args:
-            masks: of `advance`; visible: [N] bool of each training camera.
+            masks: of `advance` to `frame`; visible: [N] bool of each training camera.
         """
         seen, hit = np.zeros(len(means), np.int32), np.zeros(len(means), np.int32)
         for camera, mask, clear in zip(self.views.train_cameras, masks, visible, strict=True):
             height, width = mask.shape
-            p, depth = project(self.views.camera(camera).resized(width, height), means)
+            p, depth = project(self.views.camera(camera, frame).resized(width, height), means)
             x, y = np.floor(p).astype(np.int64).T
             on = np.flatnonzero(clear & (depth > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height))
             seen[on] += 1

@@ -87,7 +87,7 @@ def wrong_pixels(model: Model, masks: list[np.ndarray], frame: int, views) -> li
     blob = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (BLOB, BLOB))
     for camera, mask in zip(views.train_cameras, masks, strict=True):
         truth = blend(views.view(camera, frame), GREY)
-        shown = render_image(views.exposure.seen(g, camera), views.camera(camera), GREY)
+        shown = render_image(views.exposure.seen(g, camera), views.camera(camera, frame), GREY)
         error = np.abs(shown - truth).max(2)
         small = cv2.resize(error, mask.shape[::-1], interpolation=cv2.INTER_AREA)
         wrong = (mask & (small > WRONG)).astype(np.uint8)
@@ -98,7 +98,7 @@ def wrong_pixels(model: Model, masks: list[np.ndarray], frame: int, views) -> li
 def sweep_wrong(wrong: list[np.ndarray], frame: int, views, most: int, seed: int = 0):
     """At most `most` points on surfaces in the pixels that are wrong, and their colours, as of `sweep`."""
     taken = [views.view(i, frame) for i in views.train_cameras]
-    pictures = [(views.camera(i), v.rgb, v.alpha) for i, v in zip(views.train_cameras, taken, strict=True)]
+    pictures = [(views.camera(i, frame), v.rgb, v.alpha) for i, v in zip(views.train_cameras, taken, strict=True)]
     return sweep(pictures, most, seed, wrong)
 
 

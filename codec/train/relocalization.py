@@ -29,8 +29,8 @@ def whereabouts(model: Model, some: torch.Tensor, frame: int, views, changes, ma
     """
     hidden = torch.where(some, HIDDEN, model.params["logit_opacities"])
     others = Model({**model.params, "logit_opacities": hidden})
-    least, found = error(others, changes), None
-    if error(model, changes) < LOST * least:
+    least, found = error(others, frame, changes), None
+    if error(model, frame, changes) < LOST * least:
         return torch.zeros(3)
     wrong = wrong_pixels(others, masks, frame, views)
     points, _ = sweep_wrong(wrong, frame, views, POINTS)
@@ -40,16 +40,16 @@ def whereabouts(model: Model, some: torch.Tensor, frame: int, views, changes, ma
     for place in _places(points, radius):
         shift = torch.from_numpy(place).float() - centre
         moved = Model({**model.params, "means": means + torch.where(some[:, None], shift, 0.0)})
-        if (e := error(moved, changes)) < least:
+        if (e := error(moved, frame, changes)) < least:
             least, found = e, shift
     return found
 
 
-def error(model: Model, changes) -> float:
-    """Mean absolute difference to the small pictures of `changes`, over all training cameras."""
+def error(model: Model, frame: int, changes) -> float:
+    """Mean absolute difference to the small pictures of `changes`, fitted to `frame`, over all training cameras."""
     g, views, differences = model.gaussians(), changes.views, []
     for i, picture in zip(views.train_cameras, changes.fitted, strict=True):
-        camera = views.camera(i).resized(*picture.shape[1::-1])
+        camera = views.camera(i, frame).resized(*picture.shape[1::-1])
         shown = render_image(views.exposure.seen(g, i), camera, GREY)
         differences.append(np.abs(shown.astype(np.float32) - picture).mean())
     return float(np.mean(differences))

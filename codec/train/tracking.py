@@ -88,7 +88,7 @@ class Tracker:
         means = key.params["means"]
         moving = np.ones(len(key), bool)
         if len(frames) > 1:
-            seen = changes.behind(changes.copy().advance(frames[1]), means.numpy(), visible)
+            seen = changes.behind(changes.copy().advance(frames[1]), frames[1], means.numpy(), visible)
             moving = seen if seen.any() else moving
         radius = subject_radius(means[moving].numpy())
         sizes = torch.ones(len(key))
@@ -237,7 +237,7 @@ class Tracker:
             return np.zeros(len(model), bool)
         looks = look(model.params, self.views, frame, self.settings, self.workspace, SMALL)
         visible = [result.max_weight > VISIBLE for result in looks]
-        return self.changes.behind(masks, model.params["means"].numpy(), visible)
+        return self.changes.behind(masks, frame, model.params["means"].numpy(), visible)
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays, for a checkpoint."""

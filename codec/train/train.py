@@ -62,7 +62,7 @@ def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
     views = []
     for i in cameras:
         v = capture.view(i, frame)
-        views.append((capture.cameras[i], v.rgb, v.alpha))
+        views.append((capture.camera(i, frame), v.rgb, v.alpha))
     known = [c for c, _, _ in views]
     if all(alpha is not None for _, _, alpha in views):
         points, colors = carve(known, views, settings.initial_points)
@@ -290,7 +290,7 @@ class _Run:
         quality = self.settings.quality
         if subject.steps is None:
             middle, cameras = track.models[len(frames) // 2].gaussians(), self.views.train_cameras
-            taken = [self.capture.cameras[i] for i in cameras]
+            taken = [self.capture.camera(i, frames[len(frames) // 2]) for i in cameras]
             subject.steps = measured_steps(middle, quality, steps_for(quality, subject.radius), taken)
         graph, steps = subject.tracker.graph, subject.steps
         model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved())

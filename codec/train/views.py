@@ -65,14 +65,15 @@ class Views:
         there = self.extrinsics.camera(camera, held.camera)
         return replace(held, camera=there, gain=self.exposure.gain(camera))
 
-    def camera(self, index: int) -> Camera:
-        """Camera `index` of the capture where it really stands."""
-        return self.extrinsics.camera(index, self.capture.cameras[index])
+    def camera(self, index: int, frame: int) -> Camera:
+        """Camera `index` of the capture at `frame`, where it really stands."""
+        return self.extrinsics.camera(index, self.capture.camera(index, frame))
 
     def calibration(self) -> Calibration:
-        """Where the cameras stand and how bright they are, as far as that is known by now."""
+        """What is known by now about the poses and the brightness of the cameras."""
         every = range(len(self.capture.cameras))
-        return Calibration([self.camera(i) for i in every], np.stack([self.exposure.gain(i) for i in every]))
+        corrections = np.stack([self.extrinsics.correction(i) for i in every])
+        return Calibration(corrections, np.stack([self.exposure.gain(i) for i in every]))
 
     def _hold(self, key: tuple, load: Callable[[], View | Target]):
         """What `load` gives, which is kept as long as there is room."""
@@ -105,7 +106,7 @@ class Views:
         return t.rgb.nbytes + (0 if t.alpha is None else t.alpha.nbytes)
 
     def _cropped(self, camera: int, frame: int) -> Target:
-        view, there = cropped(self.view(camera, frame), self.capture.cameras[camera])
+        view, there = cropped(self.view(camera, frame), self.capture.camera(camera, frame))
         return Target(there, view.rgb, view.alpha, camera)
 
 
