@@ -96,7 +96,7 @@ def _turn(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
 
 
 def animated(rows: np.ndarray, frames: int, motion: Motion) -> Iterator[np.ndarray]:
-    """Yields the rows of each frame, given those of the static splat (structured, a field for each property)."""
+    """Yields the rows of each frame; `rows` is the static splat, a structured array with a field per property."""
     rest = Attributes(**{f.name: _columns(rows, FIELDS[f.name]) for f in fields(Attributes)})
     rest = replace(rest, quats=_unit(rest.quats))
     body, rng = Body(rest, motion.up), np.random.default_rng(motion.seed)

@@ -10,17 +10,17 @@ from gscodec.errors import UsageError
 
 
 def data_folder() -> Path:
-    """The data folder of a script, which ends with a sentence if GSCODEC_DATA is not set."""
+    """The data folder; a script ends with a sentence if GSCODEC_DATA is not set."""
     if not os.environ.get("GSCODEC_DATA"):
         sys.exit("error: GSCODEC_DATA is not set, expected the folder with the captures and splats")
     return Path(os.environ["GSCODEC_DATA"])
 
 
 def existing(path: Path) -> Path:
-    """`path`, which is in the data folder.
+    """Returns a path of the data folder.
 
     Raises:
-        UsageError: it is not.
+        UsageError: it does not exist.
     """
     if not path.exists():
         raise UsageError(f"{path} is not there; the data folder (GSCODEC_DATA) must have it")

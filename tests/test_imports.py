@@ -100,6 +100,13 @@ def test_every_part_has_a_rule():
     assert {part_of(m) for m in modules()} - {""} <= set(ALLOWED) | ANYTHING
 
 
+def test_every_package_is_in_the_wheel():
+    listed = (ROOT / "pyproject.toml").read_text()
+    for module, path in modules().items():
+        if module and path.name == "__init__.py":
+            assert f'"gscodec.{module}"' in listed, f"pyproject.toml does not list gscodec.{module}"
+
+
 def test_nothing_imports_the_command_line():
     for module in modules():
         if part_of(module) not in ANYTHING:
