@@ -3,29 +3,21 @@
 lumberjack is the bundled capture, a subject with masks; stage (of the data folder, at half its size) a full room while
 a ball drops into it. One entry of bench/results/ablation.json per capture and variant, all from the same seed and
 preset. `psnr` is of the model before coding, `psnr_coded` decoded from the stream, both on the test cameras, of the
-subject where there are masks. What has no setting of its own is taken out of the module that has it, by name, so that
-a variant whose tool is gone fails.
+subject where there are masks. A variant is a change of the training settings.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from unittest.mock import patch
-
-import numpy as np
 
 from bench import train
 from bench.machine import ROOT, update_entries
 from gscodec.capture import Capture
 from gscodec.errors import UsageError
-from gscodec.train import change_detection as changes
-from gscodec.train import finetune
-from gscodec.train import tracking as motion
-from gscodec.train import train as recipe
+from gscodec.train.settings import TrackingSettings, TrainSettings
 
 WHOLE = "whole recipe"
 LUMBERJACK, STAGE = "lumberjack", "stage"
@@ -34,40 +26,47 @@ FRAMES = {LUMBERJACK: (0, 10), STAGE: (7, 15)}  # the ball comes at 10
 
 @dataclass(frozen=True)
 class Variant:
-    """Changes to the settings, (object, name, value) of what has none, and the captures that use the tool."""
+    """A change of the settings, and the captures that use what it takes away."""
 
-    settings: dict = field(default_factory=dict)
-    patches: tuple[tuple[object, str, object], ...] = ()
+    change: Callable[[TrainSettings], TrainSettings]
     captures: tuple[str, ...] = (LUMBERJACK, STAGE)
 
 
-def without(rates: dict[str, float], *names: str) -> dict[str, float]:
-    """Learning rates of what is still learned."""
-    return {n: r for n, r in rates.items() if n not in names}
+def top(**values) -> Callable[[TrainSettings], TrainSettings]:
+    """Other values of the settings of the whole run."""
+    return lambda settings: replace(settings, **values)
 
 
-NO_POINTS = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
+def stage(name: str, **values) -> Callable[[TrainSettings], TrainSettings]:
+    """Other values of the settings of stage `name`."""
+    return lambda settings: replace(settings, **{name: replace(getattr(settings, name), **values)})
+
+
+TRACKING = TrackingSettings()
 VARIANTS = {
-    WHOLE: Variant(),
-    "no D-SSIM": Variant({"ssim_lambda": 0.0}),
-    "no mask term": Variant({"mask_lambda": 0.0}, captures=(LUMBERJACK,)),
-    "no rigidity": Variant({"rigidity": 0.0}),
-    "no rate term": Variant({"rate_lambda": 0.0}),
-    "no fine-tuning": Variant({"finetune_steps": 0}),
-    "no cuts": Variant({"cut_ratio": math.inf}),
-    "cut ratio 1.5": Variant({"cut_ratio": 1.5}),
-    "cut ratio 3": Variant({"cut_ratio": 3.0}),
-    "colours held in tracking": Variant(patches=((motion, "RATES", without(motion.RATES, "sh0", "shN")),)),
-    "full-size pictures only": Variant(patches=((motion, "SMALL", 1.0),)),
-    "nothing held still": Variant(patches=((changes, "THRESHOLD", -1.0),)),
-    "no noise on canonical values": Variant(
-        patches=((finetune.GroupModel, "_relaxed", lambda group, generator: group.key.params),)
-    ),
-    "no births": Variant(patches=((motion.Tracker, "bear", lambda *_: None),), captures=(STAGE,)),
-    "no plane sweep": Variant(patches=((recipe, "sweep", lambda *_: NO_POINTS),), captures=(STAGE,)),
-    "no shell of far points": Variant(patches=((recipe, "shell", lambda *_: NO_POINTS),), captures=(STAGE,)),
+    WHOLE: Variant(top()),
+    "no D-SSIM": Variant(top(ssim_lambda=0.0)),
+    "no mask term": Variant(top(mask_lambda=0.0), (LUMBERJACK,)),
+    "no rigidity": Variant(top(rigidity=0.0)),
+    "no rate term": Variant(top(rate_lambda=0.0)),
+    "no fine-tuning": Variant(top(finetune_steps=0)),
+    "no cuts": Variant(top(cut_ratio=math.inf)),
+    "cut ratio 1.5": Variant(top(cut_ratio=1.5)),
+    "cut ratio 3": Variant(top(cut_ratio=3.0)),
+    "colours held in tracking": Variant(stage("tracking", rates=replace(TRACKING.rates, sh0=0.0, shN=0.0))),
+    "full-size pictures only": Variant(stage("tracking", small_scale=1.0)),
+    "nothing held still": Variant(stage("change_detection", threshold=-1.0)),
+    "no noise on canonical values": Variant(stage("finetune", canonical_noise=False)),
+    "no births": Variant(stage("densification", max_share=0.0), (STAGE,)),
+    "no plane sweep": Variant(stage("initialization", use_plane_sweep=False), (STAGE,)),
+    "no shell of far points": Variant(stage("plane_sweep", shell_points=0), (STAGE,)),
     "no node graph": Variant(  # every Gaussian for itself, at the rate of a node
-        patches=((motion, "MOVE_RATE", 0.0), (motion, "TURN_RATE", 0.0), (motion, "MEANS_RATE", motion.MOVE_RATE))
+        stage(
+            "tracking",
+            node_rotation_rate=0.0,
+            node_translation_rate=0.0,
+            rates=replace(TRACKING.rates, means=TRACKING.node_translation_rate),
+        )
     ),
 }
 
@@ -100,11 +99,8 @@ def _entry(capture: Capture, name: str, preset: str, quality: float) -> dict:
     from gscodec.train.settings import train_settings
 
     variant = VARIANTS[name]
-    settings = train_settings(preset, quality=quality, **variant.settings)
-    with ExitStack() as stack:
-        for where, attribute, value in variant.patches:
-            stack.enter_context(patch.object(where, attribute, value))
-        groups, seconds = train.sequence(capture, settings)
+    settings = variant.change(train_settings(preset, quality=quality))
+    groups, seconds = train.sequence(capture, settings)
     models = train.shown(groups)
     size, decoded, _ = train.coded(capture, groups, settings)
     model, stream = (train.evaluate(capture, frames) for frames in (models, decoded))

@@ -23,8 +23,8 @@ from gscodec.model.gaussians import Gaussians
 from gscodec.render.image import render_image, render_rgba
 from gscodec.render.step import render_loss
 from gscodec.render.workspace import PARAMETERS, Workspace, simd_levels
-from gscodec.train.keyframe import RATES
-from gscodec.train.model import from_gaussians
+from gscodec.train.model import NAMES, from_gaussians
+from gscodec.train.settings import AdamSettings
 
 RATE = 1e-6  # of Adam: the scene must not change while it is measured
 BUDGET_S = 2.0  # an entry takes fewer repeats than asked for, at least 5, beyond that
@@ -74,7 +74,7 @@ def measure(scene: str, gaussians: Gaussians, cam: Camera, simd: str, threads: i
     noise = np.random.default_rng(0).integers(-9, 9, (cam.height, cam.width, 3)) * covered[..., None]
     rgb = np.clip(render_image(gaussians, cam) + noise, 0, 255).astype(np.uint8)
     mask = covered.astype(np.uint8) * 255
-    rates = {name: RATE for name in ("means", *RATES)}
+    rates = dict.fromkeys(NAMES, RATE)
     parts, steps = [], []
     for adam in (False, True):  # the passes alone, as the peers' were measured, then whole steps
         begin, count = time.perf_counter(), 0
@@ -82,7 +82,7 @@ def measure(scene: str, gaussians: Gaussians, cam: Camera, simd: str, threads: i
             start, count = time.perf_counter(), count + 1
             result = render_loss(model.params, cam, rgb, mask, (0.5, 0.5, 0.5), 0.2, 0.1, workspace)
             if adam:
-                model.adam(result.grads, rates)
+                model.adam(result.grads, rates, AdamSettings())
                 steps.append(1e3 * (time.perf_counter() - start))
             else:
                 t = workspace.timings

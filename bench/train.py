@@ -188,7 +188,7 @@ def every_frame_alone(capture: Capture, frames: range, settings) -> tuple[list[G
     for frame in frames:
         model = initial_model(capture, frame, settings)
         radius = subject_radius(model.params["means"].numpy())
-        train_keyframe(model, Views(capture, 0), frame, settings, steps=settings.keyframe_steps, radius=radius)
+        train_keyframe(model, Views(capture, settings), frame, settings, steps=settings.keyframe_steps, radius=radius)
         models.append(model.gaussians())
     return models, time.perf_counter() - start
 

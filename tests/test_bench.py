@@ -79,11 +79,13 @@ def test_ablation_shows_what_each_tool_is_worth(tmp_path):
     assert [p.name for p in draw_charts(tmp_path, tmp_path / "charts")] == ["ablation.svg", "ablation.png"]
 
 
-def test_ablation_takes_out_what_is_there():
+def test_every_ablation_changes_the_settings():
     pytest.importorskip("torch")
-    from bench.ablation import VARIANTS
+    from bench.ablation import VARIANTS, WHOLE
+    from gscodec.train.settings import TrainSettings
 
-    assert [n for n, v in VARIANTS.items() for where, name, _ in v.patches if not hasattr(where, name)] == []
+    whole = TrainSettings()
+    assert [name for name, v in VARIANTS.items() if v.change(whole) == whole] == [WHOLE]
 
 
 def test_cameras_are_taken_out_of_training(tmp_path):

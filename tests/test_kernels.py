@@ -6,7 +6,8 @@ torch = pytest.importorskip("torch")
 
 from bench.baselines.hashgrid import HashGrid  # noqa: E402
 from gscodec.errors import UsageError  # noqa: E402
-from gscodec.train.model import BETAS, EPS, Model  # noqa: E402
+from gscodec.train.model import Model  # noqa: E402
+from gscodec.train.settings import AdamSettings  # noqa: E402
 from gscodec.train.ssim import image_loss, image_loss_reference  # noqa: E402
 
 
@@ -75,13 +76,15 @@ def test_adam_is_that_of_torch():
     model = Model({n: torch.randn(s, generator=g) for n, s in shapes.items()})
     want = {n: p.clone().requires_grad_() for n, p in model.params.items() if p.numel()}
     rates = {n: 0.01 * (i + 1) for i, n in enumerate(model.params)}
-    optimizer = torch.optim.Adam([{"params": [p], "lr": rates[n]} for n, p in want.items()], betas=BETAS, eps=EPS)
+    a = AdamSettings()
+    groups = [{"params": [p], "lr": rates[n]} for n, p in want.items()]
+    optimizer = torch.optim.Adam(groups, betas=(a.beta1, a.beta2), eps=a.eps)
     for step in range(5):
         grads = {n: torch.randn(p.shape, generator=g) * 10.0 ** -(3 * step) for n, p in model.params.items()}
         for n, p in want.items():
             p.grad = grads[n].clone()
         optimizer.step()
-        model.adam(grads, rates)
+        model.adam(grads, rates, a)
     for n, p in want.items():
         torch.testing.assert_close(model.params[n], p.detach(), rtol=1e-5, atol=1e-6)
 

@@ -21,7 +21,7 @@ from bench.baselines.hashgrid import HashGrid
 from gscodec.bitstream.quantization import subject_radius
 from gscodec.render.workspace import Workspace
 from gscodec.train.deformation_graph import quat_multiply, rotvec_to_quat
-from gscodec.train.keyframe import RATES, train_keyframe
+from gscodec.train.keyframe import train_keyframe
 from gscodec.train.model import Model
 from gscodec.train.settings import TrainSettings
 from gscodec.train.train import initial_model
@@ -55,7 +55,7 @@ class MotionField(torch.nn.Module):
 def train_v3(capture, frames: range, settings: TrainSettings) -> list:
     """Gaussians of each frame: a keyframe for the first, then one frame from the other."""
     settings = replace(settings, sh_degree=0)  # its packing has no more
-    views = Views(capture, settings.seed)
+    views = Views(capture, settings)
     model = initial_model(capture, frames[0], settings)
     radius = subject_radius(model.params["means"].numpy())
     train_keyframe(model, views, frames[0], settings, steps=settings.keyframe_steps, radius=radius)
@@ -98,4 +98,5 @@ def _fine(model: Model, views: Views, frame: int, settings: TrainSettings, radiu
     for step in range(STEPS[1]):
         fade = 0.1 ** (step / STEPS[1])
         grads = compare(model.params, views.draw(frame), settings, rng, workspace).grads
-        model.adam(grads, {"means": MEANS_RATE * radius * fade, **{n: FINE_SHARE * r * fade for n, r in RATES.items()}})
+        rates = settings.keyframe.rates.scaled(radius, FINE_SHARE * fade)
+        model.adam(grads, {**rates, "means": MEANS_RATE * radius * fade}, settings.adam)

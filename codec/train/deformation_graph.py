@@ -16,16 +16,7 @@ import torch
 
 from .. import _native
 from ..farthest_point_sampling import farthest_points
-
-NODES = 256  # 1000 track as well
-STILL_SHARE = 0.25  # of the nodes, for what does not move yet, if that is as large a share of the Gaussians
-BLENDED = 4  # nodes that carry one Gaussian
-EDGES = 8  # neighbours of a node in the rigidity term
-HELD = 0.1  # weight from which a node has a hold on a Gaussian
-GRID = 1e-3  # of the radius: the lattice on which neighbours and weights are computed
-NEWCOMERS = 16  # nodes of what comes in at once
-ROOM = 2.0  # extents of the keyframe that the stream's lattice has along each axis
-PLACES = 16  # at most, that are tried for newcomers to rest
+from .settings import DeformationGraphSettings
 
 
 def quat_multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
@@ -125,8 +116,16 @@ class NodeGraph:
     """
 
     def __init__(
-        self, means: torch.Tensor, low: torch.Tensor, step: float, chosen: np.ndarray, family: np.ndarray, extent
+        self,
+        means: torch.Tensor,
+        low: torch.Tensor,
+        step: float,
+        chosen: np.ndarray,
+        family: np.ndarray,
+        extent: torch.Tensor,
+        settings: DeformationGraphSettings,
     ):
+        self.settings = settings
         self.low, self.step, self.extent = low, step, extent
         self.chosen, self.family = chosen, family
         self._connect()
@@ -138,32 +137,38 @@ class NodeGraph:
         from scipy.spatial import cKDTree
 
         self.nodes = self.low + self.step * torch.from_numpy(self.chosen.astype(np.float32))
-        m, k = len(self.chosen), min(EDGES, len(self.chosen) - 1)
+        m, k = len(self.chosen), min(self.settings.edges, len(self.chosen) - 1)
         near = cKDTree(self.nodes.numpy()).query(self.nodes.numpy(), k + 1)[1].reshape(m, -1)[:, 1:]
         self._edges = torch.from_numpy(near.astype(np.int64))
         length = (self.nodes[self._edges] - self.nodes[:, None]).norm(dim=2, keepdim=True)
         middle = length.median() if k else torch.ones(())
-        hold = torch.exp2(-((length / (1.5 * middle)) ** 2))  # long edges bridge gaps: they hold less
-        self._hold, self.spacing = hold * GRID / self.step, float(middle)
+        hold = torch.exp2(
+            -((length / (self.settings.edge_falloff * middle)) ** 2)
+        )  # long edges bridge gaps: they hold less
+        self._hold, self.spacing = hold * self.settings.lattice / self.step, float(middle)
 
     @staticmethod
     def of(
-        means: torch.Tensor, sizes: torch.Tensor, radius: float, moving: torch.Tensor, count: int = NODES
+        means: torch.Tensor,
+        sizes: torch.Tensor,
+        radius: float,
+        moving: torch.Tensor,
+        settings: DeformationGraphSettings,
     ) -> NodeGraph:
         """Nodes for Gaussians at `means` [N, 3] of `sizes` [N], most of them where `moving` ([N] bool); `radius` of
         these. They are dense where the Gaussians are small: a wall behind needs few."""
-        low, step = means.min(0).values, GRID * radius
+        low, step = means.min(0).values, settings.lattice * radius
         grid = torch.round((means - low) / step).numpy().astype(np.uint32)
-        if (~moving).float().mean() < STILL_SHARE:  # nodes that stay among others that move would hold them
+        if (~moving).float().mean() < settings.still_share:  # nodes that stay among others that move would hold them
             moving = torch.ones_like(moving)
-        still = int(STILL_SHARE * count) if (~moving).any() else 0
+        still = int(settings.still_share * settings.nodes) if (~moving).any() else 0
         some = [np.zeros((0, 3), np.uint32)]
-        for mask, most in ((moving, count - still), (~moving, still)):
+        for mask, most in ((moving, settings.nodes - still), (~moving, still)):
             if mask.any() and most:
                 some.append(grid[mask.numpy()][farthest_points(means[mask].numpy(), most, sizes[mask].numpy())])
         chosen = np.unique(np.concatenate(some), axis=0)
         chosen = chosen[_native.morton_order(chosen)]
-        return NodeGraph(means, low, step, chosen, np.zeros(len(chosen), int), means.max(0).values - low)
+        return NodeGraph(means, low, step, chosen, np.zeros(len(chosen), int), means.max(0).values - low, settings)
 
     def extend(self, means: torch.Tensor) -> None:
         """More Gaussians to carry, at [K, 3] at rest."""
@@ -185,7 +190,7 @@ class NodeGraph:
 
     def _weights(self, means: torch.Tensor, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nodes of `chosen` that carry Gaussians at `means` [N, 3], and their weights, [N, k] both."""
-        return _native.node_weights(self._on_lattice(means), chosen, BLENDED)
+        return _native.node_weights(self._on_lattice(means), chosen, self.settings.blended)
 
     def _on_lattice(self, means: torch.Tensor) -> np.ndarray:
         return torch.round((means - self.low) / self.step).clamp(min=0).numpy().astype(np.uint32)
@@ -196,7 +201,7 @@ class NodeGraph:
         Returns:
             [3], from `means` to where they rest: there nobody else's nodes or weights change. None: no room is left.
         """
-        own = means[torch.from_numpy(farthest_points(means.numpy(), NEWCOMERS))]
+        own = means[torch.from_numpy(farthest_points(means.numpy(), self.settings.added_nodes))]
         before = self._weights(self.means, self.chosen)
         for shift in self._places(means):
             young = np.unique(self._on_lattice(own + shift), axis=0)
@@ -214,9 +219,9 @@ class NodeGraph:
         """Shifts [3] of `means` to beside all that rest, along the axis with most room in the lattice."""
         low, high = means.min(0).values, means.max(0).values
         start, size = self.means.max(0).values, high - low
-        room = self.low + ROOM * self.extent.max() - size - start
+        room = self.low + self.settings.extent_max * self.extent.max() - size - start
         axis = int(room.argmax())
-        for k in range(PLACES):
+        for k in range(self.settings.places_max):
             away = (0.5 + 0.5 * k) * size.max()
             if away > room[axis]:
                 return
@@ -233,10 +238,10 @@ class NodeGraph:
         return {n: np.asarray(getattr(self, n)) for n in ("means", "low", "step", "chosen", "family", "extent")}
 
     @staticmethod
-    def restored(state: dict[str, np.ndarray]) -> NodeGraph:
+    def restored(state: dict[str, np.ndarray], settings: DeformationGraphSettings) -> NodeGraph:
         """Inverse of `state`."""
         means, low, extent = (torch.from_numpy(state[n]) for n in ("means", "low", "extent"))
-        return NodeGraph(means, low, float(state["step"]), state["chosen"], state["family"], extent)
+        return NodeGraph(means, low, float(state["step"]), state["chosen"], state["family"], extent, settings)
 
     def keep(self, chosen: torch.Tensor) -> None:
         """Carries only the Gaussians of `chosen` ([N] bool)."""
@@ -263,9 +268,10 @@ class NodeGraph:
         return means, torch.nn.functional.normalize(blend[:, 12:], dim=1)
 
     def carriers(self, chosen: torch.Tensor) -> torch.Tensor:
-        """[M] bool: nodes that carry a Gaussian of `chosen` ([N] bool) with a weight of more than `HELD`."""
+        """[M] bool: nodes that carry a Gaussian of `chosen` ([N] bool) with a weight of more than
+        `carrier_weight_min`."""
         weights = self._gather[:, chosen.numpy()]
-        return torch.from_numpy((weights > HELD).getnnz(axis=1) > 0)
+        return torch.from_numpy((weights > self.settings.carrier_weight_min).getnnz(axis=1) > 0)
 
     def rigidity(self, pose: Pose) -> torch.Tensor:
         """Mean weighted length by which the edges between nodes miss their rotated selves (Sorkine and Alexa 2007)."""

@@ -9,10 +9,9 @@ import torch
 
 from .. import _native
 from ..model.gaussians import SH_C0, Gaussians
+from .settings import AdamSettings
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
-BETAS = (0.9, 0.99)  # short schedules: a second moment that forgets in 100 steps
-EPS = 1e-15
 HIDDEN = -20.0  # logit of the opacity of what is not there
 
 
@@ -34,12 +33,14 @@ class Model:
         return math.isqrt(self.params["shN"].shape[1] + 1) - 1
 
     @torch.no_grad()
-    def adam(self, grads: dict[str, torch.Tensor], rates: dict[str, float]) -> None:
+    def adam(self, grads: dict[str, torch.Tensor], rates: dict[str, float], settings: AdamSettings) -> None:
         """One Adam step (Kingma and Ba 2015) on the attributes in `rates`, each in one pass over memory."""
         self._steps += 1
         for name, rate in rates.items():
             tensors = (self.params[name], grads[name].float().contiguous(), self._first[name], self._second[name])
-            _native.adam(tuple(t.numpy() for t in tensors), rate, BETAS, EPS, self._steps)
+            _native.adam(
+                tuple(t.numpy() for t in tensors), rate, (settings.beta1, settings.beta2), settings.eps, self._steps
+            )
 
     def restart(self) -> None:
         """Forgets the moments (a new frame, a new stage)."""

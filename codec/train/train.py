@@ -29,11 +29,6 @@ from .tracking import Tracker
 from .views import Views
 from .visual_hull import carve, random_box
 
-CUT_FLOOR = 0.004  # image loss that no frame is cut for: clean pictures fit far better than they need to
-STIRRED = 0.15  # share of the Gaussians that begin to change in one frame, for which a group ends
-SETTLED = 4  # frames that a group has at least before that
-SWEEP_LEAST = 0.1  # of the initial points that a plane sweep must find, to be a scene with texture
-
 
 @dataclass
 class Progress:
@@ -59,23 +54,24 @@ def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
     cameras = capture.indices("train")
     if not cameras:
         raise CaptureError(f"{capture.name}: no training camera, expected at least one with split 'train'")
-    views = []
-    for i in cameras:
-        v = capture.view(i, frame)
-        views.append((capture.cameras[i], v.rgb, v.alpha))
+    i, views = settings.initialization, []
+    for camera in cameras:
+        v = capture.view(camera, frame)
+        views.append((capture.cameras[camera], v.rgb, v.alpha))
     known = [c for c, _, _ in views]
     if all(alpha is not None for _, _, alpha in views):
-        points, colors = carve(known, views, settings.initial_points)
+        points, colors = carve(known, views, settings.initial_points, settings.visual_hull)
         if len(points):
-            return from_points(points, colors, opacity=0.5)
-    points, colors = sweep(views, settings.initial_points, settings.seed)
-    if len(points) >= SWEEP_LEAST * settings.initial_points:
-        surface = zip((points, colors), shell(views), strict=True)
-        return from_points(*(np.concatenate(pair) for pair in surface), opacity=0.5)
-    points, colors = random_box(known, views, settings.initial_points, settings.seed)
+            return from_points(points, colors, opacity=i.surface_opacity)
+    if i.use_plane_sweep:
+        points, colors = sweep(views, settings.initial_points, settings.seed, settings.plane_sweep)
+        if len(points) >= i.sweep_min_share * settings.initial_points:
+            surface = zip((points, colors), shell(views, settings.plane_sweep), strict=True)
+            return from_points(*(np.concatenate(pair) for pair in surface), opacity=i.surface_opacity)
+    points, colors = random_box(known, views, settings.initial_points, settings.seed, settings.visual_hull)
     if len(points) == 0:
         raise CaptureError(f"{capture.name}: no point is seen by two cameras, expected cameras that overlap")
-    return from_points(points, colors, opacity=0.1)
+    return from_points(points, colors, opacity=i.random_opacity)
 
 
 class Checkpoint:
@@ -215,7 +211,7 @@ class _Run:
 
     def __init__(self, capture, settings: TrainSettings, on_progress):
         self.capture, self.settings, self.on_progress = capture, settings, on_progress
-        self.views = Views(capture, settings.seed)
+        self.views = Views(capture, settings)
         self.progress = Progress(0, started=time.monotonic())
         self.subject: Subject | None = None
 
@@ -274,12 +270,15 @@ class _Run:
     def _follow(self, frames: range, track: _Track) -> bool:
         """Adds the frames to `track`; True: until the subject was lost. It also ends where much that has stood still
         changes at once: with few temporal frequencies, light that comes on would show in all frames of the group."""
-        subject = self.subject
+        subject, g = self.subject, self.settings.group
         for frame in frames:
-            if len(track.models) >= SETTLED and subject.tracker.stirred(frame, track.moved()) > STIRRED:
+            if (
+                len(track.models) >= g.changed_frames_min
+                and subject.tracker.stirred(frame, track.moved()) > g.changed_fraction_max
+            ):
                 return False
             loss = subject.tracker.advance(frame, self._report(f"track {frame}"))
-            if loss is not None and loss > self.settings.cut_ratio * subject.loss + CUT_FLOOR:
+            if loss is not None and loss > self.settings.cut_ratio * subject.loss + g.cut_loss_floor:
                 return True
             if loss is not None:
                 subject.tracker.bear(frame, self._report(f"births {frame}"))
@@ -293,7 +292,7 @@ class _Run:
             taken = [self.capture.cameras[i] for i in cameras]
             subject.steps = measured_steps(middle, quality, steps_for(quality, subject.radius), taken)
         graph, steps = subject.tracker.graph, subject.steps
-        model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved())
+        model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), self.settings)
         on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
         finetune(model, self.views, frames, self.settings, radius=subject.tracker.radius, on_step=on_step)
         return model

@@ -18,7 +18,7 @@ from ..render.step import RenderLoss, Workspace, render_loss
 from .calibration import Exposure, Extrinsics
 from .settings import TrainSettings
 
-CACHE_BYTES = 2 << 30  # of decoded targets
+CACHE_BYTES = 2 << 30  # of decoded targets: a bound on memory, with no effect on the result
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,12 @@ class Views:
     """The training views of a capture, `train_cameras` being their indices; `exposure` and `extrinsics` say by how much
     each differs from what the capture tells."""
 
-    def __init__(self, capture, seed: int):
+    def __init__(self, capture, settings: TrainSettings):
         self.capture = capture
         self.train_cameras = capture.indices("train")
-        self.exposure = Exposure(len(capture.cameras), self.train_cameras)
-        self.extrinsics = Extrinsics(len(capture.cameras), self.train_cameras)
-        self._seed = seed
+        self.exposure = Exposure(len(capture.cameras), self.train_cameras, settings)
+        self.extrinsics = Extrinsics(len(capture.cameras), self.train_cameras, settings)
+        self._seed = settings.seed
         self._held: OrderedDict[tuple, View | Target] = OrderedDict()
         self._bytes = 0
         self._order: dict[int, list[int]] = {}
