@@ -66,6 +66,7 @@ def correlations(table: list[dict]) -> dict[str, float]:
 
 def main() -> None:
     """Writes the table."""
+    torch.set_num_threads(1)
     capture = replace(open_capture(Path(os.environ["GSCODEC_DATA"]) / "lumberjack"), frame_count=FRAMES)
     table = [row for weight in WEIGHTS for row in rows(capture, weight)]
     correlation = correlations(table)

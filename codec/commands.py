@@ -26,6 +26,13 @@ from .progress import Bar
 AXES = ("x", "y", "z")
 
 
+def limit_torch_threads() -> None:
+    """One thread for torch in this process: it handles small tensors, and would compete with the native kernels."""
+    import torch
+
+    torch.set_num_threads(1)
+
+
 def encode_input(
     source: Path,
     out: Path,
@@ -120,6 +127,7 @@ def _restrict(sequence: GaussianSequence, frames: str | None) -> GaussianSequenc
 
 def _encode_capture(source, out, settings, preset, frames, gop, cluster, bar) -> EncodeReport:
     require("torch", "training a capture")
+    limit_torch_threads()
     from .train.settings import train_settings
     from .train.train import Checkpoint, train_groups
 
@@ -213,6 +221,7 @@ def train_to_folder(
     What an earlier run with the same settings left unfinished goes on where it stopped.
     """
     require("torch", "training a capture")
+    limit_torch_threads()
     from .splats import SequenceWriter
     from .train.settings import train_settings
     from .train.train import Checkpoint, train_groups
@@ -290,6 +299,7 @@ def bench_raster(
         UsageError: an unknown scene or instruction set, a number that is none, or torch is missing.
     """
     require("torch", "measuring training steps")
+    limit_torch_threads()
     from bench.machine import write_result
     from bench.raster import SCENES, run
 
@@ -317,6 +327,8 @@ def bench_rd(codecs: str | None, sequences: str | None, *, data: Path | None, wo
     Raises:
         UsageError: an unknown codec or sequence, or no data folder.
     """
+    require("torch", "making sequences")
+    limit_torch_threads()
     from bench.rd import CODECS, measure, update
     from bench.sequences import SEQUENCES
 
@@ -339,6 +351,7 @@ def bench_train(
         UsageError: an unknown capture or recipe, or no data folder.
     """
     require("torch", "measuring training")
+    limit_torch_threads()
     from bench.train import CASES, RECIPES, measure, update
 
     if data is None:
@@ -358,6 +371,7 @@ def bench_ablation(
         UsageError: an unknown capture or variant, or the capture is not in the data folder.
     """
     require("torch", "measuring training")
+    limit_torch_threads()
     from bench.ablation import FRAMES, VARIANTS, measure
 
     names = _names("--variant", variants, VARIANTS)
@@ -372,6 +386,7 @@ def bench_stress(cases: str | None, *, out: Path) -> Iterator[dict]:
         UsageError: an unknown case.
     """
     require("torch", "measuring training")
+    limit_torch_threads()
     from bench.stress import measure
     from bench.stress_scenes import SCENES
 

@@ -18,6 +18,7 @@ from gscodec.errors import CaptureError, UsageError
 from gscodec.metrics.image import psnr
 from gscodec.model.camera import Camera, look_at
 from gscodec.model.gaussians import GaussianSequence, Group, concatenate
+from gscodec.render.cpu import CpuBackend
 from gscodec.render.image import render_image, render_rgba
 from gscodec.train.calibration import Extrinsics
 from gscodec.train.change_detection import Changes
@@ -153,7 +154,7 @@ def test_keyframe_learns_a_view_it_has_not_seen(masks):
     losses = []
     train_keyframe(
         model,
-        Views(capture, settings),
+        Views(capture, settings, CpuBackend()),
         0,
         settings,
         steps=200,
@@ -176,7 +177,7 @@ def test_exposure_of_each_camera_is_found(darkest):
         view = capture.read(camera, frame)
         return dataclasses.replace(view, rgb=np.rint(gains[camera] * view.rgb).astype(np.uint8))
 
-    views, model = Views(dataclasses.replace(capture, read=dimmed), TINY), initial_model(capture, 0, TINY)
+    views, model = Views(dataclasses.replace(capture, read=dimmed), TINY, CpuBackend()), initial_model(capture, 0, TINY)
     train_keyframe(model, views, 0, TINY, steps=600, radius=1.0)
     true = np.log(gains[:-1]) - np.log(gains[:-1]).mean()
     np.testing.assert_allclose(views.exposure.values[:-1], true[:, None] + np.zeros(3), atol=0.04)
@@ -191,10 +192,13 @@ def test_pose_of_each_camera_is_found(wrong):
     """Up to what all cameras share; right ones stay as they are."""
     capture = capture_of(turning(300, frames=1))
     count = len(capture.cameras)
-    told, trained = Extrinsics(count, list(range(count - 1)), TINY), slice(0, -1)
+    told, trained = Extrinsics(count, list(range(count - 1)), TINY, CpuBackend()), slice(0, -1)
     told.values[trained] = np.random.default_rng(3).uniform(-wrong, wrong, (count - 1, 6))
     cameras = [told.camera(i, c) for i, c in enumerate(capture.cameras)]
-    views, model = Views(dataclasses.replace(capture, cameras=cameras), TINY), initial_model(capture, 0, TINY)
+    views, model = (
+        Views(dataclasses.replace(capture, cameras=cameras), TINY, CpuBackend()),
+        initial_model(capture, 0, TINY),
+    )
     train_keyframe(model, views, 0, TINY, steps=400, radius=1.0)
     left = views.extrinsics.values[trained] + told.values[trained] - told.values[trained].mean(0)
     assert np.sqrt(np.mean(left**2)) <= 0.5 * np.sqrt(np.mean(told.values[trained] ** 2))
@@ -225,7 +229,7 @@ def test_harmonics_stay_where_colours_depend_on_the_view(gloss, kept):
 def test_tracking_finds_the_turn(capture):
     truth = turning(300, frames=5)
     key = from_gaussians(truth.frame(0))
-    views = Views(capture, TINY)
+    views = Views(capture, TINY, CpuBackend())
     tracker = Tracker.start(key, views, TINY, 0.01, range(3))
     models, poses = [tracker.model], [tracker.pose]
     for frame in (1, 2):
@@ -285,7 +289,7 @@ def test_what_jumps_is_found_and_what_is_gone_is_not():
     frames, cameras = [concatenate([wall, at(-0.5)]), concatenate([wall, at(0.5)]), wall], arc()
     read = lambda camera, t: View(render_image(frames[t], cameras[camera], (0, 0, 0)), None)  # noqa: E731
     capture = Capture("patch", 25.0, cameras, 3, False, read)
-    views, model, some = Views(capture, TINY), from_gaussians(frames[0]), torch.arange(3800) >= 3000
+    views, model, some = Views(capture, TINY, CpuBackend()), from_gaussians(frames[0]), torch.arange(3800) >= 3000
     changes = Changes.since(views, 0, TINY.change_detection)
     shift = whereabouts(model, some, 1, changes, changes.advance(1), TINY)
     np.testing.assert_allclose(shift, [1, 0, 0], atol=0.25)
@@ -311,7 +315,7 @@ def test_masks_say_where_nothing_is():
     )
     whole, none = concatenate([left, right]), left.take(np.zeros(0, int))
     capture = capture_of(GaussianSequence(25.0, [Group([g]) for g in (whole, left, none, none)]))
-    tracker = Tracker.start(from_gaussians(whole), Views(capture, TINY), TINY, 0.01, range(4))
+    tracker = Tracker.start(from_gaussians(whole), Views(capture, TINY, CpuBackend()), TINY, 0.01, range(4))
     models, poses = [tracker.model], [tracker.pose]
     for frame in (1, 2, 3):
         loss = tracker.advance(frame)
@@ -384,9 +388,10 @@ def test_canonical_rate_is_what_the_coder_pays_and_falls_along_its_gradient():
     estimated, before = rate.bits(model.params, noise), coded_bits(rate, model, 62)
     for name in names:
         assert estimated[name].item() == pytest.approx(before[name], rel=0.15), name
+    model.start_optimizer(CpuBackend(), TINY.adam)
     for _ in range(60):
         rates = {n: 0.1 * getattr(steps, n) for n in names}
-        model.adam(rate.gradients(model.params, noise)[1], rates, TINY.adam)
+        model.step(rate.gradients(model.params, noise)[1], rates)
     after = coded_bits(rate, model, 62)
     for name in names:
         assert after[name] < 0.97 * before[name], name
@@ -411,6 +416,8 @@ def coded_bits(rate, model, quality):
 
 def test_growing_and_pruning_keep_the_moments_in_step():
     model = from_gaussians(blob(100))
+    model.start_optimizer(CpuBackend(), TINY.adam)
+    model.step({n: torch.ones_like(p) for n, p in model.params.items()}, dict.fromkeys(model.params, 0.0))
     stats = Statistics(100, 1e-8)
     stats.pull += torch.linspace(0, 1, 100)
     stats.seen += 1
@@ -425,7 +432,7 @@ def test_growing_and_pruning_keep_the_moments_in_step():
     stats.pulse[:90] = 1
     prune(model, stats, TINY.keyframe, thin=True)
     assert len(model) == 90, "what changes nothing in the picture is not worth its bits"
-    model.adam({n: torch.ones_like(p) for n, p in model.params.items()}, {"means": 0.1}, TINY.adam)
+    model.step({n: torch.ones_like(p) for n, p in model.params.items()}, {"means": 0.1})
     assert torch.isfinite(model.params["means"]).all()
 
 

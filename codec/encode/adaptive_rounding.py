@@ -14,8 +14,8 @@ import numpy as np
 
 from ..bitstream.color import correlate
 from ..model.gaussians import Gaussians
+from ..render.cpu import CpuBackend
 from ..render.sensitivity import derivatives
-from ..render.workspace import Workspace
 from .parallel import ahead
 from .refinement_views import DrawnTargets, PictureTargets
 
@@ -71,12 +71,12 @@ def refine(
         shown: frame -> the same as they look with the integers as they are now, and for each of `parts` what makes the
             derivative by its integers of that by its attribute ([N, C]).
     """
-    workspace, names = Workspace(), {p.attribute for p in parts}
+    backend, names = CpuBackend(), {p.attribute for p in parts}
     first = targets.drift / len(targets) ** 0.5
     for step, (t, camera, background, target) in enumerate(ahead(targets.draw(source, frames)), 1):
         now, chain = shown(t)
         off = lambda image, target=target: np.ascontiguousarray(image - target)  # noqa: E731
-        derivative = derivatives(workspace, now, camera, off, names, background)
+        derivative = derivatives(backend, now, camera, off, names, background)
         rate = first * (1 - (step - 1) / len(targets))
         for part, by_integers in zip(parts, chain, strict=True):
             part.follow(by_integers(derivative[part.attribute]), rate, step)

@@ -12,9 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from .. import _native
 from ..model.camera import Camera
 from ..model.gaussians import SH_C0, Gaussians
+from ..render.backend import Backend
+from ..render.optimizer import Adam
 from .settings import TrainSettings
 
 
@@ -24,33 +25,30 @@ class _Learned:
     Args:
         count: cameras of the capture.
         trained: indices of those that are trained on.
+        adam: optimiser of the values of each camera.
         rate: learning rate; least: root mean square of the values that are kept by `settle`.
 
     Attributes:
         values: [C, K] f32.
     """
 
-    def __init__(
-        self, count: int, width: int, trained: list[int], settings: TrainSettings, *, rate: float, least: float
-    ):
+    def __init__(self, count: int, width: int, trained: list[int], adam: Adam, *, rate: float, least: float):
         self._shape, self._trained, self._rate, self._least = (count, width), trained, rate, least
-        self._settings = settings
+        self._adam = adam
         self.restart()
 
     def restart(self) -> None:
         """Nothing is wrong."""
-        self.values, self._first, self._second = np.zeros((3, *self._shape), np.float32)
-        self._steps = np.zeros(self._shape[0], int)
+        self.values = np.zeros(self._shape, np.float32)
+        self._adam.restart()
         self._settled = False
 
     def learn(self, camera: int, grad: np.ndarray, fade: float) -> None:
         """One step for one camera; `grad`: [K], of the loss; rate times `fade`."""
         if self._settled:
             return
-        self._steps[camera] += 1
-        tensors = (self.values[camera], grad.astype(np.float32), self._first[camera], self._second[camera])
-        a = self._settings.adam
-        _native.adam(tensors, self._rate * fade, (a.beta1, a.beta2), a.eps, int(self._steps[camera]))
+        name = str(camera)
+        self._adam.step({name: self.values[camera]}, {name: grad}, {name: self._rate * fade})
         self.values[self._trained] -= self.values[self._trained].mean(0)
 
     def settle(self) -> None:
@@ -63,9 +61,10 @@ class _Learned:
 class Exposure(_Learned):
     """Log gains of the channels of each training camera: they multiply its rendered images, and no others."""
 
-    def __init__(self, count: int, trained: list[int], settings: TrainSettings):
+    def __init__(self, count: int, trained: list[int], settings: TrainSettings, backend: Backend):
         c = settings.calibration
-        super().__init__(count, 3, trained, settings, rate=c.exposure_rate, least=c.exposure_min)
+        super().__init__(count, 3, trained, Adam(backend, settings.adam), rate=c.exposure_rate, least=c.exposure_min)
+        self._weight = c.exposure_weight
 
     def gain(self, camera: int) -> np.ndarray:
         """[3] f32."""
@@ -78,9 +77,7 @@ class Exposure(_Learned):
 
     def learn(self, camera: int, grad: np.ndarray, fade: float) -> None:
         """As of `_Learned`; `grad`: [3], of the loss by the gains."""
-        super().learn(
-            camera, grad * self.gain(camera) + self._settings.calibration.exposure_weight * self.values[camera], fade
-        )
+        super().learn(camera, grad * self.gain(camera) + self._weight * self.values[camera], fade)
 
 
 class Extrinsics(_Learned):
@@ -88,9 +85,9 @@ class Extrinsics(_Learned):
     about the middle of the subject, then a translation in its radii.
     """
 
-    def __init__(self, count: int, trained: list[int], settings: TrainSettings):
+    def __init__(self, count: int, trained: list[int], settings: TrainSettings, backend: Backend):
         c = settings.calibration
-        super().__init__(count, 6, trained, settings, rate=c.pose_rate, least=c.pose_min)
+        super().__init__(count, 6, trained, Adam(backend, settings.adam), rate=c.pose_rate, least=c.pose_min)
         self.about(np.zeros(3), 1.0)
 
     def about(self, middle: np.ndarray, radius: float) -> None:

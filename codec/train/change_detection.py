@@ -11,6 +11,7 @@ import numpy as np
 
 from ..capture import blend
 from .settings import ChangeDetectionSettings
+from .views import GREY
 from .visual_hull import project
 
 
@@ -39,7 +40,7 @@ class Changes:
         """[h, w, 3] u8, small, over mid-grey."""
         import cv2
 
-        rgb = blend(self.views.view(camera, frame), (0.5, 0.5, 0.5))
+        rgb = blend(self.views.view(camera, frame), GREY)
         height, width = rgb.shape[:2]
         scale = min(1.0, self.settings.width / width)
         size = (max(1, round(scale * width)), max(1, round(scale * height)))
@@ -70,9 +71,9 @@ class Changes:
             if alpha is None:
                 return np.zeros(len(means), bool)
             masks.append(self._grown(cv2.resize(alpha, fitted.shape[1::-1], interpolation=cv2.INTER_AREA) > 0))
-        return ~self.behind(masks, means, [np.ones(len(means), bool)] * len(masks))
+        return ~self.behind(frame, masks, means, [np.ones(len(means), bool)] * len(masks))
 
-    def behind(self, masks: list[np.ndarray], means: np.ndarray, visible: list[np.ndarray]) -> np.ndarray:
+    def behind(self, frame: int, masks: list[np.ndarray], means: np.ndarray, visible: list[np.ndarray]) -> np.ndarray:
         """[N] bool: Gaussians at `means` ([N, 3]) that enough of the cameras that see them have in changed pixels.
 
         Args:
@@ -81,7 +82,7 @@ class Changes:
         seen, hit = np.zeros(len(means), np.int32), np.zeros(len(means), np.int32)
         for camera, mask, clear in zip(self.views.train_cameras, masks, visible, strict=True):
             height, width = mask.shape
-            p, depth = project(self.views.camera(camera).resized(width, height), means)
+            p, depth = project(self.views.camera(camera, frame).resized(width, height), means)
             x, y = np.floor(p).astype(np.int64).T
             on = np.flatnonzero(clear & (depth > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height))
             seen[on] += 1

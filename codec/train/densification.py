@@ -13,15 +13,11 @@ import numpy as np
 import torch
 
 from ..capture import blend
-from ..render.image import render_image
-from ..render.workspace import Workspace
 from .keyframe import Statistics, random_offset
 from .model import NAMES, Model, from_points
 from .plane_sweep import sweep
 from .settings import DensificationSettings, PlaneSweepSettings, TrainSettings
-from .views import compare
-
-GREY = (0.5, 0.5, 0.5)
+from .views import GREY, photometric_loss
 
 
 def born(
@@ -46,7 +42,7 @@ def born(
     room = min(room, int(d.max_share * len(model)))
     if room < d.spawn_min or np.median([m.mean() for m in wrong]) < d.error_share_min:
         return None
-    rng, workspace = np.random.default_rng([settings.seed, frame, 3]), Workspace()
+    rng = np.random.default_rng([settings.seed, frame, 3])
     points = sweep_wrong(wrong, frame, views, room // 2, settings.plane_sweep, settings.seed)
     young = from_points(*points, opacity=settings.initialization.surface_opacity)
     young.set_degree(model.degree)
@@ -55,12 +51,13 @@ def born(
     if len(young) < d.spawn_min:
         return None
     radius, stats = float(model.params["means"].std(0).norm()), Statistics(len(young), k.mse_min)
+    young.start_optimizer(views.backend, settings.adam)
     for step in range(d.steps):
         together = {n: torch.cat([model.params[n], young.params[n]]) for n in NAMES}
-        result = compare(together, views.draw(frame), settings, rng, workspace)
+        result = photometric_loss(together, views.draw(frame), settings, rng, views.backend)
         fade = k.rate_decay ** (step / d.steps)
         grads = {n: g[len(model) :] for n, g in result.grads.items()}
-        young.adam(grads, k.rates.scaled(radius, fade), settings.adam)
+        young.step(grads, k.rates.scaled(radius, fade))
         if 2 * step >= d.steps:
             weight = torch.as_tensor(result.max_weight)[len(model) :]
             torch.maximum(stats.weight, weight, out=stats.weight)
@@ -85,7 +82,7 @@ def wrong_pixels(
     blob = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (settings.opening, settings.opening))
     for camera, mask in zip(views.train_cameras, masks, strict=True):
         truth = blend(views.view(camera, frame), GREY)
-        shown = render_image(views.exposure.seen(g, camera), views.camera(camera), GREY)
+        shown = views.render(g, camera, frame)
         error = np.abs(shown - truth).max(2)
         small = cv2.resize(error, mask.shape[::-1], interpolation=cv2.INTER_AREA)
         wrong = (mask & (small > settings.error_min)).astype(np.uint8)
@@ -96,7 +93,7 @@ def wrong_pixels(
 def sweep_wrong(wrong: list[np.ndarray], frame: int, views, most: int, settings: PlaneSweepSettings, seed: int = 0):
     """At most `most` points on surfaces in the pixels that are wrong, and their colours, as of `sweep`."""
     taken = [views.view(i, frame) for i in views.train_cameras]
-    pictures = [(views.camera(i), v.rgb, v.alpha) for i, v in zip(views.train_cameras, taken, strict=True)]
+    pictures = [(views.camera(i, frame), v.rgb, v.alpha) for i, v in zip(views.train_cameras, taken, strict=True)]
     return sweep(pictures, most, seed, settings, wrong)
 
 

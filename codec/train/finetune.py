@@ -21,12 +21,12 @@ from ..bitstream.color import STEP_WEIGHTS
 from ..bitstream.quantization import Steps, trajectory_step
 from ..bitstream.transform import dct_basis
 from ..model.gaussians import Gaussians, Group, Nodes
-from ..render.workspace import Workspace
+from ..render.optimizer import Adam
 from .deformation_graph import NodeGraph, Pose, quat_conjugate, quat_multiply, quat_to_rotvec
 from .entropy_model import CanonicalRate, laplace_bits
 from .model import HIDDEN, NAMES, Model
 from .settings import TrainSettings
-from .views import Views, compare
+from .views import Views, photometric_loss
 
 
 def rounded(c: torch.Tensor, dead_zone: float) -> torch.Tensor:
@@ -238,16 +238,12 @@ class _Finetuner:
         self.group, self.views, self.frames, self.settings = group, views, frames, settings
         self.rng = np.random.default_rng([settings.seed, frames[0], 2])
         self.noise = torch.Generator().manual_seed(settings.seed)
-        self.workspace = Workspace()
         f = settings.finetune
-        rates = [(c, f.coefficient_rate) for c in group.coefficients.values()]
-        rates += [(s, f.log_scale_rate) for s in group.log_scales.values()]
-        self.optimizer = torch.optim.Adam(
-            [{"params": [p], "base": r} for p, r in rates],
-            betas=(f.coefficient_adam.beta1, f.coefficient_adam.beta2),
-            eps=f.coefficient_adam.eps,
-            fused=True,
-        )
+        scales = {f"{n}.log_scale": s for n, s in group.log_scales.items()}
+        self.leaves = {**group.coefficients, **scales}  # what is optimised besides the canonical attributes
+        self.rates = dict.fromkeys(group.coefficients, f.coefficient_rate) | dict.fromkeys(scales, f.log_scale_rate)
+        self.adam = Adam(views.backend, f.coefficient_adam)
+        group.key.start_optimizer(views.backend, settings.adam)
         canonical = settings.keyframe.rates.scaled(radius, f.canonical_rate_share)
         canonical["means"] = f.canonical_means_rate * radius
         self.canonical_rates = canonical if group.known < len(group.key) else {}
@@ -256,14 +252,12 @@ class _Finetuner:
 
     def step(self, t: int, fade: float) -> float:
         """One step on frame `t`, all rates times `fade`; returns the image loss."""
-        for g in self.optimizer.param_groups:
-            g["lr"] = g["base"] * fade
         f = self.settings.finetune
         group, names = self.group, list(self.group.coefficients)
         residuals = {n: r.requires_grad_() for n, r in group.residuals(t).items()}
         params = group.frame(t, residuals, self.noise if f.canonical_noise else None)
         target = self.views.draw(self.frames[t])
-        result = compare(params, target, self.settings, self.rng, self.workspace)
+        result = photometric_loss(params, target, self.settings, self.rng, self.views.backend)
         self.loss += (result.loss - self.loss) * (f.loss_smoothing if self.loss else 1.0)
         heads, seeds = [params[n] for n in names], [result.grads[n] for n in names]
         extra: dict[str, torch.Tensor] = {}
@@ -275,17 +269,19 @@ class _Finetuner:
             if self.canonical_rates:
                 self.canonical_bits, rate = group.canonical_rate.gradients(group.key.params, self.noise)
                 extra = {n: f.canonical_bit_weight * price * g for n, g in rate.items()}
-        self.optimizer.zero_grad()
+        for leaf in self.leaves.values():
+            leaf.grad = None
         torch.autograd.backward(heads, seeds)
         group.backward(t, residuals)
-        self.optimizer.step()
+        by_leaf = {n: leaf.grad for n, leaf in self.leaves.items() if leaf.grad is not None}  # scales: with bits only
+        self.adam.step(self.leaves, by_leaf, {n: self.rates[n] * fade for n in by_leaf})
         if self.canonical_rates:
             back = quat_conjugate(group.turned[t])
             grads = {**result.grads, "quats": quat_multiply(back, result.grads["quats"])}  # to the canonical pose
             for n, g in grads.items():
                 g += extra.get(n, 0)
                 g[: group.known] = 0
-            group.key.adam(grads, {n: r * fade for n, r in self.canonical_rates.items()}, self.settings.adam)
+            group.key.step(grads, {n: r * fade for n, r in self.canonical_rates.items()})
         return result.loss
 
     def _price(self, bits: float) -> float:

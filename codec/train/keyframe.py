@@ -12,10 +12,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from ..render.workspace import Workspace
 from .model import Model
 from .settings import KeyframeSettings, TrainSettings
-from .views import Views, compare, look
+from .views import Views, photometric_loss, view_losses
 
 
 class Statistics:
@@ -78,30 +77,29 @@ def train_keyframe(
     """
     k = settings.keyframe
     rng = np.random.default_rng([settings.seed, frame])
-    workspace = Workspace()
     stats, losses = Statistics(len(model), k.mse_min), []
-    model.restart()
+    model.start_optimizer(views.backend, settings.adam)
     views.exposure.restart()
     views.extrinsics.restart()
     views.extrinsics.about(model.params["means"].numpy().mean(0, dtype=np.float64), radius)
     for step in range(steps):
         target = views.draw(frame)
-        result = compare(model.params, target, settings, rng, workspace)
+        result = photometric_loss(model.params, target, settings, rng, views.backend)
         stats.add(result)
         losses.append(result.loss - settings.mask_lambda * result.mask)
         fade = step / max(steps - 1, 1)
         decay = k.rate_decay**fade
         if step >= k.appearance_from * steps:
-            views.exposure.learn(target.index, result.grad_gain, decay)
+            views.exposure.learn(target.index, result.grad_gain[0], decay)
             views.extrinsics.learn(target.index, model.params, result.grads, decay)
         means_rate = radius * k.rates.means * (k.means_rate_end / k.rates.means) ** fade
-        model.adam(result.grads, {**k.rates.scaled(radius, decay), "means": means_rate}, settings.adam)
+        model.step(result.grads, {**k.rates.scaled(radius, decay), "means": means_rate})
         if step == int(k.appearance_from * steps):
             model.set_degree(settings.sh_degree)
         if step == int(k.densify_until * steps):
             views.exposure.settle()
             views.extrinsics.settle()
-        if step == int(k.thin_until * steps) and not harmonics_pay(model, views, frame, settings, workspace):
+        if step == int(k.thin_until * steps) and not harmonics_pay(model, views, frame, settings):
             model.set_degree(0)
         if densify and (step + 1) % k.densify_every == 0:
             if k.densify_from * steps < step < k.densify_until * steps:
@@ -114,10 +112,10 @@ def train_keyframe(
     return float(np.mean(losses[-len(views.train_cameras) :]))
 
 
-def harmonics_pay(model: Model, views: Views, frame: int, settings: TrainSettings, workspace: Workspace) -> bool:
+def harmonics_pay(model: Model, views: Views, frame: int, settings: TrainSettings) -> bool:
     """Whether the training views of `frame` are so much worse without them that they are worth their bits."""
     plain = {**model.params, "shN": model.params["shN"][:, :0].contiguous()}
-    whole, less = (np.mean([r.mse for r in look(p, views, frame, settings, workspace)]) for p in (model.params, plain))
+    whole, less = (np.mean([r.mse for r in view_losses(p, views, frame, settings)]) for p in (model.params, plain))
     k = settings.keyframe
     return less > (1 + k.harmonics_gain_min) * max(whole, k.mse_min)
 

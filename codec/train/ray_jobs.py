@@ -47,7 +47,7 @@ def cluster_groups(
     try:
         left = [s for s in segments(open_capture().frame_count, settings.gop, random_access) if s.stop > first_frame]
         cpus = int(min(CPUS, max(node["Resources"].get("CPU", 1) for node in ray.nodes())))
-        threads = {"env_vars": {"RAYON_NUM_THREADS": str(cpus)}}
+        threads = {"env_vars": {"RAYON_NUM_THREADS": str(cpus), "OMP_NUM_THREADS": "1"}}  # of the kernels, of torch
         job = ray.remote(num_cpus=cpus, max_retries=RETRIES, runtime_env=threads)(train_segment)
         pending = [job.remote(open_capture, settings, random_access, s) for s in left]
         for segment in left:

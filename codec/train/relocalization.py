@@ -11,8 +11,7 @@ import numpy as np
 import torch
 
 from ..farthest_point_sampling import farthest_points
-from ..render.image import render_image
-from .densification import GREY, sweep_wrong, wrong_pixels
+from .densification import sweep_wrong, wrong_pixels
 from .model import HIDDEN, Model
 from .settings import RelocalizationSettings, TrainSettings
 
@@ -29,8 +28,8 @@ def whereabouts(
     s, views = settings.relocalization, changes.views
     hidden = torch.where(some, HIDDEN, model.params["logit_opacities"])
     others = Model({**model.params, "logit_opacities": hidden})
-    least, found = error(others, changes), None
-    if error(model, changes) < s.error_ratio * least:
+    least, found = error(others, frame, changes), None
+    if error(model, frame, changes) < s.error_ratio * least:
         return torch.zeros(3)
     wrong = wrong_pixels(others, masks, frame, views, settings.densification)
     points, _ = sweep_wrong(wrong, frame, views, s.points, settings.plane_sweep)
@@ -40,17 +39,16 @@ def whereabouts(
     for place in _places(points, radius, s):
         shift = torch.from_numpy(place).float() - centre
         moved = Model({**model.params, "means": means + torch.where(some[:, None], shift, 0.0)})
-        if (e := error(moved, changes)) < least:
+        if (e := error(moved, frame, changes)) < least:
             least, found = e, shift
     return found
 
 
-def error(model: Model, changes) -> float:
+def error(model: Model, frame: int, changes) -> float:
     """Mean absolute difference to the small pictures of `changes`, over all training cameras."""
     g, views, differences = model.gaussians(), changes.views, []
     for i, picture in zip(views.train_cameras, changes.fitted, strict=True):
-        camera = views.camera(i).resized(*picture.shape[1::-1])
-        shown = render_image(views.exposure.seen(g, i), camera, GREY)
+        shown = views.render(g, i, frame, picture.shape[1::-1])
         differences.append(np.abs(shown.astype(np.float32) - picture).mean())
     return float(np.mean(differences))
 

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from ..bitstream.quantization import subject_radius
-from ..render.workspace import Workspace
+from ..render.optimizer import Adam
 from .change_detection import Changes
 from .deformation_graph import NodeGraph, Pose, quat_conjugate, quat_multiply, rotvec_to_quat
 from .densification import born, wrong_pixels
@@ -30,7 +30,7 @@ from .keyframe import Statistics, rotate
 from .model import HIDDEN, NAMES, Model
 from .relocalization import whereabouts
 from .settings import TrainSettings
-from .views import Views, compare, look
+from .views import Views, photometric_loss, view_losses
 
 
 class Tracker:
@@ -59,20 +59,19 @@ class Tracker:
         self.radius, self.loss, self.calm = numbers.tolist()
         self.changes = changes
         self.moving = torch.zeros(len(own), dtype=torch.bool)
-        self.workspace = Workspace()
 
     @staticmethod
     def start(key: Model, views: Views, settings: TrainSettings, loss: float, frames: range) -> Tracker:
         """Follows `key`, the keyframe of frames[0] with image loss `loss`; most nodes go where frames[1] differs."""
         changes = Changes.since(views, frames[0], settings.change_detection)
         stats, visible = Statistics(len(key), settings.keyframe.mse_min), []
-        for result in look(key.params, views, frames[0], settings, Workspace()):
+        for result in view_losses(key.params, views, frames[0], settings):
             stats.add(result)
             visible.append(result.max_weight > settings.tracking.visible_weight)
         means = key.params["means"]
         moving = np.ones(len(key), bool)
         if len(frames) > 1:
-            seen = changes.behind(changes.copy().advance(frames[1]), means.numpy(), visible)
+            seen = changes.behind(frames[1], changes.copy().advance(frames[1]), means.numpy(), visible)
             moving = seen if seen.any() else moving
         radius = subject_radius(means[moving].numpy())
         sizes = torch.ones(len(key))
@@ -223,9 +222,9 @@ class Tracker:
         if not any(m.any() for m in masks):
             return np.zeros(len(model), bool)
         s = self.settings.tracking
-        looks = look(model.params, self.views, frame, self.settings, self.workspace, s.small_scale)
+        looks = view_losses(model.params, self.views, frame, self.settings, s.small_scale)
         visible = [result.max_weight > s.visible_weight for result in looks]
-        return self.changes.behind(masks, model.params["means"].numpy(), visible)
+        return self.changes.behind(frame, masks, model.params["means"].numpy(), visible)
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays, for a checkpoint."""
@@ -262,14 +261,10 @@ class _Fit:
         self.turn = (tracker.pose.turn * self.carriers).requires_grad_()
         self.move = (tracker.pose.move * self.carriers).requires_grad_()
         s = tracker.settings.tracking
-        rates = [(self.turn, s.node_rotation_rate), (self.move, s.node_translation_rate * tracker.radius)]
-        self.optimizer = torch.optim.Adam(
-            [{"params": [p], "base": r} for p, r in rates],
-            betas=(s.node_adam.beta1, s.node_adam.beta2),
-            eps=s.node_adam.eps,
-            fused=True,
-        )
+        self.node_rates = {"rotation": s.node_rotation_rate, "translation": s.node_translation_rate * tracker.radius}
+        self.node_adam = Adam(tracker.views.backend, s.node_adam)
         self.own = Model(tracker.own.params)
+        self.own.start_optimizer(tracker.views.backend, tracker.settings.adam)
         self.pull = Statistics(len(self.own), tracker.settings.keyframe.mse_min)
 
     def _pose(self) -> Pose:
@@ -280,23 +275,21 @@ class _Fit:
         `first_round_rigidity`."""
         t, pose, s = self.t, self._pose(), self.t.settings.tracking
         params, turned = t.carried(self.own, pose)
-        result = compare(params, target, t.settings, self.rng, t.workspace)
+        result = photometric_loss(params, target, t.settings, self.rng, t.views.backend)
         if full:
             self.pull.add(result)
         grads = result.grads
         rigid = (s.first_round_rigidity if stiff else 1.0) * t.settings.rigidity * t.graph.rigidity(pose)
-        for g in self.optimizer.param_groups:
-            g["lr"] = g["base"] * fade
-        self.optimizer.zero_grad()
+        self.turn.grad = self.move.grad = None
         heads, seeds = [params["means"], params["quats"], rigid], [grads["means"], grads["quats"], torch.ones(())]
         torch.autograd.backward(heads, seeds)
-        self.turn.grad *= self.carriers
-        self.move.grad *= self.carriers
-        self.optimizer.step()
+        nodes = {"rotation": self.turn, "translation": self.move}
+        by_nodes = {n: p.grad * self.carriers for n, p in nodes.items()}
+        self.node_adam.step(nodes, by_nodes, {n: r * fade for n, r in self.node_rates.items()})
         back = quat_multiply(quat_conjugate(turned.detach()), grads["quats"])
         fade *= s.first_round_rates if stiff else 1.0
         own = {n: g * self.moving.view(-1, *[1] * (g.dim() - 1)) for n, g in {**grads, "quats": back}.items()}
-        self.own.adam(own, s.rates.scaled(t.radius, fade), t.settings.adam)
+        self.own.step(own, s.rates.scaled(t.radius, fade))
         return result.loss - t.settings.mask_lambda * result.mask
 
     @torch.no_grad()

@@ -18,6 +18,8 @@ from ..atomic_write import read_arrays, write_arrays
 from ..bitstream.quantization import Steps, steps_for, subject_radius
 from ..errors import CaptureError
 from ..model.gaussians import Group
+from ..render.backend import Backend
+from ..render.cpu import CpuBackend
 from ..render.sensitivity import measured_steps
 from .deformation_graph import Pose
 from .finetune import GroupModel, finetune
@@ -26,7 +28,7 @@ from .model import NAMES, Model, from_points
 from .plane_sweep import shell, sweep
 from .settings import TrainSettings
 from .tracking import Tracker
-from .views import Views
+from .views import Views, captured_camera
 from .visual_hull import carve, random_box
 
 
@@ -57,7 +59,7 @@ def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
     i, views = settings.initialization, []
     for camera in cameras:
         v = capture.view(camera, frame)
-        views.append((capture.cameras[camera], v.rgb, v.alpha))
+        views.append((captured_camera(capture, camera, frame), v.rgb, v.alpha))
     known = [c for c, _, _ in views]
     if all(alpha is not None for _, _, alpha in views):
         points, colors = carve(known, views, settings.initial_points, settings.visual_hull)
@@ -161,6 +163,7 @@ def train_groups(
     random_access: int = 0,
     checkpoints: Path | None = None,
     on_progress: Callable[[Progress], None] | None = None,
+    backend: Backend | None = None,
 ) -> Iterator[Group]:
     """Trains `capture` from `first_frame` on and yields each group when it is done.
 
@@ -174,14 +177,16 @@ def train_groups(
         random_access: see `segments`.
         checkpoints: folder for what the next group starts from; None keeps it in memory only.
         on_progress: called after every step.
+        backend: device that renders and optimises; a new CpuBackend if None.
+
+    Torch handles only small tensors here, and its threads compete with those of the native kernels: a caller gains by
+    `torch.set_num_threads(1)`, as the commands do. The number of threads changes sums in their last bits.
 
     Raises:
         CaptureError: a frame cannot be read, or no view overlaps another.
     """
-    # Torch only handles small tensors here; its threads would spin against those of the native kernels.
-    torch.set_num_threads(1)
     store = Checkpoint(checkpoints)
-    run = _Run(capture, settings, on_progress)
+    run = _Run(capture, settings, backend or CpuBackend(), on_progress)
     if not first_frame:
         store.clear()  # what an earlier run with other settings may have left
     state = store.load(first_frame) if first_frame else None  # absent after a cut, too
@@ -196,7 +201,7 @@ def train_groups(
             if start == segment.stop:
                 run.subject = None
             store.save(start, run.subject)
-            yield replace(group, calibration=run.views.calibration())
+            yield replace(group, calibration=run.views.calibration(start - len(group)))
 
 
 def segments(frame_count: int, gop: int, random_access: int) -> list[range]:
@@ -209,9 +214,9 @@ def segments(frame_count: int, gop: int, random_access: int) -> list[range]:
 class _Run:
     """What the groups of one run share. `subject` is None where the next frame needs a keyframe."""
 
-    def __init__(self, capture, settings: TrainSettings, on_progress):
+    def __init__(self, capture, settings: TrainSettings, backend: Backend, on_progress):
         self.capture, self.settings, self.on_progress = capture, settings, on_progress
-        self.views = Views(capture, settings)
+        self.views = Views(capture, settings, backend)
         self.progress = Progress(0, started=time.monotonic())
         self.subject: Subject | None = None
 
@@ -288,9 +293,10 @@ class _Run:
     def _finetuned(self, subject: Subject, frames: range, track: _Track) -> GroupModel:
         quality = self.settings.quality
         if subject.steps is None:
-            middle, cameras = track.models[len(frames) // 2].gaussians(), self.views.train_cameras
-            taken = [self.capture.cameras[i] for i in cameras]
-            subject.steps = measured_steps(middle, quality, steps_for(quality, subject.radius), taken)
+            middle = len(frames) // 2
+            cameras = [captured_camera(self.capture, i, frames[middle]) for i in self.views.train_cameras]
+            nominal, g = steps_for(quality, subject.radius), track.models[middle].gaussians()
+            subject.steps = measured_steps(g, quality, nominal, cameras, backend=self.views.backend)
         graph, steps = subject.tracker.graph, subject.steps
         model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), self.settings)
         on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 from ...errors import UsageError
 from ...model.gaussians import GOP
+from ...render.optimizer import AdamSettings
 from .finetune import EntropyModelSettings, FinetuneSettings, TemporalFrequencies
 from .keyframe import (
     CameraCalibrationSettings,
@@ -19,7 +20,7 @@ from .keyframe import (
     PlaneSweepSettings,
     VisualHullSettings,
 )
-from .optimizer import AdamSettings, LearningRates
+from .learning_rates import LearningRates
 from .tracking import (
     ChangeDetectionSettings,
     DeformationGraphSettings,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from .optimizer import AdamSettings
+from ...render.optimizer import AdamSettings
 
 
 @dataclass(frozen=True)

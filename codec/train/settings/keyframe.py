@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from .optimizer import LearningRates
+from .learning_rates import LearningRates
 
 
 @dataclass(frozen=True)

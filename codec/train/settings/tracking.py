@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from .optimizer import AdamSettings, LearningRates
+from ...render.optimizer import AdamSettings
+from .learning_rates import LearningRates
 
 
 @dataclass(frozen=True)

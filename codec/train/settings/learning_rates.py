@@ -1,17 +1,8 @@
-"""Settings of the optimiser: constants of Adam, and learning rates by attribute."""
+"""Learning rates by attribute."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-
-@dataclass(frozen=True)
-class AdamSettings:
-    """Constants of the optimiser (Kingma and Ba 2015)."""
-
-    beta1: float = 0.9
-    beta2: float = 0.99  # schedules are short: the second moment averages over 100 steps
-    eps: float = 1e-15
 
 
 @dataclass(frozen=True)
