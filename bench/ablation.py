@@ -28,12 +28,7 @@ FRAMES = {LUMBERJACK: (0, 10), STAGE: (7, 15)}  # the ball comes at 10
 
 @dataclass(frozen=True)
 class Variant:
-    """One row of the ablation.
-
-    Attributes:
-        change: settings of the whole recipe -> settings of the variant.
-        captures: the captures that use the tool that is left out.
-    """
+    """A change of the settings, and the captures that use what it takes away."""
 
     change: Callable[[TrainSettings], TrainSettings]
     captures: tuple[str, ...] = (LUMBERJACK, STAGE)
@@ -81,7 +76,9 @@ def _open(capture: str, data: Path | None) -> Capture:
 
 
 def _entry(capture: Capture, name: str, preset: str, quality: float) -> dict:
-    settings = VARIANTS[name].change(train_settings(preset, quality=quality))
+
+    variant = VARIANTS[name]
+    settings = variant.change(train_settings(preset, quality=quality))
     groups, seconds = train.sequence(capture, settings)
     models = train.shown(groups)
     size, decoded, _ = train.coded(capture, groups, settings)

@@ -24,10 +24,12 @@ import numpy as np
 from gscodec.errors import UsageError
 from gscodec.model.camera import Camera
 from gscodec.model.gaussians import Gaussians
+from gscodec.render.backend import PARAMETERS, Crop
+from gscodec.render.cpu import CpuBackend
 from gscodec.render.image import render_image, render_rgba
-from gscodec.render.step import render_loss
-from gscodec.render.workspace import PARAMETERS, Workspace, simd_levels
-from gscodec.train.keyframe import RATES
+from gscodec.render.optimizer import AdamSettings
+from gscodec.render.sensitivity import params_of
+from gscodec.render.workspace import simd_levels
 from gscodec.train.model import from_gaussians
 
 from .machine import write_result
@@ -73,26 +75,29 @@ SCENES = ("capsule", *UP)
 
 def measure(scene: str, gaussians: Gaussians, cam: Camera, simd: str, threads: int, repeats: int) -> dict:
     """One entry of the list."""
-    workspace = Workspace(threads, simd)
-    workspace.forward(tuple(getattr(gaussians, name) for name in PARAMETERS), cam, (0.5, 0.5, 0.5))
-    memory = workspace.memory
+    backend, grey = CpuBackend(threads, simd), (0.5, 0.5, 0.5)
+    backend.render(params_of(gaussians), cam, grey)
+    memory = backend.workspace.memory
     model = from_gaussians(gaussians)
+    model.start_optimizer(backend, AdamSettings())
     covered = render_rgba(gaussians, cam)[..., 3] > 0.02
     noise = np.random.default_rng(0).integers(-9, 9, (cam.height, cam.width, 3)) * covered[..., None]
     rgb = np.clip(render_image(gaussians, cam) + noise, 0, 255).astype(np.uint8)
     mask = covered.astype(np.uint8) * 255
-    rates = {name: RATE for name in ("means", *RATES)}
+    rates = dict.fromkeys(PARAMETERS, RATE)
     parts, steps = [], []
     for adam in (False, True):  # the passes alone, then whole training steps
         begin, count = time.perf_counter(), 0
         while count < repeats + 2 and (count < 7 or time.perf_counter() - begin < BUDGET_S):
             start, count = time.perf_counter(), count + 1
-            result = render_loss(model.params, cam, rgb, mask, (0.5, 0.5, 0.5), 0.2, 0.1, workspace)
+            result = backend.photometric_loss(
+                model.params, [Crop(cam, rgb, mask, grey)], ssim_lambda=0.2, mask_lambda=0.1
+            )
             if adam:
-                model.adam(result.grads, rates)
+                model.step(result.grads, rates)
                 steps.append(1e3 * (time.perf_counter() - start))
             else:
-                t = workspace.timings
+                t = backend.workspace.timings
                 parts.append((t["project"] + t["bin"], t["blend"], t["backward_tiles"] + t["backward_project"]))
     project, forward, backward = np.median(parts[2:], axis=0)
     return {

@@ -37,7 +37,8 @@ def rows(capture, weight: float) -> list[dict]:
     group = next(train_groups(capture, settings))
     model = from_gaussians(group.frames[0])
     steps = steps_for(QUALITY, subject_radius(group.frames[0].means))
-    estimated = CanonicalRate(model.params["means"], steps).bits(model.params, torch.Generator().manual_seed(0))
+    rate = CanonicalRate(model.params["means"], steps, settings.entropy_model)
+    estimated = rate.bits(model.params, torch.Generator().manual_seed(0))
     cameras = [capture.cameras[i] for i in capture.indices("train")]
     integers = group_integers(group, QUALITY, cameras=cameras)
     count = len(integers["positions"])

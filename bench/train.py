@@ -209,16 +209,18 @@ def every_frame_alone(capture: Capture, frames: range, settings) -> tuple[list[G
     import torch
 
     from gscodec.bitstream.quantization import subject_radius
+    from gscodec.render.cpu import CpuBackend
     from gscodec.train.keyframe import train_keyframe
     from gscodec.train.train import initial_model
     from gscodec.train.views import Views
 
-    torch.set_num_threads(1)
+    torch.set_num_threads(1)  # as the commands do
     models, start = [], time.perf_counter()
     for frame in frames:
         model = initial_model(capture, frame, settings)
         radius = subject_radius(model.params["means"].numpy())
-        train_keyframe(model, Views(capture, 0), frame, settings, steps=settings.keyframe_steps, radius=radius)
+        views = Views(capture, settings, CpuBackend())
+        train_keyframe(model, views, frame, settings, steps=settings.keyframe_steps, radius=radius)
         models.append(model.gaussians())
     return models, time.perf_counter() - start
 

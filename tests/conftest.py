@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch, before it is imported: as the commands limit it
+
 
 @pytest.fixture(scope="session")
 def gsv(tmp_path_factory) -> Path:

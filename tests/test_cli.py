@@ -11,7 +11,7 @@ from synthetic import turning
 
 from gscodec.commands import checkout
 from gscodec.errors import UsageError
-from gscodec.model.gaussian_sequence import GaussianSequence, DenseGroup
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.splats import write_sequence
 
 

@@ -1,6 +1,7 @@
 """Training on tiny captures with known truth: carving, keyframe, motion, rate term, checkpoints."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -18,10 +19,11 @@ from gscodec.metrics.image import psnr
 from gscodec.model.camera import Camera, look_at
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.model.gaussians import concatenate
+from gscodec.model.rotations import quat_to_matrix, rotvec_to_quat
 from gscodec.render.image import render_image, render_rgba
 from gscodec.train.calibration import Extrinsics
 from gscodec.train.change_detection import Changes
-from gscodec.train.deformation_graph import NodeGraph, Pose, quat_to_matrix, rotvec_to_quat
+from gscodec.train.deformation_graph import NodeGraph, Pose
 from gscodec.train.entropy_model import CanonicalRate, laplace_bits
 from gscodec.train.finetune import GroupModel
 from gscodec.train.keyframe import Statistics, grow, prune, train_keyframe
@@ -39,6 +41,7 @@ SIZE = 64
 TINY = TrainSettings(
     gop=3, keyframe_steps=150, motion_steps=60, finetune_steps=10, gaussians_max=600, initial_points=300
 )
+FEW_NODES = dataclasses.replace(TINY.graph, nodes=32)
 
 
 def rig(count=10):
@@ -89,7 +92,7 @@ def test_axes_meet_where_the_cameras_look():
 
 def test_hull_lies_on_the_subject(capture):
     views = [(c, capture.view(i, 0).rgb, capture.view(i, 0).alpha) for i, c in enumerate(capture.cameras)]
-    points, colors = carve(capture.cameras, views, 500)
+    points, colors = carve(capture.cameras, views, 500, TINY.visual_hull)
     assert 300 < len(points) < 800
     distance = np.linalg.norm(points, axis=1)
     assert np.median(distance) == pytest.approx(1.1, abs=0.2), "a sphere of radius 1, and the width of its Gaussians"
@@ -121,10 +124,10 @@ def test_sweep_finds_a_textured_wall():
     """A wall y = 0 of coloured splats, seen from an arc in front of it: the points lie on it, the shell far behind."""
     wall, cameras = splat_wall(), arc()
     views = [(c, render_image(wall, c, (0, 0, 0)), None) for c in cameras]
-    points, colors = sweep(views, 1000, 0)
+    points, colors = sweep(views, 1000, 0, TINY.plane_sweep)
     assert len(points) == len(colors) == 1000
     assert (np.abs(points[:, 1]) < 0.22).mean() > 0.9, "a plane and a half: they are 0.15 apart there"
-    behind, _ = shell(views)
+    behind, _ = shell(views, TINY.plane_sweep)
     assert len(behind) > 5
     assert (behind[:, 1] > 8).all()
 
@@ -151,7 +154,13 @@ def test_keyframe_learns_a_view_it_has_not_seen(masks):
     radius = subject_radius(model.params["means"].numpy())
     losses = []
     train_keyframe(
-        model, Views(capture, 0), 0, settings, steps=200, radius=radius, on_step=lambda _, loss: losses.append(loss)
+        model,
+        Views(capture, settings, CpuBackend()),
+        0,
+        settings,
+        steps=200,
+        radius=radius,
+        on_step=lambda _, loss: losses.append(loss),
     )
     assert np.mean(losses[-20:]) < 0.6 * np.mean(losses[:20])
     assert len(model) <= settings.gaussians_max
@@ -169,7 +178,7 @@ def test_exposure_of_each_camera_is_found(darkest):
         view = capture.read(camera, frame)
         return dataclasses.replace(view, rgb=np.rint(gains[camera] * view.rgb).astype(np.uint8))
 
-    views, model = Views(dataclasses.replace(capture, read=dimmed), 0), initial_model(capture, 0, TINY)
+    views, model = Views(dataclasses.replace(capture, read=dimmed), TINY, CpuBackend()), initial_model(capture, 0, TINY)
     train_keyframe(model, views, 0, TINY, steps=600, radius=1.0)
     true = np.log(gains[:-1]) - np.log(gains[:-1]).mean()
     np.testing.assert_allclose(views.exposure.values[:-1], true[:, None] + np.zeros(3), atol=0.04)
@@ -183,10 +192,14 @@ def test_exposure_of_each_camera_is_found(darkest):
 def test_pose_of_each_camera_is_found(wrong):
     """Up to what all cameras share; right ones stay as they are."""
     capture = capture_of(turning(300, frames=1))
-    told, trained = Extrinsics(len(capture.cameras), list(range(len(capture.cameras) - 1))), slice(0, -1)
-    told.values[trained] = np.random.default_rng(3).uniform(-wrong, wrong, (len(capture.cameras) - 1, 6))
+    count = len(capture.cameras)
+    told, trained = Extrinsics(count, list(range(count - 1)), TINY, CpuBackend()), slice(0, -1)
+    told.values[trained] = np.random.default_rng(3).uniform(-wrong, wrong, (count - 1, 6))
     cameras = [told.camera(i, c) for i, c in enumerate(capture.cameras)]
-    views, model = Views(dataclasses.replace(capture, cameras=cameras), 0), initial_model(capture, 0, TINY)
+    views, model = (
+        Views(dataclasses.replace(capture, cameras=cameras), TINY, CpuBackend()),
+        initial_model(capture, 0, TINY),
+    )
     train_keyframe(model, views, 0, TINY, steps=400, radius=1.0)
     left = views.extrinsics.values[trained] + told.values[trained] - told.values[trained].mean(0)
     assert np.sqrt(np.mean(left**2)) <= 0.5 * np.sqrt(np.mean(told.values[trained] ** 2))
@@ -217,7 +230,7 @@ def test_harmonics_stay_where_colours_depend_on_the_view(gloss, kept):
 def test_tracking_finds_the_turn(capture):
     truth = turning(300, frames=5)
     key = from_gaussians(truth.frame(0))
-    views = Views(capture, 0)
+    views = Views(capture, TINY, CpuBackend())
     tracker = Tracker.start(key, views, TINY, 0.01, range(3))
     models, poses = [tracker.model], [tracker.pose]
     for frame in (1, 2):
@@ -229,7 +242,9 @@ def test_tracking_finds_the_turn(capture):
     assert missed < 0.25 * still, (missed, still)
     angle = 2 * np.arccos(np.abs(tracker.pose.turned[:, 0].numpy()).clip(0, 1))
     assert np.median(angle) == pytest.approx(0.2, abs=0.08), "0.1 rad a frame"
-    group = GroupModel(tracker.graph, None, models, poses, steps_for(50, 1.0), torch.ones(len(key), dtype=torch.bool))
+    group = GroupModel(
+        tracker.graph, None, models, poses, steps_for(50, 1.0), torch.ones(len(key), dtype=torch.bool), TINY
+    )
     assert psnr_of(group.gaussians(2), capture, 2) > psnr_of(truth.frame(0), capture, 2) + 4
     carried = np.abs(truth.frame(2).means - group.means[2].numpy()).mean()
     assert carried < 0.3 * still, "the nodes have found it, not the Gaussians each for itself"
@@ -237,7 +252,7 @@ def test_tracking_finds_the_turn(capture):
 
 def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
     x = torch.from_numpy(blob(200).means)
-    graph = NodeGraph.of(x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), count=32)
+    graph = NodeGraph.of(x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), FEW_NODES)
     turn = rotvec_to_quat(torch.tensor([[0.3, -0.2, 0.5]])).repeat(len(graph), 1)
     R = quat_to_matrix(turn)
     nodes = torch.einsum("nij,nj->ni", R, graph.nodes) + 1
@@ -253,7 +268,7 @@ def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
 def test_newcomers_have_nodes_of_their_own_that_change_nothing_for_others():
     x = torch.from_numpy(blob(200).means)
     young = 0.2 * torch.from_numpy(blob(60, seed=1).means) + torch.tensor([0.9, 0, 0])  # amid the others
-    graph = NodeGraph.of(x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), count=32)
+    graph = NodeGraph.of(x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), FEW_NODES)
     pose = dataclasses.replace(Pose.rest(graph), nodes=1.1 * graph.nodes)
     before, known = graph.carry(x, pose)[0], len(graph)
     shift = graph.settle(young)
@@ -264,7 +279,7 @@ def test_newcomers_have_nodes_of_their_own_that_change_nothing_for_others():
     means, _ = graph.carry(graph.means, pose)
     np.testing.assert_array_equal(means[:200], before)
     np.testing.assert_allclose(means[200:], young + 3, atol=1e-5)
-    again = NodeGraph.restored(graph.state())
+    again = NodeGraph.restored(graph.state(), FEW_NODES)
     np.testing.assert_array_equal(again.carry(again.means, pose)[0], means)
 
 
@@ -275,20 +290,20 @@ def test_what_jumps_is_found_and_what_is_gone_is_not():
     frames, cameras = [concatenate([wall, at(-0.5)]), concatenate([wall, at(0.5)]), wall], arc()
     read = lambda camera, t: View(render_image(frames[t], cameras[camera], (0, 0, 0)), None)  # noqa: E731
     capture = Capture("patch", 25.0, cameras, 3, False, read)
-    views, model, some = Views(capture, 0), from_gaussians(frames[0]), torch.arange(3800) >= 3000
-    changes = Changes.since(views, 0)
-    shift = whereabouts(model, some, 1, views, changes, changes.advance(1))
+    views, model, some = Views(capture, TINY, CpuBackend()), from_gaussians(frames[0]), torch.arange(3800) >= 3000
+    changes = Changes.since(views, 0, TINY.change_detection)
+    shift = whereabouts(model, some, 1, changes, changes.advance(1), TINY)
     np.testing.assert_allclose(shift, [1, 0, 0], atol=0.25)
-    assert whereabouts(model, some, 2, views, changes, changes.advance(2)) is None
+    assert whereabouts(model, some, 2, changes, changes.advance(2), TINY) is None
 
 
 def test_a_longer_group_has_more_temporal_frequencies():
     key = from_gaussians(blob(50))
     everything = torch.ones(50, dtype=torch.bool)
-    graph = NodeGraph.of(key.params["means"], torch.ones(50), 1.0, everything, count=8)
+    graph = NodeGraph.of(key.params["means"], torch.ones(50), 1.0, everything, dataclasses.replace(FEW_NODES, nodes=8))
     for frames, means, colours in ((4, 4, 4), (20, 10, 6), (30, 15, 9), (31, 16, 10)):
         poses = [Pose.rest(graph)] * frames
-        group = GroupModel(graph, None, [key] * frames, poses, steps_for(50, 1.0), everything)
+        group = GroupModel(graph, None, [key] * frames, poses, steps_for(50, 1.0), everything, TINY)
         assert len(group.coefficients["means"]) == means
         assert len(group.coefficients["sh0"]) == colours
 
@@ -300,15 +315,15 @@ def test_masks_say_where_nothing_is():
         for g, x in ((blob(100), -0.7), (blob(100, seed=1), 0.7))
     )
     whole, none = concatenate([left, right]), left.take(np.zeros(0, int))
-    capture = capture_of(GaussianSequence(25.0, [DenseGroup([g]) for g in (whole, left, none, none)]))
-    tracker = Tracker.start(from_gaussians(whole), Views(capture, 0), TINY, 0.01, range(4))
+    capture = capture_of(GaussianSequence(25.0, [Group([g]) for g in (whole, left, none, none)]))
+    tracker = Tracker.start(from_gaussians(whole), Views(capture, TINY, CpuBackend()), TINY, 0.01, range(4))
     models, poses = [tracker.model], [tracker.pose]
     for frame in (1, 2, 3):
         loss = tracker.advance(frame)
         models.append(tracker.model)
         poses.append(tracker.pose)
     assert loss is None
-    group = GroupModel(tracker.graph, None, models, poses, steps_for(50, 1.0), torch.zeros(200, dtype=torch.bool))
+    group = GroupModel(tracker.graph, None, models, poses, steps_for(50, 1.0), torch.zeros(200, dtype=torch.bool), TINY)
     shown = [len(group.group(None).visible(t)) for t in range(4)]
     assert shown[0] == 200
     assert 80 < shown[1] < 120
@@ -369,13 +384,15 @@ def test_rate_term_tracks_the_coders_bits():
 def test_canonical_rate_is_what_the_coder_pays_and_falls_along_its_gradient():
     """Estimated and coded bits of each attribute; coded bits after a descent on nothing but the rate."""
     model, steps = from_gaussians(blob(3000, sh_count=3)), steps_for(62, 1.0)
-    rate, noise = CanonicalRate(model.params["means"], steps), torch.Generator().manual_seed(0)
+    rate, noise = CanonicalRate(model.params["means"], steps, TINY.entropy_model), torch.Generator().manual_seed(0)
     names = ("quats", "log_scales", "logit_opacities", "sh0", "shN")
     estimated, before = rate.bits(model.params, noise), coded_bits(rate, model, 62)
     for name in names:
         assert estimated[name].item() == pytest.approx(before[name], rel=0.15), name
+    model.start_optimizer(CpuBackend(), TINY.adam)
     for _ in range(60):
-        model.adam(rate.gradients(model.params, noise)[1], {n: 0.1 * getattr(steps, n) for n in names})
+        rates = {n: 0.1 * getattr(steps, n) for n in names}
+        model.step(rate.gradients(model.params, noise)[1], rates)
     after = coded_bits(rate, model, 62)
     for name in names:
         assert after[name] < 0.97 * before[name], name
@@ -383,7 +400,7 @@ def test_canonical_rate_is_what_the_coder_pays_and_falls_along_its_gradient():
 
 def test_rate_of_one_gaussian_is_finite():
     model = from_gaussians(blob(1))
-    rate = CanonicalRate(model.params["means"], steps_for(50, 1.0))
+    rate = CanonicalRate(model.params["means"], steps_for(50, 1.0), TINY.entropy_model)
     _, grads = rate.gradients(model.params, torch.Generator().manual_seed(0))
     assert all(torch.isfinite(g).all() for g in grads.values())
 
@@ -400,21 +417,23 @@ def coded_bits(rate, model, quality):
 
 def test_growing_and_pruning_keep_the_moments_in_step():
     model = from_gaussians(blob(100))
-    stats = Statistics(100)
+    model.start_optimizer(CpuBackend(), TINY.adam)
+    model.step({n: torch.ones_like(p) for n, p in model.params.items()}, dict.fromkeys(model.params, 0.0))
+    stats = Statistics(100, 1e-8)
     stats.pull += torch.linspace(0, 1, 100)
     stats.seen += 1
     stats.weight += 0.5
-    grow(model, stats, 105, 1.0, np.random.default_rng(0))
+    grow(model, stats, 105, np.random.default_rng(0), TINY.keyframe)
     assert len(model) == 105, "no more than the most that is allowed"
     model.params["logit_opacities"][:10] = -9
-    prune(model, Statistics(len(model)))
+    prune(model, Statistics(len(model), 1e-8), TINY.keyframe)
     assert len(model) == 95
-    stats = Statistics(95)
+    stats = Statistics(95, 1e-8)
     stats.weight += 0.5
     stats.pulse[:90] = 1
-    prune(model, stats, thin=True)
+    prune(model, stats, TINY.keyframe, thin=True)
     assert len(model) == 90, "what changes nothing in the picture is not worth its bits"
-    model.adam({n: torch.ones_like(p) for n, p in model.params.items()}, {"means": 0.1})
+    model.step({n: torch.ones_like(p) for n, p in model.params.items()}, {"means": 0.1})
     assert torch.isfinite(model.params["means"]).all()
 
 
@@ -448,6 +467,12 @@ def test_segments_are_trained_without_a_look_at_others(capture):
     (alone,) = train_segment(lambda: capture, settings, 3, range(3, 5))
     np.testing.assert_array_equal(alone.frames[1].means, whole[2].frames[1].means)
     np.testing.assert_array_equal(alone.nodes.translations, whole[2].nodes.translations)
+
+
+def test_settings_are_the_same_from_json():
+    """The fingerprint of a run, by which it is resumed, is JSON."""
+    stored = dataclasses.asdict(TINY)
+    assert json.loads(json.dumps(stored)) == stored
 
 
 def test_what_cannot_be_trained_is_said():

@@ -18,13 +18,13 @@ import numpy as np
 import torch
 
 from gscodec.bitstream.quantization import subject_radius
-from gscodec.render.workspace import Workspace
-from gscodec.train.deformation_graph import quat_multiply, rotvec_to_quat
-from gscodec.train.keyframe import RATES, train_keyframe
+from gscodec.model.rotations import quat_multiply, rotvec_to_quat
+from gscodec.render.cpu import CpuBackend
+from gscodec.train.keyframe import train_keyframe
 from gscodec.train.model import Model
 from gscodec.train.settings import TrainSettings
 from gscodec.train.train import initial_model
-from gscodec.train.views import Views, compare
+from gscodec.train.views import Views, photometric_loss
 
 from .hashgrid import HashGrid
 
@@ -54,9 +54,9 @@ class MotionField(torch.nn.Module):
 
 
 def train_v3(capture, frames: range, settings: TrainSettings) -> list:
-    """Gaussians of each frame: a keyframe for the first, the others each from the one before."""
-    settings = replace(settings, sh_degree=0)  # the most that its packing has
-    views = Views(capture, settings.seed)
+    """Gaussians of each frame: a keyframe for the first, then one frame from the other."""
+    settings = replace(settings, sh_degree=0)  # its packing has no more
+    views = Views(capture, settings, CpuBackend())
     model = initial_model(capture, frames[0], settings)
     radius = subject_radius(model.params["means"].numpy())
     train_keyframe(model, views, frames[0], settings, steps=settings.keyframe_steps, radius=radius)
@@ -71,7 +71,7 @@ def train_v3(capture, frames: range, settings: TrainSettings) -> list:
 
 
 def _moved(model: Model, field: MotionField, views: Views, frame: int, settings: TrainSettings, radius: float) -> Model:
-    workspace, rng = Workspace(), np.random.default_rng([settings.seed, frame, 3])
+    rng = np.random.default_rng([settings.seed, frame, 3])
     p = model.params
     low, high = p["means"].min(0).values, p["means"].max(0).values
     unit = (p["means"] - low) / (high - low).max().clamp(min=1e-9)
@@ -86,7 +86,8 @@ def _moved(model: Model, field: MotionField, views: Views, frame: int, settings:
         quats = quat_multiply(rotvec_to_quat(turn), p["quats"])
         if step == STEPS[0]:
             return Model({**p, "means": means, "quats": quats})
-        grads = compare({**p, "means": means, "quats": quats}, views.draw(frame), settings, rng, workspace).grads
+        moved = {**p, "means": means, "quats": quats}
+        grads = photometric_loss(moved, views.draw(frame), settings, rng, views.backend).grads
         for g in optimizer.param_groups:
             g["lr"] = g["base"] * 0.1 ** (step / STEPS[0])
         optimizer.zero_grad()
@@ -95,8 +96,10 @@ def _moved(model: Model, field: MotionField, views: Views, frame: int, settings:
 
 
 def _fine(model: Model, views: Views, frame: int, settings: TrainSettings, radius: float) -> None:
-    workspace, rng = Workspace(), np.random.default_rng([settings.seed, frame, 4])
+    rng = np.random.default_rng([settings.seed, frame, 4])
+    model.start_optimizer(views.backend, settings.adam)
     for step in range(STEPS[1]):
         fade = 0.1 ** (step / STEPS[1])
-        grads = compare(model.params, views.draw(frame), settings, rng, workspace).grads
-        model.adam(grads, {"means": MEANS_RATE * radius * fade, **{n: FINE_SHARE * r * fade for n, r in RATES.items()}})
+        grads = photometric_loss(model.params, views.draw(frame), settings, rng, views.backend).grads
+        rates = settings.keyframe.rates.scaled(radius, FINE_SHARE * fade)
+        model.step(grads, {**rates, "means": MEANS_RATE * radius * fade})

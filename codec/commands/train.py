@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ..atomic_write import part_file
 from ..errors import require
+from ..fingerprint import inputs, program, sentence
 from ..model.gaussians import GOP
 from ..progress import Bar
 from .inputs import open_frames
 from .options import Frames, Gop, Preset, Quality, RandomAccess, stdout
+
+if TYPE_CHECKING:
+    from .sources import TrainOptions
 
 
 def train(
@@ -27,41 +32,45 @@ def train(
     quality: Quality = 50.0,
 ) -> None:
     """Capture to one .ply per frame, the first half of encode."""
+    from .sources import TrainOptions
+
     with Bar() as bar:
-        options = {"preset": preset, "frames": frames, "gop": gop, "random_access": random_access, "quality": quality}
-        count = train_to_folder(capture, folder, **options, bar=bar)
+        options = TrainOptions(preset, frames, gop)
+        count = train_to_folder(capture, folder, options, random_access=random_access, quality=quality, bar=bar)
     stdout.print(f"{folder}: {count} frames")
 
 
 def train_to_folder(
-    source: Path,
-    folder: Path,
-    *,
-    preset: str,
-    frames: str | None,
-    gop: int,
-    random_access: int,
-    quality: float,
-    bar: Bar,
+    source: Path, folder: Path, options: TrainOptions, *, random_access: int, quality: float, bar: Bar
 ) -> int:
-    """Trains a capture and writes one .ply per frame and sequence.json; returns the number of frames.
+    """Trains a capture and writes one .ply per frame and sequence.json, from which `encode` makes the bytes that it
+    would make of the capture; returns the number of frames.
 
-    What an earlier run with the same settings left unfinished goes on where it stopped.
+    A second run with the same program, capture and settings goes on where the first one stopped.
     """
     require("torch", "training a capture")
     from ..splats import SequenceWriter
     from ..train.settings import train_settings
     from ..train.train import Checkpoint, train_groups
+    from .sources import limit_torch_threads
 
-    capture = open_frames(source, frames)
-    recipe = train_settings(preset, gop=gop, quality=quality)
+    limit_torch_threads()
+    capture = open_frames(source, options.frames)
+    recipe = train_settings(options.preset, gop=options.gop, quality=quality)
     work, unfinished = folder / "work", folder / "unfinished.json"
-    facts = {"input": str(source.resolve()), "frames": frames, "random_access": random_access}
-    made_by = json.dumps(facts | asdict(recipe))
-    same = unfinished.is_file() and unfinished.read_text() == made_by
-    writer = SequenceWriter(folder, capture.fps, capture.cameras, resume=same)
+    settings = {"frames": options.frames, "random_access": random_access, "training": asdict(recipe)}
+    made_by = {"program": program(), "input": inputs(source), "settings": settings}
+    training = {
+        "capture": str(source.resolve()),
+        "range": options.frames,
+        "sh_degree": recipe.sh_degree,
+        "gaussians": recipe.gaussians_max,
+        "frames": options.gop,
+    }
+    same = _goes_on(unfinished, made_by)
+    writer = SequenceWriter(folder, capture.fps, capture.cameras, training=training, resume=same)
     with part_file(unfinished) as part:
-        part.write_text(made_by)
+        part.write_text(json.dumps(made_by))
     groups = train_groups(
         capture,
         recipe,
@@ -75,3 +84,13 @@ def train_to_folder(
     unfinished.unlink()
     Checkpoint(work).clear()
     return writer.frame_count
+
+
+def _goes_on(unfinished: Path, made_by: dict) -> bool:
+    """Whether an unfinished run was made by the same; a warning says what has changed."""
+    if not unfinished.is_file():
+        return False
+    before, now = json.loads(unfinished.read_text()), json.loads(json.dumps(made_by))
+    if before != now:
+        warnings.warn(f"{unfinished.parent} is trained anew: {sentence(before, now)}", stacklevel=2)
+    return before == now

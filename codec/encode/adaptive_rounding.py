@@ -2,14 +2,14 @@
 more than their bits cost.
 
 Rounding each value on its own leaves errors that another value could make up for. The decoded frame is drawn and
-compared with a target picture; the gradient of the squared difference moves the latent under each integer, straight through the
-rounding (Bengio et al. 2013). Integers that others are decoded from stay: positions, nodes, rotations. Of a single
+compared with a target picture; the gradient of the squared difference moves the latent under each integer, straight
+through the rounding (Bengio et al. 2013). Integers that others are decoded from stay: positions, nodes, rotations. Of a single
 frame, sizes move too, and its rotations are coded again; of a predicted group, only trajectories move.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cached_property
 
@@ -18,8 +18,8 @@ import numpy as np
 from .. import _native
 from ..bitstream.color import correlate, decorrelate
 from ..model.gaussians import Gaussians
+from ..render.optimizer import Adam
 from ..render.sensitivity import derivatives
-from ..render.workspace import Workspace
 from ..threads import prefetched
 from .quantize import Quantized, ReferenceGroup, with_rotations
 from .refinement_views import Target
@@ -71,12 +71,16 @@ class AdaptiveRounding:
             targets: `count` of them: (frame, camera, background, picture [H, W, 3] f32, 0 to 1).
             rate: quantization steps that the first target moves a latent; it falls to 0 linearly.
         """
-        workspace, names = Workspace(), {v.attribute for v in self._variables}
-        for step, (t, camera, background, picture) in enumerate(prefetched(targets), 1):
+        backend, names = CpuBackend(), {v.attribute for v in self._variables}
+        adam = Adam(backend, self._settings.rounding.adam)
+        for step, (t, camera, background, picture) in enumerate(prefetched(targets)):
             off = lambda image, picture=picture: np.ascontiguousarray(image - picture)  # noqa: E731
-            derivative = derivatives(workspace, self.frame(t), camera, off, names, background)
+            derivative = derivatives(backend, self.frame(t), camera, off, names, background)
+            grads = [v.by_integers(derivative[v.attribute], t) for v in self._variables]
+            latents = {k: v.latents.values for k, v in enumerate(self._variables)}
+            adam.step(latents, dict(enumerate(grads)), dict.fromkeys(latents, rate * (1 - step / count)))
             for v in self._variables:
-                v.follow(v.by_integers(derivative[v.attribute], t), rate * (1 - (step - 1) / count), step)
+                v.latents.round()
 
     def frame(self, t: int) -> Gaussians:
         """Frame `t` as decoded with the integers as they are now."""
@@ -113,9 +117,6 @@ class AdaptiveRounding:
             return g
         shown = (life[:, 0] <= t) & (t < life[:, 1])
         return replace(g, logit_opacities=np.where(shown, g.logit_opacities, np.float32(HIDDEN)))
-
-
-Refine = Callable[[AdaptiveRounding], None]
 
 
 def _coded_values(g: Gaussians) -> dict[str, np.ndarray]:

@@ -6,7 +6,7 @@ groups since came from; it is returned with each group and never changed, so tha
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -29,6 +29,7 @@ from .settings import EncodeSettings
 
 # Refines a group that begins at a frame of the capture by the pictures that it was trained on.
 RefineByPictures = Callable[[ParametricGroup, int, AdaptiveRounding], None]
+CamerasAt = Callable[[int], Sequence[Camera]]  # frame of the stream -> cameras from which the subject was captured
 
 
 @dataclass(frozen=True)
@@ -131,18 +132,18 @@ class GroupCoder:
     Attributes:
         settings: of the encoder.
         fps: frames a second of the stream.
-        cameras: of the capture, if there was one; sensitivity is measured from them too.
+        cameras: of the capture at a frame, if there was one; sensitivity is measured from them too.
         refine_by_pictures: of a capture, if its pictures can be had.
     """
 
     settings: EncodeSettings
     fps: float = 30.0
-    cameras: tuple[Camera, ...] = ()
+    cameras: CamerasAt = lambda _: ()
     refine_by_pictures: RefineByPictures | None = None
 
-    def measure(self, group: ParametricGroup) -> Importance:
+    def measure(self, group: ParametricGroup, first_frame: int) -> Importance:
         """What `code` needs of a group at any quality."""
-        return measure_group(group, list(self.cameras), self.settings.plan)
+        return measure_group(group, list(self.cameras(first_frame + len(group) // 2)), self.settings.plan)
 
     def code(
         self, state: CoderState | None, group: ParametricGroup, importance: Importance, quality: float, first_frame: int
@@ -189,11 +190,11 @@ class GroupCoder:
         if self.refine_by_pictures is not None and group.calibration is not None:
             self.refine_by_pictures(group, first_frame, rounding)
             return rounding.quantized()
-        views = self._drawn_views(group)
+        views, middle = self._drawn_views(group), len(group) // 2
         if not views:
             return quantized
         form, rate = quantized.form, self.settings.rounding.drawn_rate / views**0.5
-        cameras = sensitivity_cameras(form.means[form.frames // 2], list(self.cameras), views)
+        cameras = sensitivity_cameras(form.means[middle], list(self.cameras(first_frame + middle)), views)
         rounding.follow(drawn_views(rounding.source, cameras, form.frames), views, rate)
         return rounding.quantized()
 

@@ -7,7 +7,7 @@ run that stops goes on where it stopped, to the same bytes.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,7 +16,7 @@ import numpy as np
 from ..bitstream.levels import smallest_level
 from ..model.camera import Camera
 from ..model.parametric_group import ParametricGroup
-from .coder import CodedGroup, CoderState, GroupCoder, RefineByPictures
+from .coder import CamerasAt, CodedGroup, CoderState, GroupCoder, RefineByPictures
 from .rate_control import code_at_rate
 from .settings import EncodeSettings
 from .writer import StreamWriter
@@ -102,7 +102,7 @@ def encode_groups(
     output: StreamOutput,
     settings: EncodeSettings,
     *,
-    cameras: Sequence[Camera] = (),
+    cameras: CamerasAt = lambda _: (),
     refine_by_pictures: RefineByPictures | None = None,
     on_group: Callable[[EncodeReport], None] | None = None,
 ) -> EncodeReport:
@@ -110,15 +110,14 @@ def encode_groups(
     frames, that an earlier run left in the file.
 
     Args:
-        cameras: from which the subject was captured, if known: sensitivity is measured from those for training.
+        cameras: frame -> cameras for training, from which the subject was captured: sensitivity is measured from them.
         refine_by_pictures: (group, first frame, quantizer) of a capture: the last stage of training, for groups that
             have a calibration.
 
     Ctrl-C finishes the file with the groups done and returns with `interrupted` set; the next run goes on.
     """
     writer = StreamWriter(output.path, output.config, output.fingerprint)
-    trained = tuple(c for c in cameras if c.split == "train")
-    coder = GroupCoder(settings, float(output.config["fps"]), trained, refine_by_pictures)
+    coder = GroupCoder(settings, float(output.config["fps"]), cameras, refine_by_pictures)
     report = EncodeReport(seconds={"input": 0.0, "code": 0.0})
     try:
         _code_all(groups(writer.groups, writer.frames), coder, writer, report, on_group)
@@ -146,7 +145,7 @@ def _code_all(groups: Iterable[ParametricGroup], coder: GroupCoder, writer: Stre
         if coder.settings.bitrate:
             coded, state, quality = code_at_rate(coder, state, group, (writer.frames, writer.bytes, quality))
         else:
-            coded, state = coder.code(state, group, coder.measure(group), quality, writer.frames)
+            coded, state = coder.code(state, group, coder.measure(group, writer.frames), quality, writer.frames)
         report.seconds["code"] += clock() - mark
         kept = {"quality": np.array(quality)} | (state.to_arrays() if state else {})
         writer.append(coded.payload, len(group), sync=coded.independent, state=kept)

@@ -203,8 +203,8 @@ def _residual_coefficients(form: CodedForm, integers: QuantizedGroup, plan: Plan
 
 
 def _quantize_nodes(form: CodedForm, positions: np.ndarray, plan: Plan, settings: RdoSettings) -> QuantizedNodes:
-    """The nodes of a group whose Gaussians rest at `positions` [N, 3] u32. Rotations first; translations then make up for
-    the rounding of the rotations, one solution for all frames and axes."""
+    """The nodes of a group whose Gaussians rest at `positions` [N, 3] u32. Rotations first; translations then make up
+    for the rounding of the rotations, one solution for all frames and axes."""
     from scipy.spatial import cKDTree
 
     nodes, grid, price, frames = form.nodes, plan.parameters.grid, plan.price, form.frames

@@ -28,7 +28,7 @@ def code_at_rate(
     frames, size, quality = start
     s, per_frame = coder.settings.rate_control, coder.settings.bitrate / 8 / coder.fps
     budget = max(per_frame * (frames + len(group)) - size, s.least_budget * per_frame * len(group))
-    importance, tried = coder.measure(group), []  # of (distance, quality, log of size over budget, result)
+    importance, tried = coder.measure(group, frames), []  # of (distance, quality, log of size over budget, result)
     while len(tried) < s.tries:
         result = coder.code(state, group, importance, quality, frames)
         off = math.log(len(result[0].payload) / budget)

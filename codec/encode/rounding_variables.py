@@ -20,30 +20,25 @@ class Latents:
         thresholds: how much farther than half a step above, and below, an integer still is the better one.
 
     Attributes:
+        values: the latents, f32; an optimiser moves them in place.
         change: of the integers since the start: -1, 0 or 1.
     """
 
     def __init__(self, latents: np.ndarray, integers: np.ndarray, thresholds: tuple, settings: RoundingSettings):
         up, down = thresholds
-        self.integers, self._thresholds, self._settings = integers, thresholds, settings
+        self.integers, self._thresholds = integers, thresholds
         low, high = integers - 0.5 - down + settings.inside, integers + 0.5 + up - settings.inside
-        self._latents = np.clip(latents, low, high).astype(np.float32)
-        self._first, self._second = (np.zeros_like(self._latents) for _ in range(2))
-        self.change = np.zeros(self._latents.shape, np.int8)
+        self.values = np.ascontiguousarray(np.clip(latents, low, high), np.float32)
+        self.change = np.zeros(self.values.shape, np.int8)
 
     @property
     def now(self) -> np.ndarray:
         """The integers as they are now."""
         return self.integers + self.change
 
-    def follow(self, derivative: np.ndarray, rate: float, step: int) -> None:
-        """Adam's `step` (from 1) along the derivative by the integers."""
-        (b1, b2), epsilon = self._settings.betas, self._settings.epsilon
-        self._first += (1 - b1) * (derivative - self._first)
-        self._second += (1 - b2) * (derivative * derivative - self._second)
-        size = np.sqrt(self._second / (1 - b2**step)) + epsilon
-        self._latents -= rate * self._first / (1 - b1**step) / size
-        off, (up, down) = self._latents - self.integers, self._thresholds
+    def round(self) -> None:
+        """Sets `change` from the latents as they are now."""
+        off, (up, down) = self.values - self.integers, self._thresholds
         self.change = (off > 0.5 + up).astype(np.int8) - (-off > 0.5 + down)
 
 
@@ -71,11 +66,11 @@ class CanonicalVariable:
             for c in range(q.shape[1]):
                 found = rdo.decision_thresholds(q[own, c], weights[own, c], near, plan.price, settings.rdo)
                 thresholds[:, own, c] = found
-        self._latents = Latents((wanted - self._offset) / self._step, q, thresholds, settings.rounding)
+        self.latents = Latents((wanted - self._offset) / self._step, q, thresholds, settings.rounding)
         self._before = self._values()
 
     def _coded(self) -> np.ndarray:
-        return self._offset + self._step * self._latents.now
+        return self._offset + self._step * self.latents.now
 
     def _values(self) -> np.ndarray:
         return companding.expand(self._coded(), self._curves)
@@ -88,13 +83,9 @@ class CanonicalVariable:
         """The derivative by them, from that by the values of frame `t`."""
         return derivative * (self._step * companding.slopes(self._coded(), self._curves))
 
-    def follow(self, derivative: np.ndarray, rate: float, step: int) -> None:
-        """As of `Latents`."""
-        self._latents.follow(derivative, rate, step)
-
     def put(self, channels: dict, trajectories: dict) -> None:
         """Puts the integers into those of the group."""
-        q = (self._latents.now * self._unit).astype(np.int32)
+        q = (self.latents.now * self._unit).astype(np.int32)
         channels[self.attribute] = replace(channels[self.attribute], values=np.ascontiguousarray(q.T))
 
 
@@ -126,9 +117,6 @@ class TrajectoryVariable:
 
     def by_integers(self, derivative: np.ndarray, t: int) -> np.ndarray:
         return self.basis[self.frequency, t, None] * derivative[self.own]
-
-    def follow(self, derivative: np.ndarray, rate: float, step: int) -> None:
-        self.latents.follow(derivative, rate, step)
 
     def put(self, channels: dict, trajectories: dict) -> None:
         coefficients = trajectories[self.attribute].coefficients.copy()

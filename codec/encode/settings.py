@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ..errors import UsageError
+from ..render.optimizer import AdamSettings
 
 LAYERS_MAX = 16  # spec 4
 
@@ -102,15 +103,14 @@ class RoundingSettings:
     """Stage refine: adaptive rounding (adaptive_rounding.py).
 
     Attributes:
-        betas, epsilon: of Adam; epsilon is in the sum of squared differences by a step: what changes less stays, since
-            its square may be 0 in f32.
+        adam: of the latents; epsilon is in the sum of squared differences by a step: what changes less stays, since its
+            square may be 0 in f32.
         inside: steps by which a latent starts within the interval of its integer, at least.
         drawn_rate: steps that the first drawn view moves a latent, times the root of the number of views.
         frame_views: drawn views a frame by which a small group of splats is refined; still_views: of a single frame.
     """
 
-    betas: tuple[float, float] = (0.9, 0.99)
-    epsilon: float = 1e-6
+    adam: AdamSettings = field(default_factory=lambda: AdamSettings(eps=1e-6))
     inside: float = 0.02
     drawn_rate: float = 0.1
     frame_views: int = 10

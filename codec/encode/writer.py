@@ -12,6 +12,7 @@ import json
 import mmap
 import os
 import shutil
+import warnings
 from glob import escape
 from pathlib import Path
 
@@ -20,6 +21,7 @@ import numpy as np
 from .. import _native
 from ..atomic_write import part_file, read_arrays, write_arrays
 from ..errors import BitstreamError
+from ..fingerprint import sentence
 
 
 class StreamWriter:
@@ -49,7 +51,10 @@ class StreamWriter:
         if not (self.part.exists() and self._made_by.exists()):
             return False
         try:
-            if json.loads(self._made_by.read_text()) != fingerprint:
+            before = json.loads(self._made_by.read_text())
+            if before != fingerprint:
+                changed = sentence(before, fingerprint)
+                warnings.warn(f"{self.part} is not gone on with, it is made anew: {changed}", stacklevel=4)
                 return False
             with open(self.part, "rb") as f, mmap.mmap(f.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 if data[: len(self.init)] != self.init:

@@ -1,5 +1,5 @@
 """Gaussians + Camera -> image, on the CPU, differentiable.
 
-`image` (numpy) is the player's side; `rasterize` and `reference` need torch; `step` is the whole image side of a
-training step in one native call.
+`image` is the player's side. `backend` is the seam that training goes through, `cpu` its implementation, `optimizer`
+what steps along the gradients, `sensitivity` what encoding measures. `reference` is the slow plain version (torch).
 """

@@ -9,7 +9,8 @@ import numpy as np
 
 from ..model.camera import Camera
 from ..model.gaussians import Gaussians
-from .workspace import PARAMETERS, Workspace
+from .backend import PARAMETERS
+from .workspace import Workspace
 
 _shared: list[Workspace] = []  # one workspace for callers that bring none
 

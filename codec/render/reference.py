@@ -1,7 +1,8 @@
-"""The rasterizer as plain torch: every pixel looks at every Gaussian, in depth order. For tests and small scenes only.
+"""The rasterizer and the image loss as plain torch, for tests: the native kernels are compared with them, forward and
+backward.
 
-Written from the definition, with full matrices and nothing culled but what the definition culls, in the precision of
-its inputs; the native kernels are compared with it, forward and backward.
+Written from the definition: every pixel visits every Gaussian in depth order, with full matrices, and culls only what
+the definition culls. The precision is that of the inputs.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ def project(means, quats, log_scales, camera: Camera):
 def rasterize_reference(
     means, quats, log_scales, logit_opacities, sh0, shN, camera: Camera, background=(0.0, 0.0, 0.0)
 ):
-    """As `rasterize.rasterize`, any float dtype.
+    """Draws Gaussians (3D Gaussian Splatting, Kerbl et al. 2023), any float dtype.
 
     Returns:
         image [H, W, 3], alpha [H, W], weights [N] (summed blending weight).
@@ -97,3 +98,32 @@ def rasterize_reference(
         weights = weights + torch.nn.functional.one_hot(torch.tensor(i), len(means)) * w.detach().sum()
         T = torch.where(draw, after, T)
     return image + T[..., None] * torch.as_tensor(background, dtype=means.dtype), 1 - T, weights
+
+
+def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """[H, W, 3] each -> [H, W, 3] SSIM of each pixel and channel (Wang et al. 2004), any float dtype.
+
+    As 3D Gaussian Splatting uses it: 11 x 11 Gaussian window of sigma 1.5, zeros outside of the image.
+    """
+    d = torch.arange(-5, 6, dtype=image.dtype)
+    window = torch.exp(-d * d / (2 * 1.5**2))
+    window = window / window.sum()
+
+    def blur(x):  # [3, 1, H, W]
+        x = torch.nn.functional.conv2d(x, window.view(1, 1, -1, 1), padding=(5, 0))
+        return torch.nn.functional.conv2d(x, window.view(1, 1, 1, -1), padding=(0, 5))
+
+    x, y = (t.permute(2, 0, 1)[:, None] for t in (image, target))
+    mx, my = blur(x), blur(y)
+    vx, vy, cov = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
+    c1, c2 = 0.01**2, 0.03**2
+    s = (2 * mx * my + c1) * (2 * cov + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
+    return s[:, 0].permute(1, 2, 0)
+
+
+def image_loss_reference(image, target, ssim_lambda=0.2, weight=None) -> torch.Tensor:
+    """Image loss of training, (1 - ssim_lambda) L1 + ssim_lambda (1 - SSIM); `weight` [H, W]: a weighted mean."""
+    value = (1 - ssim_lambda) * (image - target).abs() + ssim_lambda * (1 - ssim_map(image, target))
+    if weight is None:
+        return value.mean()
+    return (value * weight[..., None]).sum() / (3 * weight.sum())

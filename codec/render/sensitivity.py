@@ -17,7 +17,8 @@ from ..bitstream.color import STEP_WEIGHTS, TO_RGB, decorrelate
 from ..bitstream.quantization import Steps, error_for, subject_radius
 from ..model.camera import Camera, cameras_around
 from ..model.gaussians import Gaussians
-from .workspace import PARAMETERS, Workspace, call
+from .backend import PARAMETERS, Backend
+from .cpu import CpuBackend
 
 VIEWS, SIZE = 24, 512
 GREY = (0.5, 0.5, 0.5)
@@ -63,21 +64,24 @@ def sensitivity_cameras(means: np.ndarray, given: list[Camera] = (), count: int 
     return fitted + cameras_around(means, count - len(taken), name="sensitivity", turn=1.3)
 
 
-def measure(frames: list[Gaussians], cameras: list[Camera] = (), views: int = VIEWS) -> Importance:
+def measure(
+    frames: list[Gaussians], cameras: list[Camera] = (), views: int = VIEWS, *, backend: Backend | None = None
+) -> Importance:
     """Sensitivity over `frames` (the same N >= 1 Gaussians), which share so many `views`.
 
     Args:
         cameras: those of the capture.
+        backend: a new CpuBackend if None.
     """
     signs = np.random.default_rng(0)
-    workspace = Workspace()
+    backend = backend or CpuBackend()
     cameras = sensitivity_cameras(np.concatenate([g.means for g in frames]), cameras, views)
     total, removal = {}, np.zeros(len(frames[0]))
     for i, camera in enumerate(cameras):
         g = frames[i % len(frames)]
         probe = (2.0 * signs.integers(0, 2, (camera.height, camera.width, 3)) - 1).astype(np.float32)
         share = 1 / (len(cameras) * probe.size)
-        for name, d in derivatives(workspace, g, camera, lambda _, probe=probe: probe).items():
+        for name, d in derivatives(backend, g, camera, lambda _, probe=probe: probe).items():
             total[name] = total.get(name, 0) + share * d * d
             if name == "logit_opacities":
                 transparency = np.maximum(1 / (1 + np.exp(g.logit_opacities)), 1e-6)
@@ -86,13 +90,18 @@ def measure(frames: list[Gaussians], cameras: list[Camera] = (), views: int = VI
     return Importance(total, total.pop("turns"), removal)
 
 
+def params_of(g: Gaussians) -> dict[str, np.ndarray]:
+    """The arrays of `g` by name, as a backend takes them."""
+    return {name: np.ascontiguousarray(getattr(g, name), np.float32) for name in PARAMETERS}
+
+
 def arrays_of(g: Gaussians) -> tuple[np.ndarray, ...]:
-    """What the workspace takes."""
-    return tuple(np.ascontiguousarray(getattr(g, name), np.float32) for name in PARAMETERS)
+    """The arrays of `g` in the order of PARAMETERS, as a workspace takes them."""
+    return tuple(params_of(g).values())
 
 
 def derivatives(
-    workspace: Workspace,
+    backend: Backend,
     g: Gaussians,
     camera: Camera,
     by_picture: Callable[[np.ndarray], np.ndarray],
@@ -105,14 +114,8 @@ def derivatives(
         by_picture: the picture of `camera`, over `background` -> the derivative by its pixels, [H, W, 3] f32 both.
         names: of the channels; those of shN are left out where there are none.
     """
-    arrays = arrays_of(g)
-    image, _ = workspace.forward(arrays, camera, background, training=True)
-    pixels = by_picture(image)
-    grads, statistics = workspace.gradients(arrays)
-    for a in grads + statistics:
-        a.fill(0)
-    call(workspace.native.backward, arrays, pixels, np.zeros(pixels.shape[:2], np.float32), (grads, statistics))
-    grads = dict(zip(PARAMETERS, grads, strict=True))
+    by_pixels = lambda image, alpha: (by_picture(image), np.zeros_like(alpha))  # noqa: E731
+    grads = backend.backpropagate(params_of(g), camera, background, by_pixels)
     return {n: _by_channels(g, grads, n) for n in names if n != "shN" or g.sh_degree}
 
 
@@ -150,13 +153,15 @@ def steps_for_error(
     return {n: np.minimum(np.sqrt(12 * high / s), coarsest(n, radius)).astype(np.float32) for n, s in sums.items()}
 
 
-def measured_steps(g: Gaussians, quality: float, nominal: Steps, cameras: list[Camera] = ()) -> Steps:
+def measured_steps(
+    g: Gaussians, quality: float, nominal: Steps, cameras: list[Camera] = (), *, backend: Backend | None = None
+) -> Steps:
     """About the steps that the encoder will find for a group that looks like `g`, in the form of `steps_for`: one for
     all channels of an attribute, at the same rate. `cameras`: those of the capture; `nominal`: where nothing is seen.
     """
     if not len(g):
         return nominal
-    measured = measure([g], cameras)
+    measured = measure([g], cameras, backend=backend)
     weights, degrees = measured.weights | {"quats": measured.scene_rotations}, g.shN.shape[1]
     values = {"means": g.means, "log_scales": g.log_scales, "quats": g.quats[:, 1:], "sh0": decorrelate(g.sh0)}
     values |= {"logit_opacities": g.logit_opacities[:, None], "shN": decorrelate(g.shN).reshape(len(g), -1)}

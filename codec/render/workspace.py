@@ -1,4 +1,4 @@
-"""The native rasterizer with its buffers: what `image`, `rasterize` and `step` share. Needs no torch.
+"""The native rasterizer with its buffers, shared by `image` and `cpu`. Needs no torch.
 
 A workspace keeps its buffers from call to call: make one per thread of control and use it for all views.
 """
@@ -10,11 +10,7 @@ import numpy as np
 from .. import _native
 from ..errors import LimitError, UsageError
 from ..model.camera import Camera
-
-PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
-STATISTICS = ("grad2d", "max_weight", "sum_weight")
-
-Region = tuple[int, int, int, int]  # x, y, width, height in pixels
+from .backend import PARAMETERS, STATISTICS, Region
 
 
 def simd_levels() -> list[str]:
@@ -38,7 +34,6 @@ class Workspace:
             self.native = _native.Rasterizer(threads, simd)
         except ValueError as e:
             raise UsageError(str(e)) from None
-        self.calls = 0  # forward passes so far; tells whether the native state is still that of a given picture
         self._grads: dict[str, np.ndarray] = {}
 
     @property
@@ -61,14 +56,12 @@ class Workspace:
         Returns:
             image [H, W, 3] f32 and alpha [H, W] f32 of the region, new arrays.
         """
-        self.calls += 1
         region = region or (0, 0, camera.width, camera.height)
         image, alpha = call(self.native.forward, params, view(camera, region), rgb(background), training)
         return image.reshape(region[3], region[2], 3), alpha.reshape(region[3], region[2])
 
     def draw(self, params, camera: Camera, background) -> np.ndarray:
         """Draws `params` and returns [H, W, 3] uint8, rounded."""
-        self.calls += 1
         whole = (0, 0, camera.width, camera.height)
         flat = call(self.native.draw, params, view(camera, whole), rgb(background))
         return flat.reshape(camera.height, camera.width, 3)
@@ -101,6 +94,11 @@ def view(camera: Camera, region: Region) -> dict:
         "viewmat": m[:3].tolist(),
         "region": [int(v) for v in region],
     }
+
+
+def host_array(array) -> np.ndarray:
+    """A numpy array, or the memory of a torch CPU tensor as one; torch is not imported."""
+    return array.detach().numpy() if hasattr(array, "detach") else array
 
 
 def rgb(colour) -> list[float]:

@@ -7,9 +7,11 @@ frame is a group of its own. Frames are read when they are asked for; a few stay
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import threading
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +25,8 @@ from ..errors import CaptureError, UsageError
 from ..model.camera import Camera
 from ..model.gaussian_sequence import DenseGroup, GaussianSequence
 from ..model.gaussians import GOP, Gaussians
+from ..model.parametric_group import ParametricGroup
+from . import parametric_file
 from .files import EXPECTED, is_splat, read_means, read_splat, splat_size
 from .tracking import relate
 
@@ -38,10 +42,12 @@ class SplatSequence(GaussianSequence):
         mode: "stored" (groups of sequence.json), "tracked" (index i is verified to be the same Gaussian), "matched"
             (Gaussians of some frames were reordered) or "independent" (groups of one frame).
         names: file name of each frame.
+        training: what `gscodec train` has left besides (`SequenceWriter`); None: others made the splats.
     """
 
     mode: str = "stored"
     names: Sequence[str] = ()
+    training: dict | None = None
 
 
 class Frames(Sequence):
@@ -202,12 +208,12 @@ def _stored(path: Path, paths: list[Path], fps: float | None) -> SplatSequence:
     try:
         data = json.loads(where.read_text())
         rate = float(fps or data["fps"])
-        spans = [(int(g["start"]), int(g["frames"]), g.get("extra")) for g in data["groups"]]
+        spans = [(int(g["start"]), int(g["frames"]), g.get("extra"), g.get("sha256")) for g in data["groups"]]
         cameras = [_camera(c) for c in data.get("cameras", [])]
     except (ValueError, KeyError, TypeError) as e:
         raise CaptureError(f"{where}: not valid ({type(e).__name__}: {e}), expected fps and groups") from e
     end = 0
-    for i, (start, count, _) in enumerate(spans):
+    for i, (start, count, *_) in enumerate(spans):
         if start != end or count < 1 or start + count > len(paths):
             raise CaptureError(
                 f"{where}: group {i} is {count} frames from {start}, expected to start at {end} "
@@ -217,10 +223,14 @@ def _stored(path: Path, paths: list[Path], fps: float | None) -> SplatSequence:
     if not spans or rate <= 0:
         raise CaptureError(f"{where}: {len(spans)} groups at {rate} frames a second, expected at least one group")
     groups = [_stored_group(path, paths, *span) for span in spans]
-    return SplatSequence(rate, groups, cameras, names=[p.name for p in paths[:end]])
+    names = [p.name for p in paths[:end]]
+    return SplatSequence(rate, groups, cameras, names=names, training=data.get("training"))
 
 
-def _stored_group(path: Path, paths: list[Path], start: int, count: int, extra: str | None) -> DenseGroup:
+def _stored_group(
+    path: Path, paths: list[Path], start: int, count: int, extra: str | None, sha256: str | None
+) -> DenseGroup | ParametricGroup:
+    """A group as it was written; one whose frames were edited since is dense."""
     own = paths[start : start + count]
     if not extra:
         return DenseGroup(Frames(own, {})[:])
@@ -229,6 +239,14 @@ def _stored_group(path: Path, paths: list[Path], start: int, count: int, extra: 
             arrays = {k: stored[k] for k in stored.files}
     except (OSError, ValueError) as e:
         raise CaptureError(f"{path / extra}: missing or damaged ({e}), sequence.json refers to it") from e
+    if sha256 is not None:
+        if _digest(own) == sha256:
+            return parametric_file.from_arrays(arrays)
+        warnings.warn(
+            f"{path}: frames {start} to {start + count - 1} were changed since they were written; they are coded as "
+            f"they are, without the motion that training found",
+            stacklevel=2,
+        )
     lifetimes, hidden = arrays.get("lifetimes"), {}
     if lifetimes is not None:
         for t in range(count):
@@ -236,6 +254,14 @@ def _stored_group(path: Path, paths: list[Path], start: int, count: int, extra: 
             if away.any():
                 hidden[t] = away, arrays[f"hidden_{t}"]
     return DenseGroup(Frames(own, {}, hidden)[:], lifetimes, arrays.get("parents"))
+
+
+def _digest(paths: list[Path]) -> str:
+    """SHA-256 of the bytes of all files, in hexadecimal."""
+    digest = hashlib.sha256()
+    for path in paths:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def _camera(c: dict) -> Camera:

@@ -8,6 +8,7 @@ resume.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -19,6 +20,7 @@ from ..atomic_write import part_file
 from ..model.camera import Camera
 from ..model.gaussian_sequence import DenseGroup, GaussianSequence
 from ..model.parametric_group import ParametricGroup
+from . import parametric_file
 from .ply import write_ply
 
 HIDDEN = -30.0  # logit opacity that no renderer shows
@@ -33,9 +35,19 @@ class SequenceWriter:
         frame_count: frames of those groups.
     """
 
-    def __init__(self, folder: str | Path, fps: float, cameras: Sequence[Camera] = (), *, resume: bool = False):
+    def __init__(
+        self,
+        folder: str | Path,
+        fps: float,
+        cameras: Sequence[Camera] = (),
+        *,
+        training: dict | None = None,
+        resume: bool = False,
+    ):
         """
         Args:
+            training: what `encode` must know of a trained sequence (JSON-able): capture, range, sh_degree, gaussians,
+                frames.
             resume: continue after the groups of an existing sequence.json; otherwise it is removed.
         """
         self._folder = Path(folder)
@@ -45,6 +57,7 @@ class SequenceWriter:
             listed.unlink(missing_ok=True)  # its frames will be overwritten
         self.groups = json.loads(listed.read_text())["groups"] if listed.is_file() else []
         self._head = {"fps": fps, "cameras": [_camera(c) for c in cameras]}
+        self._head |= {} if training is None else {"training": training}
 
     @property
     def frame_count(self) -> int:
@@ -52,7 +65,7 @@ class SequenceWriter:
 
     def add(self, group: DenseGroup | ParametricGroup, progress: Callable[[int], None] | None = None) -> None:
         """Writes a group; `progress` is called with the number of frames written in all."""
-        start, extra = self.frame_count, {}
+        start, extra, digest = self.frame_count, {}, hashlib.sha256()
         for t in range(len(group)):
             g = group.frame(t)
             if group.lifetimes is not None:
@@ -60,14 +73,17 @@ class SequenceWriter:
                 if away.any():
                     extra[f"hidden_{t}"] = g.logit_opacities[away]
                     g = replace(g, logit_opacities=np.where(away, np.float32(HIDDEN), g.logit_opacities))
-            write_ply(self._folder / f"{start + t:06d}.ply", g)
+            path = self._folder / f"{start + t:06d}.ply"
+            write_ply(path, g)
+            digest.update(path.read_bytes())
             if progress:
                 progress(start + t + 1)
         entry = {"start": start, "frames": len(group)}
-        if group.lifetimes is not None:
-            extra["lifetimes"] = group.lifetimes
-        if group.parents is not None:
-            extra["parents"] = group.parents
+        if isinstance(group, ParametricGroup):
+            extra |= parametric_file.to_arrays(group)
+            entry["sha256"] = digest.hexdigest()  # of the frames: whoever edits them, codes them as they are
+        else:
+            extra |= {n: v for n in ("lifetimes", "parents") if (v := getattr(group, n)) is not None}
         if extra:
             entry["extra"] = f"group_{len(self.groups):04d}.npz"
             with part_file(self._folder / entry["extra"]) as part, part.open("wb") as f:

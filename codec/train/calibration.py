@@ -12,40 +12,43 @@ from dataclasses import replace
 
 import numpy as np
 
-from .. import _native
 from ..model.camera import Camera
 from ..model.gaussians import SH_C0, Gaussians
-from .model import BETAS, EPS
+from ..render.backend import Backend
+from ..render.optimizer import Adam
+from .settings import TrainSettings
 
 
 class _Learned:
     """A few values of each camera, learned with Adam; 0 where nothing is wrong.
 
     Args:
-        count: cameras of the capture; trained: indices of those that are trained on.
-        least: root mean square of the values that are kept by `settle`.
+        count: cameras of the capture.
+        trained: indices of those that are trained on.
+        adam: optimiser of the values of each camera.
+        rate: learning rate; least: root mean square of the values that are kept by `settle`.
 
     Attributes:
         values: [C, K] f32.
     """
 
-    def __init__(self, count: int, width: int, trained: list[int], *, rate: float, least: float):
+    def __init__(self, count: int, width: int, trained: list[int], adam: Adam, *, rate: float, least: float):
         self._shape, self._trained, self._rate, self._least = (count, width), trained, rate, least
+        self._adam = adam
         self.restart()
 
     def restart(self) -> None:
         """Nothing is wrong."""
-        self.values, self._first, self._second = np.zeros((3, *self._shape), np.float32)
-        self._steps = np.zeros(self._shape[0], int)
+        self.values = np.zeros(self._shape, np.float32)
+        self._adam.restart()
         self._settled = False
 
     def learn(self, camera: int, grad: np.ndarray, fade: float) -> None:
         """One step for one camera; `grad`: [K], of the loss; rate times `fade`."""
         if self._settled:
             return
-        self._steps[camera] += 1
-        tensors = (self.values[camera], grad.astype(np.float32), self._first[camera], self._second[camera])
-        _native.adam(tensors, self._rate * fade, BETAS, EPS, int(self._steps[camera]))
+        name = str(camera)
+        self._adam.step({name: self.values[camera]}, {name: grad}, {name: self._rate * fade})
         self.values[self._trained] -= self.values[self._trained].mean(0)
 
     def settle(self) -> None:
@@ -56,15 +59,12 @@ class _Learned:
 
 
 class Exposure(_Learned):
-    """Log gains of the channels: what is drawn for a training camera is multiplied by them, what a viewer sees is not.
+    """Log gains of the channels of each training camera: they multiply its rendered images, and no others."""
 
-    By shading alone, the procedural captures come to 2 to 5 %, lumberjack to 1 %.
-    """
-
-    PULL = 0.02  # towards 0: this times half the square of a log gain is added to the loss
-
-    def __init__(self, count: int, trained: list[int]):
-        super().__init__(count, 3, trained, rate=0.02, least=0.05)
+    def __init__(self, count: int, trained: list[int], settings: TrainSettings, backend: Backend):
+        c = settings.calibration
+        super().__init__(count, 3, trained, Adam(backend, settings.adam), rate=c.exposure_rate, least=c.exposure_min)
+        self._weight = c.exposure_weight
 
     def gain(self, camera: int) -> np.ndarray:
         """[3] f32."""
@@ -77,19 +77,17 @@ class Exposure(_Learned):
 
     def learn(self, camera: int, grad: np.ndarray, fade: float) -> None:
         """As of `_Learned`; `grad`: [3], of the loss by the gains."""
-        super().learn(camera, grad * self.gain(camera) + self.PULL * self.values[camera], fade)
+        super().learn(camera, grad * self.gain(camera) + self._weight * self.values[camera], fade)
 
 
 class Extrinsics(_Learned):
     """By which small rigid motion of the scene each camera sees what the others see: a rotation vector in radians
     about the middle of the subject, then a translation in its radii.
-
-    Where poses are right, the procedural captures come to 0.009 at most (thin rods, four cameras), lumberjack to 0.001;
-    half a degree and 5 mm on a figure come to 0.015.
     """
 
-    def __init__(self, count: int, trained: list[int]):
-        super().__init__(count, 6, trained, rate=5e-3, least=1e-2)
+    def __init__(self, count: int, trained: list[int], settings: TrainSettings, backend: Backend):
+        c = settings.calibration
+        super().__init__(count, 6, trained, Adam(backend, settings.adam), rate=c.pose_rate, least=c.pose_min)
         self.about(np.zeros(3), 1.0)
 
     def about(self, middle: np.ndarray, radius: float) -> None:

@@ -10,12 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from ..capture import blend
+from .settings import ChangeDetectionSettings
+from .views import GREY
 from .visual_hull import project
-
-WIDTH = 256  # pixels of the pictures that are compared: noise averages out
-THRESHOLD = 6.0  # grey levels, after a mean over 3 x 3; sensors and path tracers stay below
-MARGIN = 0.02  # of the width: what is near a change may move with it, also where it has no texture
-SEEN_SHARE = 0.5  # of the cameras that see a Gaussian, that must see a change there
 
 
 class Changes:
@@ -25,27 +22,27 @@ class Changes:
         fitted: [h, w, 3] u8 of each training camera: what the Gaussians show.
     """
 
-    def __init__(self, views, fitted: list[np.ndarray]):
-        self.views, self.fitted = views, fitted
+    def __init__(self, views, fitted: list[np.ndarray], settings: ChangeDetectionSettings):
+        self.views, self.fitted, self.settings = views, fitted, settings
 
     @staticmethod
-    def since(views, frame: int) -> Changes:
+    def since(views, frame: int, settings: ChangeDetectionSettings) -> Changes:
         """Everything is fitted to `frame`."""
-        changes = Changes(views, [])
+        changes = Changes(views, [], settings)
         changes.fitted = [changes._picture(i, frame) for i in views.train_cameras]
         return changes
 
     def copy(self) -> Changes:
         """The same, to look ahead with."""
-        return Changes(self.views, [picture.copy() for picture in self.fitted])
+        return Changes(self.views, [picture.copy() for picture in self.fitted], self.settings)
 
     def _picture(self, camera: int, frame: int) -> np.ndarray:
         """[h, w, 3] u8, small, over mid-grey."""
         import cv2
 
-        rgb = blend(self.views.view(camera, frame), (0.5, 0.5, 0.5))
+        rgb = blend(self.views.view(camera, frame), GREY)
         height, width = rgb.shape[:2]
-        scale = min(1.0, WIDTH / width)
+        scale = min(1.0, self.settings.width / width)
         size = (max(1, round(scale * width)), max(1, round(scale * height)))
         return np.rint(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)).astype(np.uint8)
 
@@ -58,9 +55,9 @@ class Changes:
         for camera, fitted in zip(self.views.train_cameras, self.fitted, strict=True):
             now = self._picture(camera, frame)
             difference = cv2.blur(now.astype(np.float32) - fitted, (3, 3))
-            changed = np.abs(difference).max(2) > THRESHOLD
+            changed = np.abs(difference).max(2) > self.settings.threshold
             fitted[changed] = now[changed]
-            masks.append(_grown(changed))
+            masks.append(self._grown(changed))
         return masks
 
     def outside(self, frame: int, means: np.ndarray) -> np.ndarray:
@@ -73,10 +70,10 @@ class Changes:
             alpha = self.views.view(camera, frame).alpha
             if alpha is None:
                 return np.zeros(len(means), bool)
-            masks.append(_grown(cv2.resize(alpha, fitted.shape[1::-1], interpolation=cv2.INTER_AREA) > 0))
-        return ~self.behind(masks, frame, means, [np.ones(len(means), bool)] * len(masks))
+            masks.append(self._grown(cv2.resize(alpha, fitted.shape[1::-1], interpolation=cv2.INTER_AREA) > 0))
+        return ~self.behind(frame, masks, means, [np.ones(len(means), bool)] * len(masks))
 
-    def behind(self, masks: list[np.ndarray], frame: int, means: np.ndarray, visible: list[np.ndarray]) -> np.ndarray:
+    def behind(self, frame: int, masks: list[np.ndarray], means: np.ndarray, visible: list[np.ndarray]) -> np.ndarray:
         """[N] bool: Gaussians at `means` ([N, 3]) that enough of the cameras that see them have in changed pixels.
 
         Args:
@@ -90,13 +87,12 @@ class Changes:
             on = np.flatnonzero(clear & (depth > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height))
             seen[on] += 1
             hit[on] += mask[y[on], x[on]]
-        return (hit > 0) & (hit >= SEEN_SHARE * seen)
+        return (hit > 0) & (hit >= self.settings.seen_share * seen)
 
+    def _grown(self, mask: np.ndarray) -> np.ndarray:
+        """[h, w] bool and what is near it."""
+        import cv2
 
-def _grown(mask: np.ndarray) -> np.ndarray:
-    """[h, w] bool and what is near it."""
-    import cv2
-
-    size = 2 * round(MARGIN * mask.shape[1]) + 1
-    near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    return cv2.dilate(mask.astype(np.uint8), near) > 0
+        size = 2 * round(self.settings.margin * mask.shape[1]) + 1
+        near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+        return cv2.dilate(mask.astype(np.uint8), near) > 0

@@ -16,56 +16,8 @@ import torch
 
 from .. import _native
 from ..farthest_point_sampling import farthest_points
-
-NODES = 256  # 1000 track as well
-STILL_SHARE = 0.25  # of the nodes, for what does not move yet, if that is as large a share of the Gaussians
-BLENDED = 4  # nodes that carry one Gaussian
-EDGES = 8  # neighbours of a node in the rigidity term
-HELD = 0.1  # weight from which a node has a hold on a Gaussian
-GRID = 1e-3  # of the radius: the lattice on which neighbours and weights are computed
-NEWCOMERS = 16  # nodes of what comes in at once
-ROOM = 2.0  # extents of the keyframe that the stream's lattice has along each axis
-PLACES = 16  # at most, that are tried for newcomers to rest
-
-
-def quat_multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Hamilton product, [N, 4] wxyz."""
-    aw, au, bw, bu = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
-    w = aw * bw - (au * bu).sum(1, keepdim=True)
-    return torch.cat([w, aw * bu + bw * au + torch.linalg.cross(au, bu, dim=-1)], 1)
-
-
-def quat_conjugate(q: torch.Tensor) -> torch.Tensor:
-    """Inverse of unit wxyz quaternions, [N, 4]."""
-    return q * torch.tensor([1.0, -1.0, -1.0, -1.0])
-
-
-def rotvec_to_quat(v: torch.Tensor) -> torch.Tensor:
-    """[N, 3] radians -> [N, 4] wxyz, smooth at zero."""
-    half = (v.square().sum(1, keepdim=True) + 1e-16).sqrt() / 2
-    return torch.cat([torch.cos(half), v * 0.5 * torch.sinc(half / torch.pi)], 1)
-
-
-def quat_to_rotvec(q: torch.Tensor, near: torch.Tensor | None = None) -> torch.Tensor:
-    """[N, 4] unit wxyz -> [N, 3] radians, of the equal ones the nearest to `near` (no jumps over time)."""
-    q = q * torch.where(q[:, :1] < 0, -1.0, 1.0)
-    sine = q[:, 1:].norm(dim=1, keepdim=True)
-    axis = q[:, 1:] / sine.clamp(min=1e-12)
-    angle = 2 * torch.atan2(sine, q[:, :1])
-    if near is not None:
-        angle = angle + 2 * torch.pi * torch.round(((near * axis).sum(1, keepdim=True) - angle) / (2 * torch.pi))
-    return axis * angle
-
-
-def quat_to_matrix(q: torch.Tensor) -> torch.Tensor:
-    """[N, 4] unit wxyz -> [N, 3, 3]."""
-    w, x, y, z = q.unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, 1).view(-1, 3, 3)
+from ..model.rotations import quat_multiply, quat_to_matrix, rigid_poses, rotvec_to_quat
+from .settings import DeformationGraphSettings
 
 
 @dataclass
@@ -95,18 +47,20 @@ class Pose:
         return Pose(*(torch.cat([getattr(self, f.name), getattr(more, f.name)]) for f in fields(Pose)))
 
 
-class _Weighted(torch.autograd.Function):
-    """Sparse weights [N, M] times rows [M, C]; scipy's product takes a tenth of the time of gathering rows in torch."""
+class _Blend(torch.autograd.Function):
+    """`_native.blend_rigid`, differentiable in the poses of the nodes."""
 
     @staticmethod
-    def forward(ctx, rows, weights, transposed):
-        ctx.transposed = transposed
-        return torch.from_numpy(weights @ rows.detach().numpy())
+    def forward(ctx, poses, rest, neighbors, weights):
+        arrays = tuple(np.ascontiguousarray(t.detach().numpy(), np.float32) for t in (poses, rest))
+        ctx.arrays = (*arrays, neighbors, weights)
+        return tuple(torch.from_numpy(a) for a in _native.blend_rigid(*ctx.arrays))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        return torch.from_numpy(ctx.transposed @ grad.numpy()), None, None
+    def backward(ctx, by_means, by_rotations):
+        grads = (g.contiguous().numpy() for g in (by_means, by_rotations))
+        return torch.from_numpy(_native.blend_rigid_backward(*ctx.arrays, *grads)), None, None, None
 
 
 class NodeGraph:
@@ -120,17 +74,26 @@ class NodeGraph:
 
     Attributes:
         means: as given.
+        neighbors: [N, k] u32, nodes that carry each Gaussian, the nearest first; weights: [N, k] f32.
         nodes: [M, 3] positions of the nodes at rest.
         spacing: usual distance of neighbouring nodes.
     """
 
     def __init__(
-        self, means: torch.Tensor, low: torch.Tensor, step: float, chosen: np.ndarray, family: np.ndarray, extent
+        self,
+        means: torch.Tensor,
+        low: torch.Tensor,
+        step: float,
+        chosen: np.ndarray,
+        family: np.ndarray,
+        extent: torch.Tensor,
+        settings: DeformationGraphSettings,
     ):
+        self.settings = settings
         self.low, self.step, self.extent = low, step, extent
         self.chosen, self.family = chosen, family
         self._connect()
-        self.means, self._blend = means[:0], None
+        self.means = means[:0]
         self.extend(means)
 
     def _connect(self) -> None:
@@ -138,54 +101,50 @@ class NodeGraph:
         from scipy.spatial import cKDTree
 
         self.nodes = self.low + self.step * torch.from_numpy(self.chosen.astype(np.float32))
-        m, k = len(self.chosen), min(EDGES, len(self.chosen) - 1)
+        m, k = len(self.chosen), min(self.settings.edges, len(self.chosen) - 1)
         near = cKDTree(self.nodes.numpy()).query(self.nodes.numpy(), k + 1)[1].reshape(m, -1)[:, 1:]
         self._edges = torch.from_numpy(near.astype(np.int64))
         length = (self.nodes[self._edges] - self.nodes[:, None]).norm(dim=2, keepdim=True)
         middle = length.median() if k else torch.ones(())
-        hold = torch.exp2(-((length / (1.5 * middle)) ** 2))  # long edges bridge gaps: they hold less
-        self._hold, self.spacing = hold * GRID / self.step, float(middle)
+        hold = torch.exp2(
+            -((length / (self.settings.edge_falloff * middle)) ** 2)
+        )  # long edges bridge gaps: they hold less
+        self._hold, self.spacing = hold * self.settings.lattice / self.step, float(middle)
 
     @staticmethod
     def of(
-        means: torch.Tensor, sizes: torch.Tensor, radius: float, moving: torch.Tensor, count: int = NODES
+        means: torch.Tensor,
+        sizes: torch.Tensor,
+        radius: float,
+        moving: torch.Tensor,
+        settings: DeformationGraphSettings,
     ) -> NodeGraph:
         """Nodes for Gaussians at `means` [N, 3] of `sizes` [N], most of them where `moving` ([N] bool); `radius` of
         these. They are dense where the Gaussians are small: a wall behind needs few."""
-        low, step = means.min(0).values, GRID * radius
+        low, step = means.min(0).values, settings.lattice * radius
         grid = torch.round((means - low) / step).numpy().astype(np.uint32)
-        if (~moving).float().mean() < STILL_SHARE:  # nodes that stay among others that move would hold them
+        if (~moving).float().mean() < settings.still_share:  # nodes that stay among others that move would hold them
             moving = torch.ones_like(moving)
-        still = int(STILL_SHARE * count) if (~moving).any() else 0
+        still = int(settings.still_share * settings.nodes) if (~moving).any() else 0
         some = [np.zeros((0, 3), np.uint32)]
-        for mask, most in ((moving, count - still), (~moving, still)):
+        for mask, most in ((moving, settings.nodes - still), (~moving, still)):
             if mask.any() and most:
                 some.append(grid[mask.numpy()][farthest_points(means[mask].numpy(), most, sizes[mask].numpy())])
         chosen = np.unique(np.concatenate(some), axis=0)
         chosen = chosen[_native.morton_order(chosen)]
-        return NodeGraph(means, low, step, chosen, np.zeros(len(chosen), int), means.max(0).values - low)
+        return NodeGraph(means, low, step, chosen, np.zeros(len(chosen), int), means.max(0).values - low, settings)
 
     def extend(self, means: torch.Tensor) -> None:
         """More Gaussians to carry, at [K, 3] at rest."""
-        from scipy.sparse import csr_matrix, vstack
-
-        index, weight = self._weights(means, self.chosen)
-        parts = (
-            weight.astype(np.float32).ravel(),
-            index.astype(np.int32).ravel(),
-            index.shape[1] * np.arange(len(means) + 1),
-        )
-        rows = csr_matrix(parts, (len(means), len(self.chosen)))
-        if self._blend is not None:
-            self._blend.resize(self._blend.shape[0], len(self.chosen))
-            rows = vstack([self._blend, rows], format="csr")
-        self._blend = rows  # [N, M]
-        self._gather = self._blend.T.tocsr()
+        index, weight = (_padded(a, self.settings.blended) for a in self._weights(means, self.chosen))
+        if len(self.means):
+            index, weight = np.concatenate([self.neighbors, index]), np.concatenate([self.weights, weight])
+        self.neighbors, self.weights = index, weight
         self.means = torch.cat([self.means, means])
 
     def _weights(self, means: torch.Tensor, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nodes of `chosen` that carry Gaussians at `means` [N, 3], and their weights, [N, k] both."""
-        return _native.node_weights(self._on_lattice(means), chosen, BLENDED)
+        return _native.node_weights(self._on_lattice(means), chosen, self.settings.blended)
 
     def _on_lattice(self, means: torch.Tensor) -> np.ndarray:
         return torch.round((means - self.low) / self.step).clamp(min=0).numpy().astype(np.uint32)
@@ -196,7 +155,7 @@ class NodeGraph:
         Returns:
             [3], from `means` to where they rest: there nobody else's nodes or weights change. None: no room is left.
         """
-        own = means[torch.from_numpy(farthest_points(means.numpy(), NEWCOMERS))]
+        own = means[torch.from_numpy(farthest_points(means.numpy(), self.settings.added_nodes))]
         before = self._weights(self.means, self.chosen)
         for shift in self._places(means):
             young = np.unique(self._on_lattice(own + shift), axis=0)
@@ -214,9 +173,9 @@ class NodeGraph:
         """Shifts [3] of `means` to beside all that rest, along the axis with most room in the lattice."""
         low, high = means.min(0).values, means.max(0).values
         start, size = self.means.max(0).values, high - low
-        room = self.low + ROOM * self.extent.max() - size - start
+        room = self.low + self.settings.extent_max * self.extent.max() - size - start
         axis = int(room.argmax())
-        for k in range(PLACES):
+        for k in range(self.settings.places_max):
             away = (0.5 + 0.5 * k) * size.max()
             if away > room[axis]:
                 return
@@ -226,22 +185,22 @@ class NodeGraph:
 
     def family_of(self) -> np.ndarray:
         """[N] int, the family of the nodes that carry each Gaussian."""
-        return self.family[self._blend.indices[self._blend.indptr[:-1]]]
+        return self.family[self.neighbors[:, 0]]
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays."""
         return {n: np.asarray(getattr(self, n)) for n in ("means", "low", "step", "chosen", "family", "extent")}
 
     @staticmethod
-    def restored(state: dict[str, np.ndarray]) -> NodeGraph:
+    def restored(state: dict[str, np.ndarray], settings: DeformationGraphSettings) -> NodeGraph:
         """Inverse of `state`."""
         means, low, extent = (torch.from_numpy(state[n]) for n in ("means", "low", "extent"))
-        return NodeGraph(means, low, float(state["step"]), state["chosen"], state["family"], extent)
+        return NodeGraph(means, low, float(state["step"]), state["chosen"], state["family"], extent, settings)
 
     def keep(self, chosen: torch.Tensor) -> None:
         """Carries only the Gaussians of `chosen` ([N] bool)."""
-        self.means, self._blend = self.means[chosen], self._blend[chosen.numpy()]
-        self._gather = self._blend.T.tocsr()
+        self.means = self.means[chosen]
+        self.neighbors, self.weights = (np.ascontiguousarray(a[chosen.numpy()]) for a in (self.neighbors, self.weights))
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -255,27 +214,15 @@ class NodeGraph:
         Returns:
             means [N, 3] and the blended rotation [N, 4] unit wxyz.
         """
-        R = quat_to_matrix(pose.turned)
-        offset = pose.nodes - torch.einsum("mij,mj->mi", R, self.nodes)
-        rows = torch.cat([R.flatten(1), offset, pose.turned], 1)
-        blend = _Weighted.apply(rows, self._blend, self._gather)
-        means = (blend[:, :9].view(-1, 3, 3) * x[:, None]).sum(2) + blend[:, 9:12]
-        return means, torch.nn.functional.normalize(blend[:, 12:], dim=1)
-
-    def blend(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes that carry each Gaussian, [N, k] int32, and their weights, [N, k] f32."""
-        n, k = len(self.means), min(BLENDED, len(self.nodes))
-        index, weights = np.zeros((n, k), np.int32), np.zeros((n, k), np.float32)
-        index[:, : self._neighbors.shape[1]], weights[:, : self._weights_of.shape[1]] = (
-            self._neighbors,
-            self._weights_of,
-        )
-        return index, weights
+        poses = rigid_poses(self.nodes, pose.turned, pose.nodes - self.nodes)
+        return _Blend.apply(poses, x, self.neighbors, self.weights)
 
     def carriers(self, chosen: torch.Tensor) -> torch.Tensor:
-        """[M] bool: nodes that carry a Gaussian of `chosen` ([N] bool) with a weight of more than `HELD`."""
-        weights = self._gather[:, chosen.numpy()]
-        return torch.from_numpy((weights > HELD).getnnz(axis=1) > 0)
+        """[M] bool: nodes that carry a Gaussian of `chosen` ([N] bool) with a weight of more than
+        `carrier_weight_min`."""
+        some = chosen.numpy()
+        carried = self.neighbors[some][self.weights[some] > self.settings.carrier_weight_min]
+        return torch.from_numpy(np.isin(np.arange(len(self)), carried))
 
     def rigidity(self, pose: Pose) -> torch.Tensor:
         """Mean weighted length by which the edges between nodes miss their rotated selves (Sorkine and Alexa 2007)."""
@@ -285,3 +232,8 @@ class NodeGraph:
         turned = torch.einsum("mij,mkj->mki", quat_to_matrix(pose.turned), edge)
         missed = turned - (pose.nodes[self._edges] - pose.nodes[:, None])
         return (self._hold * missed).square().sum(2).add(1e-12).sqrt().mean()
+
+
+def _padded(a: np.ndarray, width: int) -> np.ndarray:
+    """[N, k] -> [N, width], zeros behind: a group with few nodes may get more."""
+    return np.ascontiguousarray(np.pad(a, ((0, 0), (0, width - a.shape[1]))))

@@ -15,11 +15,11 @@ import torch
 from .. import _native
 from ..bitstream.color import STEP_WEIGHTS, TO_YCOCG
 from ..bitstream.quantization import Steps
-from .deformation_graph import quat_conjugate, quat_multiply
+from ..model.rotations import quat_conjugate, quat_multiply
+from .settings import EntropyModelSettings
 
-NEAR, WINDOW = 4, 32  # contexts: so many nearest among so many before (spec 7.3)
-GRID_MOST = 2**20  # steps along an axis: far floaters make them coarser
-LEAST_SPREAD, LEAST_WIDTH = 0.5, 0.05  # steps
+CONTEXT_NEIGHBOURS, CONTEXT_WINDOW = 4, 32  # the nearest so many of the so many before (spec 7.3)
+GRID_MAX = 2**20  # steps along an axis, what the Morton order takes: far floaters make steps coarser
 LN2 = float(np.log(2))
 _H = 0.5**0.5
 _TURNS = torch.zeros(27, 4)  # [9 a + 3 b + c] the turn after which axes a, b, c are the first, second, third
@@ -68,15 +68,15 @@ def neighbours(means: torch.Tensor, step: float) -> torch.Tensor:
     """[N, 4] the nearest Gaussians among the 32 before each in Morton order, as contexts see them; itself where there
     is none."""
     low, high = means.min(0).values, means.max(0).values
-    step = max(step, float((high - low).max()) / GRID_MOST)
+    step = max(step, float((high - low).max()) / GRID_MAX)
     grid = torch.round((means - low) / step).numpy().astype(np.uint32)
     order = _native.morton_order(grid).astype(np.int64)
     p = grid[order].astype(np.float32)
     n = len(p)
-    distance = np.full((n, WINDOW), np.inf, np.float32)
-    for back in range(1, min(WINDOW, n - 1) + 1):
+    distance = np.full((n, CONTEXT_WINDOW), np.inf, np.float32)
+    for back in range(1, min(CONTEXT_WINDOW, n - 1) + 1):
         distance[back:, back - 1] = ((p[back:] - p[:-back]) ** 2).sum(1)
-    back = distance.argsort(1, kind="stable")[:, :NEAR] + 1
+    back = distance.argsort(1, kind="stable")[:, :CONTEXT_NEIGHBOURS] + 1
     index = np.arange(n)[:, None] - back
     index = np.where(index < 0, np.arange(n)[:, None], index)
     near = np.empty_like(index)
@@ -92,7 +92,8 @@ class CanonicalRate:
         steps: of the stream.
     """
 
-    def __init__(self, means: torch.Tensor, steps: Steps):
+    def __init__(self, means: torch.Tensor, steps: Steps, settings: EntropyModelSettings):
+        self.settings = settings
         self.near = neighbours(means, steps.means)
         colour = torch.from_numpy(STEP_WEIGHTS).float()
         self.to_ycocg = torch.from_numpy(TO_YCOCG.T).float()
@@ -125,9 +126,9 @@ class CanonicalRate:
         around = x[self.near]
         mean = torch.zeros_like(x) if attribute == "quats" else around.mean(1)  # a turn may be to either side
         with torch.no_grad():  # the law's width follows the neighbours' own differences
-            spread = (around - mean[:, None]).abs().mean(1) + LEAST_SPREAD
+            spread = (around - mean[:, None]).abs().mean(1) + self.settings.spread_min
             width = spread * (x - mean).abs().mean(0) / spread.mean(0)
-        return laplace_bits(x - mean, width.clamp(min=LEAST_WIDTH).log()).sum()
+        return laplace_bits(x - mean, width.clamp(min=self.settings.scale_min).log()).sum()
 
     def gradients(
         self, params: dict[str, torch.Tensor], generator: torch.Generator

@@ -20,33 +20,19 @@ import torch
 from ..bitstream.color import STEP_WEIGHTS
 from ..bitstream.quantization import Steps, trajectory_step
 from ..model.parametric_group import NodeMotion, ParametricGroup
+from ..model.rotations import quat_conjugate, quat_multiply, quat_to_rotvec
 from ..model.temporal_transform import dct_basis
-from ..render.workspace import Workspace
-from . import keyframe
-from .deformation_graph import NodeGraph, Pose, quat_conjugate, quat_multiply, quat_to_rotvec
+from ..render.optimizer import Adam
+from .deformation_graph import NodeGraph, Pose
 from .entropy_model import CanonicalRate, laplace_bits
 from .model import HIDDEN, NAMES, Model
 from .settings import TrainSettings
-from .views import Views, compare
-
-# attribute -> temporal frequencies that a group of so many frames may use, a longer one more in proportion; what is not
-# listed is constant in a group
-FREQUENCIES = {"means": 10, "quats": 4, "log_scales": 3, "logit_opacities": 3, "sh0": 6}
-FREQUENCIES_OF = 20
-STARTS = 0.5  # steps: a residual that is there from the start, of a Gaussian that has moved in an earlier group
-ROUND_DOWN = 0.1  # a coefficient below 0.6 steps is not coded, as the encoder does it
-RESIDUAL_RATE = 0.05  # in steps of the stream a step of the optimiser
-LAPLACE_RATE = 0.02
-MEANS_RATE = 4e-5  # of the canonical means, times the radius
-CANONICAL_SHARE = 0.3  # of the keyframe's rates
-CANONICAL_PRICE = 3.0  # of a canonical bit, in bits of residuals
-LOSS_SHARE = 0.05  # of one step in the mean of the losses
-RATE_EVERY = 8  # the rate term has every coefficient, an image few of them: once in so many steps, so much stronger
+from .views import Views, photometric_loss
 
 
-def rounded(c: torch.Tensor) -> torch.Tensor:
-    """The decoder's integers."""
-    return torch.nn.functional.softshrink(c, ROUND_DOWN).round_()
+def rounded(c: torch.Tensor, dead_zone: float) -> torch.Tensor:
+    """The decoder's integers, as the encoder rounds them."""
+    return torch.nn.functional.softshrink(c, dead_zone).round_()
 
 
 class GroupModel:
@@ -74,7 +60,9 @@ class GroupModel:
         poses: list[Pose],
         steps: Steps,
         moved: torch.Tensor,
+        settings: TrainSettings,
     ):
+        self.settings = settings.finetune
         self.graph, self.poses = graph, _at_rest_until_born(poses)
         counts = torch.tensor([len(m) for m in tracked])
         self.born = (counts[:, None] <= torch.arange(counts[-1])).sum(0)
@@ -86,15 +74,20 @@ class GroupModel:
         self.key = self._canonical(key, tracked)
         self.basis = torch.from_numpy(dct_basis(len(tracked))).float()  # [T, T]
         self.canonical_steps = {n: getattr(steps, n) for n in NAMES}
-        self.canonical_rate = CanonicalRate(self.key.params["means"], steps)
-        self.unit = {name: trajectory_step(getattr(steps, name), len(tracked)) for name in FREQUENCIES}
+        self.canonical_rate = CanonicalRate(self.key.params["means"], steps, settings.entropy_model)
+        self.unit = {
+            name: trajectory_step(getattr(steps, name), len(tracked)) for name in vars(self.settings.frequencies)
+        }
         self.unit["sh0"] *= float(STEP_WEIGHTS[0])  # Y, Co, Cg share one step; RGB errors add up over them
         self.means, self.turned = zip(*(self._carry(p) for p in self.poses), strict=True)
         self.coefficients = self._project(tracked)  # in units of the quantization step
-        self.free = torch.stack([(c.detach().abs() > STARTS).any(2).any(0) for c in self.coefficients.values()]).any(0)
+        self.free = torch.stack(
+            [(c.detach().abs() > self.settings.free_min).any(2).any(0) for c in self.coefficients.values()]
+        ).any(0)
         self.free |= moved
         self.log_scales = {
-            n: torch.full((len(c), 1, 1), -1.0, requires_grad=True) for n, c in self.coefficients.items()
+            n: torch.full((len(c), 1, 1), self.settings.log_scale_start, requires_grad=True)
+            for n, c in self.coefficients.items()
         }
 
     def _held(self, x: list[torch.Tensor]) -> torch.Tensor:
@@ -122,7 +115,7 @@ class GroupModel:
     def _project(self, tracked: list[Model]) -> dict[str, torch.Tensor]:
         """The tracked frames' lowest frequencies, minus what the nodes carry."""
         p = self.key.params
-        residual: dict[str, list] = {name: [] for name in FREQUENCIES}
+        residual: dict[str, list] = {name: [] for name in vars(self.settings.frequencies)}
         for model, means, turned in zip(tracked, self.means, self.turned, strict=True):
             q = model.params
             dq = quat_multiply(q["quats"], quat_conjugate(quat_multiply(turned, p["quats"])))
@@ -132,9 +125,9 @@ class GroupModel:
                 residual[name].append(q[name] - p[name])
             faded = (q["logit_opacities"] - p["logit_opacities"])[:, None]
             residual["logit_opacities"].append(torch.where(q["logit_opacities"][:, None] > HIDDEN, faded, 0.0))
-        out = {}
-        for name, most in FREQUENCIES.items():
-            low = self.basis[: -(-most * max(len(tracked), FREQUENCIES_OF) // FREQUENCIES_OF)]
+        out, per = {}, self.settings.frequencies_frames
+        for name, most in vars(self.settings.frequencies).items():
+            low = self.basis[: -(-most * max(len(tracked), per) // per)]
             c = torch.einsum("kt,tnc->knc", low, self._held(residual[name])) / self.unit[name]
             out[name] = c.contiguous().requires_grad_()
         return out
@@ -142,7 +135,10 @@ class GroupModel:
     @torch.no_grad()
     def residuals(self, t: int) -> dict[str, torch.Tensor]:
         """attribute -> [N, C], residual at frame `t`, in its own units."""
-        return {n: torch.tensordot(self._at(n, t), rounded(c), 1) for n, c in self.coefficients.items()}
+        return {
+            n: torch.tensordot(self._at(n, t), rounded(c, self.settings.dead_zone), 1)
+            for n, c in self.coefficients.items()
+        }
 
     @torch.no_grad()
     def backward(self, t: int, residuals: dict[str, torch.Tensor]) -> None:
@@ -200,7 +196,7 @@ class GroupModel:
         lifetimes = torch.stack([self.born, self.end], 1).numpy().astype(np.int32)
         cut = (lifetimes != [0, frames]).any()
         with torch.no_grad():
-            used = {n: rounded(c) * self.unit[n] for n, c in self.coefficients.items()}
+            used = {n: rounded(c, self.settings.dead_zone) * self.unit[n] for n, c in self.coefficients.items()}
         return ParametricGroup(
             frames,
             self.key.gaussians(),
@@ -219,7 +215,7 @@ class GroupModel:
             rotations.append(near)
         translations = [pose.nodes - self.graph.nodes for pose in self.poses]
         arrays = (self.graph.nodes, torch.stack(rotations), torch.stack(translations))
-        return NodeMotion(*(a.numpy().astype(np.float32) for a in arrays), *self.graph.blend())
+        return NodeMotion(*(a.numpy().astype(np.float32) for a in arrays), self.graph.neighbors, self.graph.weights)
 
 
 def _padded(model: Model, last: Model) -> Model:
@@ -244,46 +240,50 @@ class _Finetuner:
         self.group, self.views, self.frames, self.settings = group, views, frames, settings
         self.rng = np.random.default_rng([settings.seed, frames[0], 2])
         self.noise = torch.Generator().manual_seed(settings.seed)
-        self.workspace = Workspace()
-        rates = [(c, RESIDUAL_RATE) for c in group.coefficients.values()]
-        rates += [(s, LAPLACE_RATE) for s in group.log_scales.values()]
-        self.optimizer = torch.optim.Adam([{"params": [p], "base": r} for p, r in rates], betas=(0.9, 0.99), fused=True)
-        canonical = {n: CANONICAL_SHARE * r for n, r in keyframe.RATES.items()}
-        self.canonical_rates = {"means": MEANS_RATE * radius, **canonical} if group.known < len(group.key) else {}
+        f = settings.finetune
+        scales = {f"{n}.log_scale": s for n, s in group.log_scales.items()}
+        self.leaves = {**group.coefficients, **scales}  # what is optimised besides the canonical attributes
+        self.rates = dict.fromkeys(group.coefficients, f.coefficient_rate) | dict.fromkeys(scales, f.log_scale_rate)
+        self.adam = Adam(views.backend, f.coefficient_adam)
+        group.key.start_optimizer(views.backend, settings.adam)
+        canonical = settings.keyframe.rates.scaled(radius, f.canonical_rate_share)
+        canonical["means"] = f.canonical_means_rate * radius
+        self.canonical_rates = canonical if group.known < len(group.key) else {}
         self.loss = 0.0  # mean of the last steps'
         self.canonical_bits, _ = group.canonical_rate.gradients(group.key.params, self.noise)
 
     def step(self, t: int, fade: float) -> float:
         """One step on frame `t`, all rates times `fade`; returns the image loss."""
-        for g in self.optimizer.param_groups:
-            g["lr"] = g["base"] * fade
+        f = self.settings.finetune
         group, names = self.group, list(self.group.coefficients)
         residuals = {n: r.requires_grad_() for n, r in group.residuals(t).items()}
-        params = group.frame(t, residuals, self.noise)
+        params = group.frame(t, residuals, self.noise if f.canonical_noise else None)
         target = self.views.draw(self.frames[t])
-        result = compare(params, target, self.settings, self.rng, self.workspace)
-        self.loss += (result.loss - self.loss) * (LOSS_SHARE if self.loss else 1.0)
+        result = photometric_loss(params, target, self.settings, self.rng, self.views.backend)
+        self.loss += (result.loss - self.loss) * (f.loss_smoothing if self.loss else 1.0)
         heads, seeds = [params[n] for n in names], [result.grads[n] for n in names]
         extra: dict[str, torch.Tensor] = {}
-        if self.settings.rate_lambda and self.rng.integers(RATE_EVERY) == 0:
+        if self.settings.rate_lambda and self.rng.integers(f.rate_every) == 0:
             bits = group.bits(self.noise)
             price = self._price(float(bits.detach()))
             heads.append(price * bits)
             seeds.append(torch.ones(()))
             if self.canonical_rates:
                 self.canonical_bits, rate = group.canonical_rate.gradients(group.key.params, self.noise)
-                extra = {n: CANONICAL_PRICE * price * g for n, g in rate.items()}
-        self.optimizer.zero_grad()
+                extra = {n: f.canonical_bit_weight * price * g for n, g in rate.items()}
+        for leaf in self.leaves.values():
+            leaf.grad = None
         torch.autograd.backward(heads, seeds)
         group.backward(t, residuals)
-        self.optimizer.step()
+        by_leaf = {n: leaf.grad for n, leaf in self.leaves.items() if leaf.grad is not None}  # scales: with bits only
+        self.adam.step(self.leaves, by_leaf, {n: self.rates[n] * fade for n in by_leaf})
         if self.canonical_rates:
             back = quat_conjugate(group.turned[t])
             grads = {**result.grads, "quats": quat_multiply(back, result.grads["quats"])}  # to the canonical pose
             for n, g in grads.items():
                 g += extra.get(n, 0)
                 g[: group.known] = 0
-            group.key.adam(grads, {n: r * fade for n, r in self.canonical_rates.items()})
+            group.key.step(grads, {n: r * fade for n, r in self.canonical_rates.items()})
         return result.loss
 
     def _price(self, bits: float) -> float:
@@ -292,7 +292,7 @@ class _Finetuner:
         What counts is by which share bits and loss change. A group is priced as if it stood alone, so that a bit costs
         the same in all groups of a subject.
         """
-        return RATE_EVERY * self.settings.rate_lambda * self.loss / (bits + self.canonical_bits)
+        return self.settings.finetune.rate_every * self.settings.rate_lambda * self.loss / (bits + self.canonical_bits)
 
 
 def finetune(
@@ -315,6 +315,6 @@ def finetune(
     for step in range(steps):
         # The first and the last frame come twice: they have neighbours on one side only.
         order = order or run.rng.permutation([0, *range(len(frames)), len(frames) - 1]).tolist()
-        loss = run.step(order.pop(), 0.05 ** (step / steps))
+        loss = run.step(order.pop(), settings.finetune.rate_decay ** (step / steps))
         if on_step:
             on_step(step, loss)

@@ -12,32 +12,16 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from ..render.workspace import Workspace
 from .model import Model
-from .settings import TrainSettings
-from .views import Views, compare, look
-
-RATES = {"quats": 2e-3, "log_scales": 1e-2, "logit_opacities": 3e-2, "sh0": 5e-3, "shN": 1.5e-3}
-MEANS_RATE = (1.6e-3, 1.6e-5)  # start, end, times the radius of the subject
-DENSIFY_EVERY = 100
-DENSIFY_FROM, DENSIFY_UNTIL = 0.1, 0.6  # of the steps
-APPEARANCE_FROM = 0.3  # of the steps: exposure and harmonics wait for colours that are about right
-HARMONICS_PAY = 0.1  # share by which pictures must err more without harmonics; what these cost in quality buys 0.04
-KEYFRAME_SHARE = 0.8  # of the Gaussians at most; the rest is for births
-GROWTH = 0.12  # share of the Gaussians that one round may add
-THINNING = 0.25  # share of the Gaussians that one round of thinning may take
-THIN_UNTIL = 0.8  # of the steps, from DENSIFY_UNTIL on: what is left of them repairs the picture
-IDLE = 5.0  # a Gaussian goes if the picture without it errs by less than so many shares of the error per Gaussian
-LEAST_ERROR = 1e-8  # of a picture, mean square
-PRUNE_OPACITY = 0.02
-PRUNE_WEIGHT = 0.02  # a Gaussian whose largest blending weight in any view is below this is not seen
-SPLIT_SHRINK = np.log(1.6)
+from .settings import KeyframeSettings, TrainSettings
+from .views import Views, photometric_loss, view_losses
 
 
 class Statistics:
     """What densification asks for, gathered over the steps since the last round."""
 
-    def __init__(self, count: int):
+    def __init__(self, count: int, mse_min: float):
+        self.mse_min = mse_min
         self.pull = torch.zeros(count)  # sum of the screen-space gradient
         self.seen = torch.zeros(count)
         self.weight = torch.zeros(count)  # largest blending weight
@@ -51,7 +35,7 @@ class Statistics:
         self.seen += weight > 0
         torch.maximum(self.weight, weight, out=self.weight)
         self.pulse += torch.as_tensor(result.grads["logit_opacities"]).square() * (
-            3 * result.pixels / max(result.mse, LEAST_ERROR)
+            3 * result.pixels / max(result.mse, self.mse_min)
         )
         self.views += 1
 
@@ -91,85 +75,89 @@ def train_keyframe(
         densify: also clone, split and prune.
         on_step: called with (step, loss).
     """
+    k = settings.keyframe
     rng = np.random.default_rng([settings.seed, frame])
-    workspace = Workspace()
-    stats, losses = Statistics(len(model)), []
-    model.restart()
+    stats, losses = Statistics(len(model), k.mse_min), []
+    model.start_optimizer(views.backend, settings.adam)
     views.exposure.restart()
     views.extrinsics.restart()
     views.extrinsics.about(model.params["means"].numpy().mean(0, dtype=np.float64), radius)
     for step in range(steps):
         target = views.draw(frame)
-        result = compare(model.params, target, settings, rng, workspace)
+        result = photometric_loss(model.params, target, settings, rng, views.backend)
         stats.add(result)
         losses.append(result.loss - settings.mask_lambda * result.mask)
         fade = step / max(steps - 1, 1)
-        rate = radius * MEANS_RATE[0] * (MEANS_RATE[1] / MEANS_RATE[0]) ** fade
-        if step >= APPEARANCE_FROM * steps:
-            views.exposure.learn(target.index, result.grad_gain, 0.1**fade)
-            views.extrinsics.learn(target.index, model.params, result.grads, 0.1**fade)
-        model.adam(result.grads, {"means": rate, **{n: r * 0.1**fade for n, r in RATES.items()}})
-        if step == int(APPEARANCE_FROM * steps):
+        decay = k.rate_decay**fade
+        if step >= k.appearance_from * steps:
+            views.exposure.learn(target.index, result.grad_gain[0], decay)
+            views.extrinsics.learn(target.index, model.params, result.grads, decay)
+        means_rate = radius * k.rates.means * (k.means_rate_end / k.rates.means) ** fade
+        model.step(result.grads, {**k.rates.scaled(radius, decay), "means": means_rate})
+        if step == int(k.appearance_from * steps):
             model.set_degree(settings.sh_degree)
-        if step == int(DENSIFY_UNTIL * steps):
+        if step == int(k.densify_until * steps):
             views.exposure.settle()
             views.extrinsics.settle()
-        if step == int(THIN_UNTIL * steps) and not harmonics_pay(model, views, frame, settings, workspace):
+        if step == int(k.thin_until * steps) and not harmonics_pay(model, views, frame, settings):
             model.set_degree(0)
-        if densify and (step + 1) % DENSIFY_EVERY == 0:
-            if DENSIFY_FROM * steps < step < DENSIFY_UNTIL * steps:
-                grow(model, stats, int(KEYFRAME_SHARE * settings.gaussians_max), radius, rng)
-            elif step >= DENSIFY_UNTIL * steps:
-                prune(model, stats, thin=step < THIN_UNTIL * steps)
-            stats = Statistics(len(model))
+        if densify and (step + 1) % k.densify_every == 0:
+            if k.densify_from * steps < step < k.densify_until * steps:
+                grow(model, stats, int(k.gaussians_share * settings.gaussians_max), rng, k)
+            elif step >= k.densify_until * steps:
+                prune(model, stats, k, thin=step < k.thin_until * steps)
+            stats = Statistics(len(model), k.mse_min)
         if on_step:
             on_step(step, result.loss)
     return float(np.mean(losses[-len(views.train_cameras) :]))
 
 
-def harmonics_pay(model: Model, views: Views, frame: int, settings: TrainSettings, workspace: Workspace) -> bool:
+def harmonics_pay(model: Model, views: Views, frame: int, settings: TrainSettings) -> bool:
     """Whether the training views of `frame` are so much worse without them that they are worth their bits."""
     plain = {**model.params, "shN": model.params["shN"][:, :0].contiguous()}
-    whole, less = (np.mean([r.mse for r in look(p, views, frame, settings, workspace)]) for p in (model.params, plain))
-    return less > (1 + HARMONICS_PAY) * max(whole, LEAST_ERROR)
+    whole, less = (np.mean([r.mse for r in view_losses(p, views, frame, settings)]) for p in (model.params, plain))
+    k = settings.keyframe
+    return less > (1 + k.harmonics_gain_min) * max(whole, k.mse_min)
 
 
-def _shows(model: Model, stats: Statistics) -> torch.Tensor:
+def _shows(model: Model, stats: Statistics, settings: KeyframeSettings) -> torch.Tensor:
     """[N] bool: neither nearly transparent nor hidden in every view it was tried in."""
-    opaque = torch.sigmoid(model.params["logit_opacities"]) > PRUNE_OPACITY
-    return opaque & ((stats.weight > PRUNE_WEIGHT) | (stats.seen == 0))
+    opaque = torch.sigmoid(model.params["logit_opacities"]) > settings.prune_opacity
+    return opaque & ((stats.weight > settings.prune_weight) | (stats.seen == 0))
 
 
 @torch.no_grad()
-def prune(model: Model, stats: Statistics, *, thin: bool = False) -> None:
+def prune(model: Model, stats: Statistics, settings: KeyframeSettings, *, thin: bool = False) -> None:
     """Drops Gaussians that are nearly transparent or hidden in every view they were tried in; with `thin`, also those
     that are not worth their bits."""
-    keep = _shows(model, stats)
+    keep = _shows(model, stats, settings)
     if thin:
         worth = stats.worth(torch.sigmoid(model.params["logit_opacities"]))
-        keep &= worth >= min(IDLE, torch.quantile(worth, THINNING).item())
+        keep &= worth >= min(settings.contribution_min, torch.quantile(worth, settings.thinning).item())
     if keep.any():
         model.select(keep)
 
 
 @torch.no_grad()
-def grow(model: Model, stats: Statistics, most: int, radius: float, rng: np.random.Generator) -> None:
+def grow(model: Model, stats: Statistics, most: int, rng: np.random.Generator, settings: KeyframeSettings) -> None:
     """One round of densification: the Gaussians with the strongest pull are split (large) or cloned (small)."""
-    keep = _shows(model, stats)
+    keep = _shows(model, stats, settings)
     pull = stats.mean_pull()
     pull[~keep] = 0
-    room = max(0, min(int(GROWTH * len(model)), most - int(keep.sum())))
+    room = max(0, min(int(settings.growth * len(model)), most - int(keep.sum())))
     chosen = torch.topk(pull, min(room, len(pull))).indices
     chosen = chosen[pull[chosen] > 0]
     children = {n: p[chosen].clone() for n, p in model.params.items()}
     spread = torch.exp(children["log_scales"])
     large = spread.max(1).values > torch.exp(model.params["log_scales"]).max(1).values.median()
     offset = random_offset(children, rng)
-    children["means"] = children["means"] + offset * torch.where(large, 0.7, 0.3)[:, None]
+    children["means"] = (
+        children["means"] + offset * torch.where(large, settings.split_offset, settings.clone_offset)[:, None]
+    )
     parents = chosen[large]
-    model.params["means"][parents] -= 0.7 * offset[large]
-    model.params["log_scales"][parents] -= SPLIT_SHRINK
-    children["log_scales"][large] -= SPLIT_SHRINK
+    model.params["means"][parents] -= settings.split_offset * offset[large]
+    model.params["log_scales"][parents] -= np.log(settings.split_shrink)
+    children["log_scales"][large] -= np.log(settings.split_shrink)
     if keep.any():
         model.select(keep)
     model.append(children)

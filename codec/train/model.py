@@ -1,4 +1,4 @@
-"""Trainable Gaussians: attribute tensors with their Adam moments, and the surgery that densification needs."""
+"""Trainable Gaussians: attribute tensors and their optimiser, which gain and lose Gaussians together."""
 
 from __future__ import annotations
 
@@ -7,23 +7,20 @@ import math
 import numpy as np
 import torch
 
-from .. import _native
 from ..model.gaussians import SH_C0, Gaussians
+from ..render.backend import Backend
+from ..render.optimizer import Adam, AdamSettings
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
-BETAS = (0.9, 0.99)  # short schedules: a second moment that forgets in 100 steps
-EPS = 1e-15
 HIDDEN = -20.0  # logit of the opacity of what is not there
 
 
 class Model:
-    """N Gaussians as tensors (`params[name]`, f32) with Adam moments of the same shapes."""
+    """N Gaussians as tensors (`params[name]`, f32) and, once `start_optimizer` is called, their optimiser."""
 
     def __init__(self, params: dict[str, torch.Tensor]):
         self.params = {n: params[n].detach().clone().float().contiguous() for n in NAMES}
-        self._first = {n: torch.zeros_like(p) for n, p in self.params.items()}
-        self._second = {n: torch.zeros_like(p) for n, p in self.params.items()}
-        self._steps = 0
+        self._adam: Adam | None = None
 
     def __len__(self) -> int:
         return len(self.params["means"])
@@ -33,40 +30,35 @@ class Model:
         """Of the spherical harmonics."""
         return math.isqrt(self.params["shN"].shape[1] + 1) - 1
 
-    @torch.no_grad()
-    def adam(self, grads: dict[str, torch.Tensor], rates: dict[str, float]) -> None:
-        """One Adam step (Kingma and Ba 2015) on the attributes in `rates`, each in one pass over memory."""
-        self._steps += 1
-        for name, rate in rates.items():
-            tensors = (self.params[name], grads[name].float().contiguous(), self._first[name], self._second[name])
-            _native.adam(tuple(t.numpy() for t in tensors), rate, BETAS, EPS, self._steps)
+    def start_optimizer(self, backend: Backend, settings: AdamSettings) -> None:
+        """A new Adam for a new stage or frame, with zero moments."""
+        self._adam = Adam(backend, settings)
 
-    def restart(self) -> None:
-        """Forgets the moments (a new frame, a new stage)."""
-        self._steps = 0
-        for store in (self._first, self._second):
-            for t in store.values():
-                t.zero_()
+    def step(self, grads: dict[str, torch.Tensor], rates: dict[str, float]) -> None:
+        """One step of the optimiser on the attributes in `rates`."""
+        self._adam.step(self.params, grads, rates)
 
     def select(self, index: torch.Tensor) -> None:
         """Keeps the Gaussians at `index` ([M] int or [N] bool)."""
-        for store in (self.params, self._first, self._second):
-            for n in NAMES:
-                store[n] = store[n][index].contiguous()
+        for n in NAMES:
+            self.params[n] = self.params[n][index].contiguous()
+        if self._adam is not None:
+            self._adam.select(index.numpy())
 
     def append(self, params: dict[str, torch.Tensor]) -> None:
-        """Adds Gaussians with fresh moments."""
+        """Adds Gaussians, with zero moments."""
         for n in NAMES:
-            new = params[n].to(self.params[n].dtype)
-            self.params[n] = torch.cat([self.params[n], new])
-            for store in (self._first, self._second):
-                store[n] = torch.cat([store[n], torch.zeros_like(new)])
+            self.params[n] = torch.cat([self.params[n], params[n].to(self.params[n].dtype)])
+        if self._adam is not None:
+            self._adam.append(len(params["means"]))
 
     def set_degree(self, degree: int) -> None:
-        """Gives the Gaussians spherical harmonics of this degree: higher ones go, lower ones that are missing are 0."""
-        more = (degree + 1) ** 2 - 1 - self.params["shN"].shape[1]
-        for store in (self.params, self._first, self._second):
-            store["shN"] = torch.nn.functional.pad(store["shN"], (0, 0, 0, more)).contiguous()
+        """Gives the Gaussians spherical harmonics of this degree; higher ones are dropped, missing ones are 0."""
+        count = (degree + 1) ** 2 - 1
+        shN = self.params["shN"]
+        self.params["shN"] = torch.nn.functional.pad(shN, (0, 0, 0, count - shN.shape[1])).contiguous()
+        if self._adam is not None:
+            self._adam.resize("shN", count)
 
     def gaussians(self) -> Gaussians:
         """A copy in numpy, quaternions normalised."""

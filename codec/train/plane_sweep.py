@@ -12,21 +12,13 @@ from __future__ import annotations
 import numpy as np
 
 from ..model.camera import fibonacci_directions
+from .settings import PlaneSweepSettings
 from .visual_hull import colors_of, meeting_point, project
 
-WIDTH = 256  # pixels of the pictures that are compared
-PLANES = 96  # evenly in 1/depth
-NEIGHBOURS = 4
-WINDOW = 7  # pixels
-CORRELATION = 0.6  # least, to be believed
-AGREEMENT = 0.03  # relative difference of depth between two views
-BEST = 2  # neighbours that make the score
-FLAT = 2.0  # standard deviation of grey levels below which a window says nothing
-NEAR, FAR = 0.2, 4.0  # times the distance to where the axes meet
-SHELL = 500  # points on the whole sphere
 
-
-def sweep(views, count: int, seed: int, masks: list[np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:
+def sweep(
+    views, count: int, seed: int, settings: PlaneSweepSettings, masks: list[np.ndarray] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Points on the surfaces that several views see.
 
     Args:
@@ -41,7 +33,7 @@ def sweep(views, count: int, seed: int, masks: list[np.ndarray] | None = None) -
 
     cameras, pictures, where = [], [], []
     for i, (camera, rgb, _) in enumerate(views):
-        scale = min(1.0, WIDTH / camera.width)
+        scale = min(1.0, settings.width / camera.width)
         size = (round(scale * camera.width), round(scale * camera.height))
         cameras.append(camera.resized(*size))
         pictures.append(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA))
@@ -50,14 +42,18 @@ def sweep(views, count: int, seed: int, masks: list[np.ndarray] | None = None) -
     greys = [cv2.cvtColor(p, cv2.COLOR_RGB2GRAY).astype(np.float32) for p in pictures]
     centre = meeting_point(cameras)
     distance = np.median([np.linalg.norm(c.center - centre) for c in cameras])
-    inverse = np.linspace(1 / (FAR * distance), 1 / (NEAR * distance), PLANES)
-    near = [_neighbours(cameras, i) for i in range(len(cameras))]
-    depths = [_depth(cameras, greys, where[i], i, near[i], inverse) for i in range(len(cameras))]
+    inverse = np.linspace(1 / (settings.far * distance), 1 / (settings.near * distance), settings.planes)
+    near = [_neighbours(cameras, i, settings) for i in range(len(cameras))]
+    depths = [_depth(cameras, greys, where[i], i, near[i], inverse, settings) for i in range(len(cameras))]
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for i, camera in enumerate(cameras):
         y, x = np.nonzero(depths[i])
         found = _unproject(camera, x, y, depths[i][y, x])
-        sure = np.any([_agree(found, cameras[j], depths[j]) for j in near[i]] or [np.zeros(len(found), bool)], axis=0)
+        sure = np.any(
+            [_agree(found, cameras[j], depths[j], settings.depth_tolerance) for j in near[i]]
+            or [np.zeros(len(found), bool)],
+            axis=0,
+        )
         points.append(found[sure])
         colors.append(pictures[i][y, x][sure] / 255)
     points, colors = np.concatenate(points), np.concatenate(colors)
@@ -65,12 +61,14 @@ def sweep(views, count: int, seed: int, masks: list[np.ndarray] | None = None) -
     return points[chosen], colors[chosen]
 
 
-def shell(views) -> tuple[np.ndarray, np.ndarray]:
+def shell(views, settings: PlaneSweepSettings) -> tuple[np.ndarray, np.ndarray]:
     """Far points, evenly in all directions that a view sees: positions [P, 3] and colours [P, 3] in 0..1."""
+    if not settings.shell_points:
+        return np.zeros((0, 3)), np.zeros((0, 3))
     cameras = [c for c, _, _ in views]
     centre = meeting_point(cameras)
-    radius = FAR * np.median([np.linalg.norm(c.center - centre) for c in cameras])
-    points = centre + radius * fibonacci_directions(SHELL)
+    radius = settings.far * np.median([np.linalg.norm(c.center - centre) for c in cameras])
+    points = centre + radius * fibonacci_directions(settings.shell_points)
     seen = np.zeros(len(points), bool)
     for c in cameras:
         p, depth = project(c, points)
@@ -78,12 +76,12 @@ def shell(views) -> tuple[np.ndarray, np.ndarray]:
     return points[seen], colors_of(points[seen], views)
 
 
-def _neighbours(cameras, i: int) -> list[int]:
-    """The nearest cameras that look the same way (within 60 degrees)."""
+def _neighbours(cameras, i: int, settings: PlaneSweepSettings) -> list[int]:
+    """The nearest cameras that look the same way."""
     axis = [c.viewmat[2, :3] for c in cameras]
     away = [np.linalg.norm(c.center - cameras[i].center) for c in cameras]
-    order = [j for j in np.argsort(away) if j != i and axis[j] @ axis[i] > 0.5]
-    return order[:NEIGHBOURS]
+    order = [j for j in np.argsort(away) if j != i and axis[j] @ axis[i] > settings.axis_cosine_min]
+    return order[: settings.neighbours]
 
 
 def _unproject(camera, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -91,13 +89,13 @@ def _unproject(camera, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.nd
     return (rays * depth[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
 
 
-def _agree(points: np.ndarray, camera, depths: np.ndarray) -> np.ndarray:
+def _agree(points: np.ndarray, camera, depths: np.ndarray, tolerance: float) -> np.ndarray:
     """[N] bool: the depth map of `camera` has a surface there."""
     p, depth = project(camera, points)
     x, y = np.floor(p).astype(np.int64).T
     on = (depth > 0) & (x >= 0) & (y >= 0) & (x < depths.shape[1]) & (y < depths.shape[0])
     there = depths[y.clip(0, depths.shape[0] - 1), x.clip(0, depths.shape[1] - 1)]
-    return on & (there > 0) & (np.abs(there - depth) < AGREEMENT * depth)
+    return on & (there > 0) & (np.abs(there - depth) < tolerance * depth)
 
 
 def _plane(camera, other, inverse_depth: float) -> np.ndarray:
@@ -110,15 +108,17 @@ def _plane(camera, other, inverse_depth: float) -> np.ndarray:
     return np.linalg.inv(centre) @ H @ centre
 
 
-def _windows(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _windows(grey: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation of the window around each pixel."""
     import cv2
 
-    mean = cv2.blur(grey, (WINDOW, WINDOW))
-    return mean, np.sqrt(np.maximum(cv2.blur(grey * grey, (WINDOW, WINDOW)) - mean * mean, 1e-6))
+    mean = cv2.blur(grey, (side, side))
+    return mean, np.sqrt(np.maximum(cv2.blur(grey * grey, (side, side)) - mean * mean, 1e-6))
 
 
-def _depth(cameras, greys, where: np.ndarray, i: int, near: list[int], inverse: np.ndarray) -> np.ndarray:
+def _depth(
+    cameras, greys, where: np.ndarray, i: int, near: list[int], inverse: np.ndarray, settings: PlaneSweepSettings
+) -> np.ndarray:
     """[H, W] depth of view `i`, 0 where it is not known; `where` [H, W] bool: pixels that are asked for."""
     import cv2
 
@@ -129,7 +129,7 @@ def _depth(cameras, greys, where: np.ndarray, i: int, near: list[int], inverse: 
     top, bottom, left, right = rows[0], rows[-1] + 1, cols[0], cols[-1] + 1
     part = (slice(top, bottom), slice(left, right))
     camera, grey = cameras[i].cropped(left, top, right - left, bottom - top), greys[i][part]
-    mean, deviation = _windows(grey)
+    mean, deviation = _windows(grey, settings.window)
     best, depth = np.full(grey.shape, -1, np.float32), np.zeros(grey.shape, np.float32)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     for d in inverse:
@@ -137,13 +137,13 @@ def _depth(cameras, greys, where: np.ndarray, i: int, near: list[int], inverse: 
         for score, j in zip(scores, near, strict=True):
             plane = _plane(camera, cameras[j], d)
             seen = cv2.warpPerspective(greys[j], plane, grey.shape[::-1], flags=flags, borderValue=-1)
-            mean_seen, deviation_seen = _windows(seen)
-            score[:] = cv2.blur(grey * seen, (WINDOW, WINDOW)) - mean * mean_seen
-            score /= deviation * np.maximum(deviation_seen, FLAT)
+            mean_seen, deviation_seen = _windows(seen, settings.window)
+            score[:] = cv2.blur(grey * seen, (settings.window, settings.window)) - mean * mean_seen
+            score /= deviation * np.maximum(deviation_seen, settings.contrast_min)
             score[seen < 0] = -1
-        score = np.sort(scores, 0)[-BEST:].mean(0)
+        score = np.sort(scores, 0)[-settings.scored_neighbours :].mean(0)
         better = score > best
         best[better], depth[better] = score[better], 1 / d
-    depth[(best < CORRELATION) | (deviation < FLAT) | ~where[part]] = 0
+    depth[(best < settings.correlation_min) | (deviation < settings.contrast_min) | ~where[part]] = 0
     whole[part] = depth
     return whole

@@ -10,7 +10,7 @@ import socket
 from collections.abc import Callable, Iterator
 
 from ..errors import UsageError, require
-from ..model.gaussians import Group
+from ..model.parametric_group import ParametricGroup
 from .settings import TrainSettings
 from .train import segments, train_groups
 
@@ -26,7 +26,7 @@ def cluster_groups(
     *,
     first_frame: int = 0,
     on_progress: Callable[[int], None] | None = None,
-) -> Iterator[Group]:
+) -> Iterator[ParametricGroup]:
     """Yields what `train_groups` does.
 
     Args:
@@ -47,7 +47,7 @@ def cluster_groups(
     try:
         left = [s for s in segments(open_capture().frame_count, settings.gop, random_access) if s.stop > first_frame]
         cpus = int(min(CPUS, max(node["Resources"].get("CPU", 1) for node in ray.nodes())))
-        threads = {"env_vars": {"RAYON_NUM_THREADS": str(cpus)}}
+        threads = {"env_vars": {"RAYON_NUM_THREADS": str(cpus), "OMP_NUM_THREADS": "1"}}  # of the kernels, of torch
         job = ray.remote(num_cpus=cpus, max_retries=RETRIES, runtime_env=threads)(train_segment)
         pending = [job.remote(open_capture, settings, random_access, s) for s in left]
         for segment in left:
@@ -74,7 +74,9 @@ def _knock(address: str) -> None:
         socket.create_connection((host, int(port)), timeout=10).close()
 
 
-def train_segment(open_capture: Callable, settings: TrainSettings, random_access: int, frames: range) -> list[Group]:
+def train_segment(
+    open_capture: Callable, settings: TrainSettings, random_access: int, frames: range
+) -> list[ParametricGroup]:
     """One job: the groups of a segment."""
     done, groups = (
         frames.start,

@@ -11,33 +11,32 @@ import numpy as np
 import torch
 
 from ..farthest_point_sampling import farthest_points
-from ..render.image import render_image
-from .densification import GREY, sweep_wrong, wrong_pixels
+from .densification import sweep_wrong, wrong_pixels
 from .model import HIDDEN, Model
-
-LOST = 1.002  # times the error without them; what is hidden makes none
-POINTS = 1000
-PLACES, ROUNDS = 8, 5  # that are tried, each the mean of the points around it
+from .settings import RelocalizationSettings, TrainSettings
 
 
-def whereabouts(model: Model, some: torch.Tensor, frame: int, views, changes, masks) -> torch.Tensor | None:
+def whereabouts(
+    model: Model, some: torch.Tensor, frame: int, changes, masks: list[np.ndarray], settings: TrainSettings
+) -> torch.Tensor | None:
     """[3], the shift that brings Gaussians to where `frame` shows them; None: nowhere.
 
     Args:
         model: all Gaussians; some: [N] bool, those in question.
         changes: fitted to `frame`; masks: [h, w] bool of each training camera, what has changed in it.
     """
+    s, views = settings.relocalization, changes.views
     hidden = torch.where(some, HIDDEN, model.params["logit_opacities"])
     others = Model({**model.params, "logit_opacities": hidden})
     least, found = error(others, frame, changes), None
-    if error(model, frame, changes) < LOST * least:
+    if error(model, frame, changes) < s.error_ratio * least:
         return torch.zeros(3)
-    wrong = wrong_pixels(others, masks, frame, views)
-    points, _ = sweep_wrong(wrong, frame, views, POINTS)
+    wrong = wrong_pixels(others, masks, frame, views, settings.densification)
+    points, _ = sweep_wrong(wrong, frame, views, s.points, settings.plane_sweep)
     means = model.params["means"]
     centre = means[some].mean(0)
-    radius = float((means[some] - centre).norm(dim=1).quantile(0.9))
-    for place in _places(points, radius):
+    radius = float((means[some] - centre).norm(dim=1).quantile(s.radius_quantile))
+    for place in _places(points, radius, s):
         shift = torch.from_numpy(place).float() - centre
         moved = Model({**model.params, "means": means + torch.where(some[:, None], shift, 0.0)})
         if (e := error(moved, frame, changes)) < least:
@@ -46,20 +45,19 @@ def whereabouts(model: Model, some: torch.Tensor, frame: int, views, changes, ma
 
 
 def error(model: Model, frame: int, changes) -> float:
-    """Mean absolute difference to the small pictures of `changes`, fitted to `frame`, over all training cameras."""
+    """Mean absolute difference to the small pictures of `changes`, over all training cameras."""
     g, views, differences = model.gaussians(), changes.views, []
     for i, picture in zip(views.train_cameras, changes.fitted, strict=True):
-        camera = views.camera(i, frame).resized(*picture.shape[1::-1])
-        shown = render_image(views.exposure.seen(g, i), camera, GREY)
+        shown = views.render(g, i, frame, picture.shape[1::-1])
         differences.append(np.abs(shown.astype(np.float32) - picture).mean())
     return float(np.mean(differences))
 
 
-def _places(points: np.ndarray, radius: float) -> list[np.ndarray]:
+def _places(points: np.ndarray, radius: float, settings: RelocalizationSettings) -> list[np.ndarray]:
     """Centres [3] of balls of this radius that hold many of the `points` [P, 3] (mean shift)."""
     found = []
-    for place in points[farthest_points(points, PLACES)] if len(points) else ():
-        for _ in range(ROUNDS):
+    for place in points[farthest_points(points, settings.places)] if len(points) else ():
+        for _ in range(settings.mean_shift_rounds):
             place = points[np.linalg.norm(points - place, axis=1) <= radius].mean(0)
         found.append(place)
     return found

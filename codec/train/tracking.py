@@ -22,32 +22,16 @@ import numpy as np
 import torch
 
 from ..bitstream.quantization import subject_radius
-from ..render.workspace import Workspace
+from ..model.rotations import quat_conjugate, quat_multiply, rotvec_to_quat
+from ..render.optimizer import Adam
 from .change_detection import Changes
-from .deformation_graph import NodeGraph, Pose, quat_conjugate, quat_multiply, rotvec_to_quat
-from .densification import LEAST, born, wrong_pixels
-from .keyframe import PRUNE_OPACITY, Statistics, rotate
+from .deformation_graph import NodeGraph, Pose
+from .densification import born, wrong_pixels
+from .keyframe import Statistics, rotate
 from .model import HIDDEN, NAMES, Model
 from .relocalization import whereabouts
 from .settings import TrainSettings
-from .views import Views, compare, look
-
-ROUNDS = 4  # at most, of `motion_steps` each: as many as a frame needs to come near the loss of the one before
-PAYS, LOSS_FLOOR = 1.2, 0.001  # what is near
-SMALL = 0.5  # scale of the pictures in the first half of the steps
-LOSS_WINDOW = 20  # steps over which a loss is averaged: about every view once
-TURN_RATE, MOVE_RATE = 2e-2, 3e-3  # of the nodes: radians, radii
-# Where no velocity is known yet, a first round at small pictures: the nodes hold together, and the Gaussians' own rates
-# are slow, or else what has moved far takes the colours of what it lies over.
-STIFF, SLOW = 25.0, 0.1  # times the rigidity and the rates
-MASK_LAMBDA = 3.0  # the silhouette counts more than in a keyframe: it does not depend on light
-# The Gaussians' own: what light changes is quick, place and shape are slow, so that the nodes take the motion.
-RATES = {"quats": 6e-4, "log_scales": 6e-3, "logit_opacities": 2e-2, "sh0": 5e-2, "shN": 2.5e-3}
-MEANS_RATE = 3e-5  # radii
-CALM = 0.995  # quantile of the pull in a keyframe
-CROWD = 2  # times the Gaussians that may live at once: those of a group, with its dead
-AWAY = 4.0  # times their distance from one another: newcomers so far from all else are strangers
-VISIBLE = 0.05  # blending weight from which a camera sees a Gaussian
+from .views import Views, photometric_loss, view_losses
 
 
 class Tracker:
@@ -72,31 +56,31 @@ class Tracker:
         self, graph: NodeGraph, own: Model, views: Views, settings: TrainSettings, numbers: np.ndarray, changes: Changes
     ):
         self.graph, self.own, self.pose, self.views = graph, own, Pose.rest(graph), views
-        self.settings = replace(settings, mask_lambda=MASK_LAMBDA * settings.mask_lambda)
+        self.settings = replace(settings, mask_lambda=settings.tracking.mask_factor * settings.mask_lambda)
         self.radius, self.loss, self.calm = numbers.tolist()
         self.changes = changes
         self.moving = torch.zeros(len(own), dtype=torch.bool)
-        self.workspace = Workspace()
 
     @staticmethod
     def start(key: Model, views: Views, settings: TrainSettings, loss: float, frames: range) -> Tracker:
         """Follows `key`, the keyframe of frames[0] with image loss `loss`; most nodes go where frames[1] differs."""
-        stats, visible, changes = Statistics(len(key)), [], Changes.since(views, frames[0])
-        for result in look(key.params, views, frames[0], settings, Workspace()):
+        changes = Changes.since(views, frames[0], settings.change_detection)
+        stats, visible = Statistics(len(key), settings.keyframe.mse_min), []
+        for result in view_losses(key.params, views, frames[0], settings):
             stats.add(result)
-            visible.append(result.max_weight > VISIBLE)
+            visible.append(result.max_weight > settings.tracking.visible_weight)
         means = key.params["means"]
         moving = np.ones(len(key), bool)
         if len(frames) > 1:
-            seen = changes.behind(changes.copy().advance(frames[1]), frames[1], means.numpy(), visible)
+            seen = changes.behind(frames[1], changes.copy().advance(frames[1]), means.numpy(), visible)
             moving = seen if seen.any() else moving
         radius = subject_radius(means[moving].numpy())
         sizes = torch.ones(len(key))
         if not views.capture.has_alpha:  # there is a background
             sizes = key.params["log_scales"].sort(1).values[:, 1:].mean(1).exp()  # without the thin axis
-        graph = NodeGraph.of(means, sizes, radius, torch.from_numpy(moving))
+        graph = NodeGraph.of(means, sizes, radius, torch.from_numpy(moving), settings.graph)
         own = Model({**key.params, "means": torch.zeros_like(means)})
-        calm = float(torch.quantile(stats.mean_pull(), CALM))
+        calm = float(torch.quantile(stats.mean_pull(), settings.tracking.gradient_quantile))
         return Tracker(graph, own, views, settings, np.array([radius, loss, calm]), changes)
 
     def carried(self, own: Model, pose: Pose) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
@@ -129,12 +113,13 @@ class Tracker:
 
     def _fit(self, frame: int, on_step) -> None:
         fit = _Fit(self, np.random.default_rng([self.settings.seed, frame, 1]))
-        bound, loss = PAYS * self.loss + LOSS_FLOOR, np.inf
+        s = self.settings.tracking
+        bound, loss = s.loss_ratio * self.loss + s.loss_floor, np.inf
         if not self.pose.move.any():
             self._round(fit, frame, 1.0, on_step)
-        for turn in range(ROUNDS):
+        for turn in range(s.rounds_max):
             before, loss = loss, self._round(fit, frame, 0.5 if turn == 0 else 0.0, on_step)
-            if loss < bound or loss > 0.9 * before:
+            if loss < bound or loss > s.progress_ratio * before:
                 break
         self.own, self.pose = fit.result()
         self.loss = loss
@@ -146,7 +131,7 @@ class Tracker:
         for k in np.setdiff1d(family[(self.moving & self.alive).numpy()], [0]):
             some = torch.from_numpy(family == k) & self.alive
             model = Model(self.carried(self.own, next_pose)[0])
-            shift = whereabouts(model, some, frame, self.views, self.changes, self.masks)
+            shift = whereabouts(model, some, frame, self.changes, self.masks, self.settings)
             if shift is None:
                 self._bury(some)
             else:
@@ -155,7 +140,7 @@ class Tracker:
 
     @property
     def _faded(self) -> torch.Tensor:
-        return torch.sigmoid(self.own.params["logit_opacities"]) < PRUNE_OPACITY
+        return torch.sigmoid(self.own.params["logit_opacities"]) < self.settings.keyframe.prune_opacity
 
     def _bury(self, dead: torch.Tensor) -> None:
         """Gaussians of `dead` ([N] bool) do not come back."""
@@ -176,9 +161,9 @@ class Tracker:
     def bear(self, frame: int, on_step: Callable[[int, float], None] | None = None) -> None:
         """Adds the Gaussians that `frame` needs besides, after `advance`."""
         most = self.settings.gaussians_max
-        room = min(most - int(self.alive.sum()), CROWD * most - len(self.own))
+        room = min(most - int(self.alive.sum()), self.settings.tracking.stored_factor * most - len(self.own))
         pull = self.pull / self.calm
-        wrong = wrong_pixels(self.model, self.masks, frame, self.views)
+        wrong = wrong_pixels(self.model, self.masks, frame, self.views, self.settings.densification)
         young = born(self.model, pull, wrong, frame, self.views, self.settings, room, on_step)
         if young is not None:
             self._add(young)
@@ -196,12 +181,13 @@ class Tracker:
         them, too. Strangers, away from all, have nodes of their own, and what is nearest to these goes with them."""
         from scipy.spatial import cKDTree
 
+        s = self.settings.tracking
         params, turned = self.carried(self.own, self.pose)
         there, turned, rest = params["means"][self.alive], turned[self.alive], self.graph.means[self.alive]
         among = np.median(cKDTree(means.numpy()).query(means.numpy(), 2)[0][:, 1])
-        strange = torch.from_numpy(cKDTree(there.numpy()).query(means.numpy())[0] > AWAY * among)
+        strange = torch.from_numpy(cKDTree(there.numpy()).query(means.numpy())[0] > s.separate_distance * among)
         first = len(self.graph)
-        shift = self.graph.settle(means[strange]) if strange.sum() >= LEAST else None
+        shift = self.graph.settle(means[strange]) if strange.sum() >= s.separate_min else None
         if shift is not None:
             self.pose = self.pose.joined(self.graph.nodes[first:] - shift)
             there, rest = torch.cat([there, means[strange]]), torch.cat([rest, means[strange] + shift])
@@ -211,14 +197,15 @@ class Tracker:
 
     def _round(self, fit: _Fit, frame: int, coarse: float, on_step) -> float:
         """`motion_steps` views, the first share of them, `coarse`, small; returns the image loss at the end."""
+        s = self.settings.tracking
         losses, steps = [], self.settings.motion_steps
         for step in range(steps):
             full = step >= coarse * steps
-            target = self.views.draw(frame, 1.0 if full else SMALL)
-            losses.append(fit.step(target, 0.1 ** (step / steps), full, stiff=coarse == 1))
+            target = self.views.draw(frame, 1.0 if full else s.small_scale)
+            losses.append(fit.step(target, s.rate_decay ** (step / steps), full, stiff=coarse == 1))
             if on_step:
                 on_step(step, losses[-1])
-        return float(np.mean(losses[-LOSS_WINDOW:]))
+        return float(np.mean(losses[-s.loss_window :]))
 
     def stirred(self, frame: int, before: torch.Tensor) -> float:
         """Share of the Gaussians that `frame`, the next one, shows otherwise, beyond those of `before` ([N] bool)."""
@@ -235,9 +222,10 @@ class Tracker:
         model = self.model
         if not any(m.any() for m in masks):
             return np.zeros(len(model), bool)
-        looks = look(model.params, self.views, frame, self.settings, self.workspace, SMALL)
-        visible = [result.max_weight > VISIBLE for result in looks]
-        return self.changes.behind(masks, frame, model.params["means"].numpy(), visible)
+        s = self.settings.tracking
+        looks = view_losses(model.params, self.views, frame, self.settings, s.small_scale)
+        visible = [result.max_weight > s.visible_weight for result in looks]
+        return self.changes.behind(frame, masks, model.params["means"].numpy(), visible)
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays, for a checkpoint."""
@@ -252,8 +240,9 @@ class Tracker:
     def restored(state: dict[str, np.ndarray], views: Views, settings: TrainSettings) -> Tracker:
         """Inverse of `state`."""
         own = Model({n: torch.from_numpy(state[f"own.{n}"]) for n in NAMES})
-        graph = NodeGraph.restored({n[6:]: a for n, a in state.items() if n.startswith("graph.")})
-        changes = Changes(views, [state[f"fitted.{i}"] for i in range(len(views.train_cameras))])
+        graph = NodeGraph.restored({n[6:]: a for n, a in state.items() if n.startswith("graph.")}, settings.graph)
+        fitted = [state[f"fitted.{i}"] for i in range(len(views.train_cameras))]
+        changes = Changes(views, fitted, settings.change_detection)
         tracker = Tracker(graph, own, views, settings, state["numbers"], changes)
         tracker.pose = Pose(*(torch.from_numpy(state[f"pose.{f.name}"]) for f in fields(Pose)))
         return tracker
@@ -272,36 +261,36 @@ class _Fit:
         self.carriers = tracker.graph.carriers(tracker.moving).float()[:, None]
         self.turn = (tracker.pose.turn * self.carriers).requires_grad_()
         self.move = (tracker.pose.move * self.carriers).requires_grad_()
-        rates = [(self.turn, TURN_RATE), (self.move, MOVE_RATE * tracker.radius)]
-        self.optimizer = torch.optim.Adam([{"params": [p], "base": r} for p, r in rates], betas=(0.9, 0.99), fused=True)
+        s = tracker.settings.tracking
+        self.node_rates = {"rotation": s.node_rotation_rate, "translation": s.node_translation_rate * tracker.radius}
+        self.node_adam = Adam(tracker.views.backend, s.node_adam)
         self.own = Model(tracker.own.params)
-        self.pull = Statistics(len(self.own))
+        self.own.start_optimizer(tracker.views.backend, tracker.settings.adam)
+        self.pull = Statistics(len(self.own), tracker.settings.keyframe.mse_min)
 
     def _pose(self) -> Pose:
         return replace(self.t.pose, turn=self.turn, move=self.move).ahead()
 
     def step(self, target, fade: float, full: bool, stiff: bool) -> float:
-        """One view; rates times `fade`; a `full` one counts for what pulls at the Gaussians; `stiff`: see STIFF."""
-        t, pose = self.t, self._pose()
+        """One view; rates times `fade`; a `full` one counts for what pulls at the Gaussians; `stiff`: see
+        `first_round_rigidity`."""
+        t, pose, s = self.t, self._pose(), self.t.settings.tracking
         params, turned = t.carried(self.own, pose)
-        result = compare(params, target, t.settings, self.rng, t.workspace)
+        result = photometric_loss(params, target, t.settings, self.rng, t.views.backend)
         if full:
             self.pull.add(result)
         grads = result.grads
-        rigid = (STIFF if stiff else 1.0) * t.settings.rigidity * t.graph.rigidity(pose)
-        for g in self.optimizer.param_groups:
-            g["lr"] = g["base"] * fade
-        self.optimizer.zero_grad()
+        rigid = (s.first_round_rigidity if stiff else 1.0) * t.settings.rigidity * t.graph.rigidity(pose)
+        self.turn.grad = self.move.grad = None
         heads, seeds = [params["means"], params["quats"], rigid], [grads["means"], grads["quats"], torch.ones(())]
         torch.autograd.backward(heads, seeds)
-        self.turn.grad *= self.carriers
-        self.move.grad *= self.carriers
-        self.optimizer.step()
+        nodes = {"rotation": self.turn, "translation": self.move}
+        by_nodes = {n: p.grad * self.carriers for n, p in nodes.items()}
+        self.node_adam.step(nodes, by_nodes, {n: r * fade for n, r in self.node_rates.items()})
         back = quat_multiply(quat_conjugate(turned.detach()), grads["quats"])
-        rates = {"means": MEANS_RATE * t.radius, **RATES}
-        fade *= SLOW if stiff else 1.0
+        fade *= s.first_round_rates if stiff else 1.0
         own = {n: g * self.moving.view(-1, *[1] * (g.dim() - 1)) for n, g in {**grads, "quats": back}.items()}
-        self.own.adam(own, {n: r * fade for n, r in rates.items()})
+        self.own.step(own, s.rates.scaled(t.radius, fade))
         return result.loss - t.settings.mask_lambda * result.mask
 
     @torch.no_grad()

@@ -17,7 +17,9 @@ import torch
 from ..atomic_write import read_arrays, write_arrays
 from ..bitstream.quantization import Steps, steps_for, subject_radius
 from ..errors import CaptureError
-from ..model.gaussians import Group
+from ..model.parametric_group import ParametricGroup
+from ..render.backend import Backend
+from ..render.cpu import CpuBackend
 from ..render.sensitivity import measured_steps
 from .deformation_graph import Pose
 from .finetune import GroupModel, finetune
@@ -28,11 +30,6 @@ from .settings import TrainSettings
 from .tracking import Tracker
 from .views import Views
 from .visual_hull import carve, random_box
-
-CUT_FLOOR = 0.004  # image loss that no frame is cut for: clean pictures fit far better than they need to
-STIRRED = 0.15  # share of the Gaussians that begin to change in one frame, for which a group ends
-SETTLED = 4  # frames that a group has at least before that
-SWEEP_LEAST = 0.1  # of the initial points that a plane sweep must find, to be a scene with texture
 
 
 @dataclass
@@ -59,23 +56,24 @@ def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
     cameras = capture.indices("train")
     if not cameras:
         raise CaptureError(f"{capture.name}: no training camera, expected at least one with split 'train'")
-    views = []
-    for i in cameras:
-        v = capture.view(i, frame)
-        views.append((capture.camera(i, frame), v.rgb, v.alpha))
+    i, views = settings.initialization, []
+    for camera in cameras:
+        v = capture.view(camera, frame)
+        views.append((capture.camera(camera, frame), v.rgb, v.alpha))
     known = [c for c, _, _ in views]
     if all(alpha is not None for _, _, alpha in views):
-        points, colors = carve(known, views, settings.initial_points)
+        points, colors = carve(known, views, settings.initial_points, settings.visual_hull)
         if len(points):
-            return from_points(points, colors, opacity=0.5)
-    points, colors = sweep(views, settings.initial_points, settings.seed)
-    if len(points) >= SWEEP_LEAST * settings.initial_points:
-        surface = zip((points, colors), shell(views), strict=True)
-        return from_points(*(np.concatenate(pair) for pair in surface), opacity=0.5)
-    points, colors = random_box(known, views, settings.initial_points, settings.seed)
+            return from_points(points, colors, opacity=i.surface_opacity)
+    if i.use_plane_sweep:
+        points, colors = sweep(views, settings.initial_points, settings.seed, settings.plane_sweep)
+        if len(points) >= i.sweep_min_share * settings.initial_points:
+            surface = zip((points, colors), shell(views, settings.plane_sweep), strict=True)
+            return from_points(*(np.concatenate(pair) for pair in surface), opacity=i.surface_opacity)
+    points, colors = random_box(known, views, settings.initial_points, settings.seed, settings.visual_hull)
     if len(points) == 0:
         raise CaptureError(f"{capture.name}: no point is seen by two cameras, expected cameras that overlap")
-    return from_points(points, colors, opacity=0.1)
+    return from_points(points, colors, opacity=i.random_opacity)
 
 
 class Checkpoint:
@@ -165,10 +163,11 @@ def train_groups(
     random_access: int = 0,
     checkpoints: Path | None = None,
     on_progress: Callable[[Progress], None] | None = None,
-) -> Iterator[Group]:
+    backend: Backend | None = None,
+) -> Iterator[ParametricGroup]:
     """Trains `capture` from `first_frame` on and yields each group when it is done.
 
-    A group continues the Gaussians of the one before (`Group.parents`) as long as they serve; where the image loss of a
+    A group continues the Gaussians of the one before (`parents`) as long as they serve; where the image loss of a
     tracked frame is `cut_ratio` times the keyframe's, the group ends and the next one starts anew. Where much that
     stood still begins to change at once, it ends, and the next one continues. Every segment of `random_access` frames
     starts anew, too: segments depend on nothing but their own frames.
@@ -178,14 +177,16 @@ def train_groups(
         random_access: see `segments`.
         checkpoints: folder for what the next group starts from; None keeps it in memory only.
         on_progress: called after every step.
+        backend: device that renders and optimises; a new CpuBackend if None.
+
+    Torch handles only small tensors here, and its threads compete with those of the native kernels: a caller gains by
+    `torch.set_num_threads(1)`, as the commands do. The number of threads changes sums in their last bits.
 
     Raises:
         CaptureError: a frame cannot be read, or no view overlaps another.
     """
-    # Torch only handles small tensors here; its threads would spin against those of the native kernels.
-    torch.set_num_threads(1)
     store = Checkpoint(checkpoints)
-    run = _Run(capture, settings, on_progress)
+    run = _Run(capture, settings, backend or CpuBackend(), on_progress)
     if not first_frame:
         store.clear()  # what an earlier run with other settings may have left
     state = store.load(first_frame) if first_frame else None  # absent after a cut, too
@@ -213,9 +214,9 @@ def segments(frame_count: int, gop: int, random_access: int) -> list[range]:
 class _Run:
     """What the groups of one run share. `subject` is None where the next frame needs a keyframe."""
 
-    def __init__(self, capture, settings: TrainSettings, on_progress):
+    def __init__(self, capture, settings: TrainSettings, backend: Backend, on_progress):
         self.capture, self.settings, self.on_progress = capture, settings, on_progress
-        self.views = Views(capture, settings.seed)
+        self.views = Views(capture, settings, backend)
         self.progress = Progress(0, started=time.monotonic())
         self.subject: Subject | None = None
 
@@ -236,7 +237,7 @@ class _Run:
 
         return on_step
 
-    def group(self, frames: range) -> Group:
+    def group(self, frames: range) -> ParametricGroup:
         """Trains one group; it ends before `frames` does where the Gaussians no longer serve."""
         track = _Track()
         self.views.restart()
@@ -252,7 +253,7 @@ class _Run:
         if len(done) == 1 and parents is None:
             subject.canonical = track.models[0]
             subject.parents = np.arange(len(subject.canonical))
-            return Group([subject.canonical.gaussians()])
+            return ParametricGroup(1, subject.canonical.gaussians(), rate_optimized=False)
         model = self._finetuned(subject, done, track)
         known = len(model.key) if parents is None else len(parents)
         born = np.full(len(model.key) - known, -1)
@@ -274,12 +275,15 @@ class _Run:
     def _follow(self, frames: range, track: _Track) -> bool:
         """Adds the frames to `track`; True: until the subject was lost. It also ends where much that has stood still
         changes at once: with few temporal frequencies, light that comes on would show in all frames of the group."""
-        subject = self.subject
+        subject, g = self.subject, self.settings.group
         for frame in frames:
-            if len(track.models) >= SETTLED and subject.tracker.stirred(frame, track.moved()) > STIRRED:
+            if (
+                len(track.models) >= g.changed_frames_min
+                and subject.tracker.stirred(frame, track.moved()) > g.changed_fraction_max
+            ):
                 return False
             loss = subject.tracker.advance(frame, self._report(f"track {frame}"))
-            if loss is not None and loss > self.settings.cut_ratio * subject.loss + CUT_FLOOR:
+            if loss is not None and loss > self.settings.cut_ratio * subject.loss + g.cut_loss_floor:
                 return True
             if loss is not None:
                 subject.tracker.bear(frame, self._report(f"births {frame}"))
@@ -289,11 +293,12 @@ class _Run:
     def _finetuned(self, subject: Subject, frames: range, track: _Track) -> GroupModel:
         quality = self.settings.quality
         if subject.steps is None:
-            middle, cameras = track.models[len(frames) // 2].gaussians(), self.views.train_cameras
-            taken = [self.capture.camera(i, frames[len(frames) // 2]) for i in cameras]
-            subject.steps = measured_steps(middle, quality, steps_for(quality, subject.radius), taken)
+            middle = len(frames) // 2
+            cameras = [self.capture.camera(i, frames[middle]) for i in self.views.train_cameras]
+            nominal, g = steps_for(quality, subject.radius), track.models[middle].gaussians()
+            subject.steps = measured_steps(g, quality, nominal, cameras, backend=self.views.backend)
         graph, steps = subject.tracker.graph, subject.steps
-        model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved())
+        model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), self.settings)
         on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
         finetune(model, self.views, frames, self.settings, radius=subject.tracker.radius, on_step=on_step)
         return model

@@ -7,18 +7,21 @@ and the mask term needs only a margin of it.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..capture import View, cropped
 from ..model.camera import Calibration, Camera
-from ..render.step import RenderLoss, Workspace, render_loss
+from ..model.gaussians import Gaussians
+from ..render.backend import Backend, Crop, RenderLoss
+from ..render.sensitivity import params_of
 from .calibration import Exposure, Extrinsics
 from .settings import TrainSettings
 
-CACHE_BYTES = 2 << 30  # of decoded targets
+CACHE_BYTES = 2 << 30  # of decoded targets: a bound on memory, with no effect on the result
+GREY = (0.5, 0.5, 0.5)  # background of images that are compared
 
 
 @dataclass(frozen=True)
@@ -43,12 +46,12 @@ class Views:
     """The training views of a capture, `train_cameras` being their indices; `exposure` and `extrinsics` say by how much
     each differs from what the capture tells."""
 
-    def __init__(self, capture, seed: int):
-        self.capture = capture
+    def __init__(self, capture, settings: TrainSettings, backend: Backend):
+        self.capture, self.backend = capture, backend
         self.train_cameras = capture.indices("train")
-        self.exposure = Exposure(len(capture.cameras), self.train_cameras)
-        self.extrinsics = Extrinsics(len(capture.cameras), self.train_cameras)
-        self._seed = seed
+        self.exposure = Exposure(len(capture.cameras), self.train_cameras, settings, backend)
+        self.extrinsics = Extrinsics(len(capture.cameras), self.train_cameras, settings, backend)
+        self._seed = settings.seed
         self._held: OrderedDict[tuple, View | Target] = OrderedDict()
         self._bytes = 0
         self._order: dict[int, list[int]] = {}
@@ -66,14 +69,25 @@ class Views:
         return replace(held, camera=there, gain=self.exposure.gain(camera))
 
     def camera(self, index: int, frame: int) -> Camera:
-        """Camera `index` of the capture at `frame`, where it really stands."""
+        """Camera `index` at `frame`, in its calibrated pose."""
         return self.extrinsics.camera(index, self.capture.camera(index, frame))
 
     def calibration(self) -> Calibration:
-        """What is known by now about the poses and the brightness of the cameras."""
+        """Corrections of the poses, and exposures, of all cameras."""
         every = range(len(self.capture.cameras))
         corrections = np.stack([self.extrinsics.correction(i) for i in every])
         return Calibration(corrections, np.stack([self.exposure.gain(i) for i in every]))
+
+    def render(self, g: Gaussians, index: int, frame: int, size: Sequence[int] | None = None) -> np.ndarray:
+        """Gaussians as camera `index` shows them at `frame`, with its exposure, over mid-grey; [H, W, 3] u8.
+
+        Args:
+            size: width and height; those of the camera if None.
+        """
+        camera = self.camera(index, frame)
+        camera = camera if size is None else camera.resized(*size)
+        image, _ = self.backend.render(params_of(self.exposure.seen(g, index)), camera, GREY)
+        return np.floor(255 * image.clip(0, 1) + 0.5).astype(np.uint8)
 
     def _hold(self, key: tuple, load: Callable[[], View | Target]):
         """What `load` gives, which is kept as long as there is room."""
@@ -128,27 +142,20 @@ def shrink(target: Target, scale: float) -> Target:
     )
 
 
-def compare(params: dict, target: Target, settings: TrainSettings, rng, workspace: Workspace) -> RenderLoss:
-    """Loss of Gaussians (see `render_loss`) against a target; the background is random in each step, so that opacity is
-    learned and not painted."""
-    background = rng.uniform(0, 1, 3)
-    return render_loss(
-        {name: p.detach() for name, p in params.items()},
-        target.camera,
-        target.rgb,
-        target.alpha,
-        background=tuple(background),
-        ssim_lambda=settings.ssim_lambda,
-        mask_lambda=settings.mask_lambda,
-        workspace=workspace,
-        gain=target.gain,
-    )
+def photometric_loss(
+    params: dict, target: Target, settings: TrainSettings, rng: np.random.Generator, backend: Backend
+) -> RenderLoss:
+    """Loss of Gaussians against one target (`Backend.photometric_loss`). The background is random in each step, so that
+    opacity is learned instead of a background painted with Gaussians."""
+    background = tuple(rng.uniform(0, 1, 3))
+    crop = Crop(target.camera, target.rgb, target.alpha, background, target.gain)
+    return backend.photometric_loss(params, [crop], ssim_lambda=settings.ssim_lambda, mask_lambda=settings.mask_lambda)
 
 
-def look(
-    params: dict, views: Views, frame: int, settings: TrainSettings, workspace: Workspace, scale: float = 1.0
+def view_losses(
+    params: dict, views: Views, frame: int, settings: TrainSettings, scale: float = 1.0
 ) -> Iterator[RenderLoss]:
-    """`compare` with every training view of `frame`, in the order of the cameras."""
+    """`photometric_loss` against every training view of `frame`, in the order of the cameras."""
     rng = np.random.default_rng(settings.seed)
     for camera in views.train_cameras:
-        yield compare(params, views.target(camera, frame, scale), settings, rng, workspace)
+        yield photometric_loss(params, views.target(camera, frame, scale), settings, rng, views.backend)

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-COARSE = 64  # voxels a side
-MISSES = 0  # masks that may disagree with a voxel
-SEEN_SHARE = 0.5  # of the views must see a voxel
+from .settings import VisualHullSettings
+
+DEPTH_MIN = 0.01  # world units, the near plane of the renderer
+OPAQUE = 128  # of 255, alpha from which a pixel belongs to the subject
 
 
 def meeting_point(cameras) -> np.ndarray:
@@ -36,17 +37,17 @@ def _lattice(low: np.ndarray, high: np.ndarray, step: float) -> tuple[np.ndarray
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3), shape
 
 
-def _inside(points: np.ndarray, views) -> np.ndarray:
+def _inside(points: np.ndarray, views, settings: VisualHullSettings) -> np.ndarray:
     """[N] bool: in the mask of every view that sees the point, and seen by most (masks say nothing of what is off)."""
     seen = np.zeros(len(points), np.int32)
     missed = np.zeros(len(points), np.int32)
     for camera, _, alpha in views:
         p, depth = project(camera, points)
         x, y = np.floor(p).astype(np.int64).T
-        on = (depth > 0.01) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+        on = (depth > DEPTH_MIN) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
         seen += on
-        missed[on] += alpha[y[on], x[on]] < 128
-    return (seen >= max(2, SEEN_SHARE * len(views))) & (missed <= MISSES)
+        missed[on] += alpha[y[on], x[on]] < OPAQUE
+    return (seen >= max(2, settings.seen_share * len(views))) & (missed <= settings.misses_max)
 
 
 def colors_of(points: np.ndarray, views) -> np.ndarray:
@@ -55,16 +56,16 @@ def colors_of(points: np.ndarray, views) -> np.ndarray:
     for i, (camera, rgb, alpha) in enumerate(views):
         p, depth = project(camera, points)
         x, y = np.floor(p).astype(np.int64).T
-        on = np.flatnonzero((depth > 0.01) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height))
+        on = np.flatnonzero((depth > DEPTH_MIN) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height))
         if alpha is not None:
-            on = on[alpha[y[on], x[on]] >= 128]
+            on = on[alpha[y[on], x[on]] >= OPAQUE]
         colors[i, on] = rgb[y[on], x[on]] / 255
     unseen = np.isnan(colors).all(0)
     colors[:, unseen] = 0.5
     return np.nanmedian(colors, axis=0)
 
 
-def carve(cameras, views, count: int) -> tuple[np.ndarray, np.ndarray]:
+def carve(cameras, views, count: int, settings: VisualHullSettings) -> tuple[np.ndarray, np.ndarray]:
     """Surface of the visual hull.
 
     Args:
@@ -77,9 +78,9 @@ def carve(cameras, views, count: int) -> tuple[np.ndarray, np.ndarray]:
     centre = meeting_point(cameras)
     half = min(np.linalg.norm(c.center - centre) for c in cameras)
     low, high = centre - half, centre + half
-    step = 2 * half / COARSE
+    step = 2 * half / settings.coarse_voxels
     occupied, _ = _lattice(low, high, step)
-    occupied = occupied[_inside(occupied, views)]
+    occupied = occupied[_inside(occupied, views, settings)]
     if len(occupied) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3))
     low, high = occupied.min(0) - step, occupied.max(0) + step
@@ -88,7 +89,7 @@ def carve(cameras, views, count: int) -> tuple[np.ndarray, np.ndarray]:
     step = min(step, np.sqrt(6 * volume ** (2 / 3) / count))
     for _ in range(4):
         points, shape = _lattice(low, high, step)
-        inside = _inside(points, views).reshape(shape)
+        inside = _inside(points, views, settings).reshape(shape)
         padded = np.pad(inside, 1)
         core = padded[1:-1, 1:-1, 1:-1].copy()
         for axis in range(3):
@@ -101,27 +102,28 @@ def carve(cameras, views, count: int) -> tuple[np.ndarray, np.ndarray]:
     return surface, colors_of(surface, views)
 
 
-def random_box(cameras, views, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def random_box(cameras, views, count: int, seed: int, settings: VisualHullSettings) -> tuple[np.ndarray, np.ndarray]:
     """Random points in what the cameras see, nearer ones denser; for captures without masks.
 
-    Depths along random pixels of random cameras are spread evenly in 1/depth between a quarter of and three times
-    the distance to where the axes meet; points that fewer than two cameras see are dropped.
+    Depths along random pixels of random cameras are uniform in 1/depth; points that fewer than
+    two cameras see are dropped.
     """
     rng = np.random.default_rng(seed)
     centre = meeting_point(cameras)
     distance = np.median([np.linalg.norm(c.center - centre) for c in cameras])
+    near, far = 1 / (settings.random_depth_min * distance), 1 / (settings.random_depth_max * distance)
     picked = []
     for c in cameras:
         n = 3 * count // len(cameras) + 1
         pixels = rng.uniform(0, 1, (n, 2)) * [c.width, c.height]
-        depth = 1 / rng.uniform(1 / (3 * distance), 1 / (0.25 * distance), n)
+        depth = 1 / rng.uniform(far, near, n)
         rays = np.concatenate([pixels, np.ones((n, 1))], 1) @ np.linalg.inv(c.K).T
         picked.append((rays * depth[:, None] - c.viewmat[:3, 3]) @ c.viewmat[:3, :3])
     points = np.concatenate(picked)
     seen = np.zeros(len(points), np.int32)
     for c in cameras:
         p, depth = project(c, points)
-        seen += (depth > 0.01) & (p >= 0).all(1) & (p < [c.width, c.height]).all(1)
+        seen += (depth > DEPTH_MIN) & (p >= 0).all(1) & (p < [c.width, c.height]).all(1)
     points = points[seen >= min(2, len(cameras))]
     points = points[rng.permutation(len(points))[:count]]
     return points, colors_of(points, views)

@@ -1,0 +1,217 @@
+"""What `encode` encodes: groups of a capture that is trained, of splats that are fitted, or of a folder that `train`
+left. Each is opened here as a `Source`, and from there on all are alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from ..encode.coder import CamerasAt, RefineByPictures
+from ..encode.encode import stream_config
+from ..encode.settings import EncodeSettings
+from ..errors import CaptureError, UsageError, require
+from ..frame_range import frame_range
+from ..model.camera import Camera
+from ..model.gaussian_sequence import DenseGroup, GaussianSequence
+from ..model.parametric_group import ParametricGroup
+from ..progress import Bar
+from .inputs import open_frames
+
+AXES = ("x", "y", "z")
+UP_UNKNOWN = "-y"  # what 3DGS trainers leave where nothing is known
+
+
+@dataclass(frozen=True)
+class Source:
+    """An input of the encoder.
+
+    Attributes:
+        groups: (groups done, frames done) -> the groups behind them.
+        config: of the stream.
+        settings: of the encoder, as they are for this input.
+        made_of: settings besides those of the encoder that decide what the groups are (JSON-able).
+        frames: in all.
+        cameras: frame -> the cameras for training, from which sensitivity is measured too.
+        refine_by_pictures: last stage of training; None: there are no pictures.
+        finish: called when the stream is complete.
+    """
+
+    groups: Callable[[int, int], Iterator[ParametricGroup]]
+    config: dict
+    settings: EncodeSettings
+    made_of: dict
+    frames: int
+    cameras: CamerasAt
+    refine_by_pictures: RefineByPictures | None = None
+    finish: Callable[[], None] = lambda: None
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Options of the commands that train.
+
+    Attributes:
+        preset: fast, medium or slow. frames: "A:B", None: all. gop: most frames in a group.
+        cluster: address of the Ray cluster that trains; None: this machine.
+    """
+
+    preset: str
+    frames: str | None
+    gop: int
+    cluster: str | None = None
+
+
+def up_axis(cameras: Sequence[Camera]) -> str:
+    """The world axis that the cameras hold upwards, e.g. "z" or "-y"."""
+    up = -np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
+    i = int(np.abs(up).argmax())
+    return ("-" if up[i] < 0 else "") + AXES[i]
+
+
+def limit_torch_threads() -> None:
+    """One thread for torch in this process: it handles small tensors, and would compete with the native kernels."""
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def splat_source(path: Path, settings: EncodeSettings, frames: str | None, gop: int, bar: Bar) -> Source:
+    """Splats that others trained, or a folder that `gscodec train` has left."""
+    require("scipy", "encoding")
+    from ..fit import fit_groups
+    from ..splats import open_sequence
+
+    sequence = open_sequence(path, gop=gop)
+    if sequence.frame_count > 1:
+        bar.say(f"{path}: {sequence.mode} ({_MODES.get(sequence.mode, 'as sequence.json says')})")
+    sequence = _restricted(sequence, frames)
+    if settings.refine is None and sequence.frame_count == 1:
+        settings = replace(settings, refine=settings.rounding.still_views)
+    cameras, refinement, level = sequence.cameras, None, None
+    if sequence.training and frames is None:
+        refinement, level = _trained(path, sequence.training, settings, bar)
+    level = level or _largest(sequence)
+    trained = [c for c in cameras if c.split == "train"]
+    return Source(
+        lambda done, _: fit_groups(
+            sequence.groups, start=done, random_access=settings.random_access, quality=settings.quality
+        ),
+        stream_config(fps=sequence.fps, **level, cameras=cameras, up=up_axis(cameras) if cameras else UP_UNKNOWN),
+        settings,
+        {"frames": frames, "gop": gop},
+        sequence.frame_count,
+        lambda _: trained,
+        refinement,
+    )
+
+
+_MODES = {
+    "tracked": "index i is the same Gaussian in every frame",
+    "matched": "Gaussians were matched from frame to frame",
+    "independent": "frames do not match each other, each is coded alone",
+}
+
+
+def _largest(sequence: GaussianSequence) -> dict:
+    """What the level of the stream must have room for."""
+    first = [g.frame(0) for g in sequence.groups]
+    counts = {"gaussians": len(first[0]), "frames": max(len(g) for g in sequence.groups)}
+    return {"sh_degree": max(g.sh_degree for g in first), **counts}
+
+
+def _trained(path: Path, training: dict, settings: EncodeSettings, bar: Bar) -> tuple:
+    """Refinement by the pictures of the capture that a folder was trained on, and the level of its stream."""
+    from ..train.refinement import PictureRefinement
+
+    level = {"sh_degree": training["sh_degree"], "gaussians": training["gaussians"], "frames": training["frames"]}
+    try:
+        capture = open_frames(Path(training["capture"]), training["range"])
+    except (CaptureError, UsageError, OSError) as e:
+        bar.say(f"{path}: coded without refinement by pictures, since the capture that it was trained on is gone: {e}")
+        return None, level
+    return PictureRefinement(capture, views=settings.refine), level
+
+
+def _restricted(sequence, frames: str | None):
+    """Frames A:B; groups that the range cuts become shorter, and dense."""
+    chosen = frame_range(frames, sequence.frame_count)
+    if len(chosen) == sequence.frame_count:
+        return sequence
+    groups, start = [], 0
+    for g in sequence.groups:
+        a, b = max(chosen[0] - start, 0), min(chosen[-1] + 1 - start, len(g))
+        if a < b:
+            life = None if g.lifetimes is None else np.clip(g.lifetimes - a, 0, b - a)
+            whole = (a, b) == (0, len(g)) and isinstance(g, ParametricGroup)
+            cut = DenseGroup([g.frame(t) for t in range(a, b)], life, g.parents if groups else None)
+            groups.append(replace(g, parents=g.parents if groups else None) if whole else cut)
+        start += len(g)
+    return sequence.with_groups(groups)
+
+
+def capture_source(path: Path, out: Path, settings: EncodeSettings, options: TrainOptions, bar: Bar) -> Source:
+    """A capture that is trained group by group, while the group before is coded and safe on disk."""
+    require("torch", "training a capture")
+    from ..train.refinement import PictureRefinement
+    from ..train.settings import train_settings
+    from ..train.train import Checkpoint
+
+    limit_torch_threads()
+    capture = open_frames(path, options.frames)
+    recipe = train_settings(options.preset, gop=options.gop, quality=settings.quality)
+    work, trained = out.with_name(out.name + ".work"), capture.indices("train")
+    if options.cluster:
+        groups = partial(_cluster_groups, path, settings, options, recipe, bar)
+    else:
+        groups = partial(_local_groups, capture, recipe, settings.random_access, work, bar)
+    return Source(
+        groups,
+        stream_config(
+            fps=capture.fps,
+            sh_degree=recipe.sh_degree,
+            gaussians=recipe.gaussians_max,
+            frames=options.gop,
+            cameras=capture.cameras,
+            up=up_axis(capture.cameras),
+        ),
+        settings,
+        {"frames": options.frames, "training": asdict(recipe)},
+        capture.frame_count,
+        lambda t: [capture.camera(i, t) for i in trained],
+        PictureRefinement(capture, views=settings.refine),
+        Checkpoint(work).clear,
+    )
+
+
+def _local_groups(capture, recipe, random_access: int, work: Path, bar: Bar, _: int, first_frame: int):
+    from ..train.train import train_groups
+
+    steps, start = [0, 1], first_frame
+
+    def on_progress(p) -> None:
+        steps[:] = p.done, p.total
+        bar.update(p.stage, *steps)
+
+    options = {"random_access": random_access, "checkpoints": work, "on_progress": on_progress}
+    for group in train_groups(capture, recipe, first_frame=first_frame, **options):
+        bar.update(f"code {start}-{start + len(group) - 1}", *steps)
+        start += len(group)
+        yield group
+
+
+def _cluster_groups(path: Path, settings, options: TrainOptions, recipe, bar: Bar, _: int, first_frame: int):
+    from ..train.ray_jobs import cluster_groups
+
+    total = open_frames(path, options.frames).frame_count
+    yield from cluster_groups(
+        options.cluster,
+        partial(open_frames, path.resolve(), options.frames),
+        recipe,
+        settings.random_access,
+        first_frame=first_frame,
+        on_progress=lambda done: bar.update("train on the cluster", done, total),
+    )

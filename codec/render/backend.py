@@ -1,0 +1,121 @@
+"""The device seam: all that training, camera calibration and sensitivity measurement ask of a device.
+
+`cpu.CpuBackend` is the only implementation. A caller makes one backend, passes it along and uses it from one thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ..model.camera import Camera
+
+PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
+STATISTICS = ("grad2d", "max_weight", "sum_weight")
+
+Region = tuple[int, int, int, int]  # x, y, width, height in pixels
+Params = Mapping[str, np.ndarray]  # PARAMETERS -> numpy arrays or torch CPU tensors, f32, contiguous
+PixelGradient = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A view, or a part of one, and its target image.
+
+    Attributes:
+        camera: pinhole camera of the whole image.
+        target_rgb: [h, w, 3] u8, unassociated colour, of the region.
+        target_alpha: [h, w] u8; the target is composited on `background` with it. None: opaque, and no mask term.
+        background: 3 floats in [0, 1]; a random one in each step where there are masks.
+        gain: 3 floats, exposure of this camera; multiplies the colour of the Gaussians, not the background.
+        weight: [h, w] f32, weights of pixels in the image loss (a weighted mean).
+        region: part of the image that is rendered; None: all of it.
+    """
+
+    camera: Camera
+    target_rgb: np.ndarray
+    target_alpha: np.ndarray | None = None
+    background: Sequence[float] = (0.0, 0.0, 0.0)
+    gain: Sequence[float] | None = None
+    weight: np.ndarray | None = None
+    region: Region | None = None
+
+    def part(self) -> Region:
+        """The region; all of the image if none is given."""
+        return self.region or (0, 0, self.camera.width, self.camera.height)
+
+
+@dataclass(frozen=True)
+class RenderLoss:
+    """Loss of a batch of crops and its gradients. Arrays belong to the backend; its next call overwrites them.
+
+    Attributes:
+        loss: (1 - ssim_lambda) * l1 + ssim_lambda * (1 - ssim) + mask_lambda * mask, summed over the crops.
+        l1, mse, ssim, mask: the terms; means over pixels (and channels) and crops. psnr = -10 log10(mse).
+        pixels: of all crops together.
+        grads: by parameter name, in the shapes of the parameters; tensors where the parameter was a tensor.
+        grad2d: [N] f32, norm of the gradient by the projected mean in units of half the image (the densification
+            measure of 3D Gaussian Splatting), summed over the crops.
+        max_weight, sum_weight: [N] f32, largest and summed blending weight alpha * transmittance.
+        radii: [N] f32, pixels, largest over the crops; 0 for a Gaussian that is not visible.
+        grad_gain: [crops, 3] f64, gradient by each `gain`.
+    """
+
+    loss: float
+    l1: float
+    mse: float
+    ssim: float
+    mask: float
+    pixels: int
+    grads: dict
+    grad2d: np.ndarray
+    max_weight: np.ndarray
+    sum_weight: np.ndarray
+    radii: np.ndarray
+    grad_gain: np.ndarray
+
+
+class Backend(Protocol):
+    """Rendering with gradients, and the optimiser step. All methods raise UsageError where shapes disagree or a camera
+    has distortion, and LimitError where there are too many Gaussians or pixels."""
+
+    def render(
+        self, params: Params, camera: Camera, background: Sequence[float], region: Region | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Image [h, w, 3] f32 over `background` and alpha [h, w] f32 of the region (None: all of the image)."""
+
+    def photometric_loss(
+        self, params: Params, crops: Sequence[Crop], *, ssim_lambda: float, mask_lambda: float
+    ) -> RenderLoss:
+        """Loss of Gaussians against the targets of `crops`, and its gradients."""
+
+    def backpropagate(
+        self, params: Params, camera: Camera, background: Sequence[float], pixel_gradient: PixelGradient
+    ) -> dict[str, np.ndarray]:
+        """Gradients by the parameters for a gradient by the pixels.
+
+        Args:
+            pixel_gradient: image [H, W, 3] and alpha [H, W] as rendered -> the gradients by them, f32, same shapes.
+
+        Returns:
+            PARAMETERS -> f32 in the shapes of the parameters; arrays of the backend, overwritten by its next call.
+        """
+
+    def adam(
+        self,
+        arrays: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+        *,
+        rate: float,
+        betas: tuple[float, float],
+        eps: float,
+        step: int,
+    ) -> None:
+        """One step of Adam in place.
+
+        Args:
+            arrays: parameter, gradient, first and second moment; f32, contiguous, one shape.
+            step: of this parameter, from 1.
+        """

@@ -1,0 +1,112 @@
+"""The backend of the CPU: the native rasterizer, its fused training step, and the native Adam.
+
+One native call renders, compares and differentiates, so that nothing of the size of an image goes through torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .. import _native
+from ..errors import UsageError
+from ..model.camera import Camera
+from .backend import PARAMETERS, STATISTICS, Crop, Params, PixelGradient, Region, RenderLoss
+from .workspace import Workspace, call, host_array, rgb, view
+
+
+class CpuBackend:
+    """Realises `Backend`.
+
+    Args:
+        threads: 0 for all cores. Results do not depend on it.
+        simd: "auto" or one of `workspace.simd_levels()`.
+
+    Raises:
+        UsageError: this machine does not have that instruction set.
+    """
+
+    def __init__(self, threads: int = 0, simd: str = "auto"):
+        self.workspace = Workspace(threads, simd)
+
+    def render(
+        self, params: Params, camera: Camera, background: Sequence[float], region: Region | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As of `Backend`."""
+        return self.workspace.forward(_arrays(params), camera, background, region)
+
+    def photometric_loss(
+        self, params: Params, crops: Sequence[Crop], *, ssim_lambda: float = 0.2, mask_lambda: float = 0.0
+    ) -> RenderLoss:
+        """As of `Backend`.
+
+        Raises:
+            UsageError: shapes disagree, a camera has distortion, or there are no crops.
+        """
+        if not crops:
+            raise UsageError("a batch has at least one crop, got none")
+        arrays = _arrays(params)
+        grads, statistics = self.workspace.gradients(arrays)
+        step, native = self.workspace.native.step, [_native_crop(crop) for crop in crops]
+        values, radii = call(step, arrays, native, (ssim_lambda, mask_lambda), (grads, statistics))
+        losses, gain = np.array([v[:5] for v in values]), np.array([v[5] for v in values])
+        loss, means = float(losses[:, 0].sum()), losses[:, 1:].mean(0).tolist()
+        return RenderLoss(
+            loss,
+            *means,
+            pixels=sum(crop.part()[2] * crop.part()[3] for crop in crops),
+            grads={k: _like(g, params[k]) for k, g in zip(PARAMETERS, grads, strict=True)},
+            radii=radii,
+            grad_gain=gain,
+            **dict(zip(STATISTICS, statistics, strict=True)),
+        )
+
+    def backpropagate(
+        self, params: Params, camera: Camera, background: Sequence[float], pixel_gradient: PixelGradient
+    ) -> dict[str, np.ndarray]:
+        """As of `Backend`."""
+        arrays = _arrays(params)
+        image, alpha = self.workspace.forward(arrays, camera, background, training=True)
+        pixels = tuple(np.ascontiguousarray(g, np.float32) for g in pixel_gradient(image, alpha))
+        grads, statistics = self.workspace.gradients(arrays)
+        for a in grads + statistics:
+            a.fill(0)
+        call(self.workspace.native.backward, arrays, *pixels, (grads, statistics))
+        return dict(zip(PARAMETERS, grads, strict=True))
+
+    def adam(
+        self,
+        arrays: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+        *,
+        rate: float,
+        betas: tuple[float, float],
+        eps: float,
+        step: int,
+    ) -> None:
+        """As of `Backend`."""
+        call(_native.adam, arrays, rate, betas, eps, step)
+
+
+def _arrays(params: Params) -> tuple[np.ndarray, ...]:
+    """The six arrays in the order of PARAMETERS."""
+    return tuple(np.ascontiguousarray(host_array(params[name]), np.float32) for name in PARAMETERS)
+
+
+def _native_crop(crop: Crop) -> tuple:
+    """A crop as the native side takes it."""
+    target = (crop.target_rgb, crop.target_alpha, crop.weight)
+    return (
+        view(crop.camera, crop.part()),
+        (rgb(crop.background), None if crop.gain is None else rgb(crop.gain)),
+        tuple(None if t is None else np.ascontiguousarray(t) for t in target),
+    )
+
+
+def _like(grad: np.ndarray, param):
+    """`grad` as a tensor where `param` is one."""
+    if not hasattr(param, "detach"):
+        return grad
+    import torch
+
+    return torch.from_numpy(grad)

@@ -1,0 +1,48 @@
+"""ParametricGroup <-> arrays of an .npz, beside the .ply frames of a sequence; exact, so that what is coded from the file
+is what would have been coded from memory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+
+import numpy as np
+
+from ..model.camera import Calibration
+from ..model.gaussians import Gaussians
+from ..model.parametric_group import NodeMotion, ParametricGroup
+
+OPTIONAL = ("lifetimes", "parents")
+
+
+def to_arrays(group: ParametricGroup) -> dict[str, np.ndarray]:
+    """Everything in a group as named arrays."""
+    arrays = {"frame_count": np.array(group.frame_count), "rate_optimized": np.array(group.rate_optimized)}
+    parts = {"canonical": group.canonical, "nodes": group.nodes, "calibration": group.calibration}
+    for part, value in parts.items():
+        if value is not None:
+            arrays |= {f"{part}.{f.name}": getattr(value, f.name) for f in fields(value)}
+    arrays |= {f"trajectories.{n}": c for n, c in group.trajectories.items()}
+    return arrays | {n: getattr(group, n) for n in OPTIONAL if getattr(group, n) is not None}
+
+
+def from_arrays(arrays: Mapping[str, np.ndarray]) -> ParametricGroup:
+    """Inverse of `to_arrays`.
+
+    Raises:
+        KeyError: an array is missing.
+    """
+
+    def part(name: str, kind):
+        own = {n.partition(".")[2]: a for n, a in arrays.items() if n.startswith(f"{name}.")}
+        return kind(**{f.name: own[f.name] for f in fields(kind)}) if own else None
+
+    return ParametricGroup(
+        int(arrays["frame_count"]),
+        part("canonical", Gaussians),
+        part("nodes", NodeMotion),
+        {n.partition(".")[2]: a for n, a in arrays.items() if n.startswith("trajectories.")},
+        *(arrays.get(n) for n in OPTIONAL),
+        part("calibration", Calibration),
+        bool(arrays["rate_optimized"]),
+    )

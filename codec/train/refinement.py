@@ -1,0 +1,83 @@
+"""Last stage of training: the integers of a coded group are refined by the pictures of the capture.
+
+A trained model is only as near to its pictures as training came. Its rounded values are compared with the pictures and
+not with the model, so that errors of the model are made up for as well. The encoder hands over its quantizer, which
+takes the steps (`follow`); this stage draws the pictures and says how far a step goes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+
+from ..capture import Capture, View, blend, cropped
+from ..model.camera import Calibration, Camera
+from ..model.parametric_group import ParametricGroup
+from .settings import RefinementSettings
+
+Picture = tuple[int, Camera, tuple[float, float, float], np.ndarray]  # frame, camera, background, [H, W, 3] f32
+
+
+class Quantizer(Protocol):
+    """A group in integers that can be moved.
+
+    Attributes:
+        frames: of the group. gaussians: that are coded.
+    """
+
+    frames: int
+    gaussians: int
+
+    def follow(self, targets: Iterable[Picture], count: int, rate: float) -> None:
+        """One optimiser step for each of `count` pictures; the first moves a value by `rate` quantization steps."""
+
+
+class PictureRefinement:
+    """Refines groups by the training pictures of `capture`, whose frame 0 is that of the stream.
+
+    Args:
+        views: pictures of each group; None: as `settings` say.
+    """
+
+    def __init__(self, capture: Capture, settings: RefinementSettings = RefinementSettings(), views: int | None = None):
+        self._capture, self._settings, self._views = capture, settings, views
+        self._trained = capture.indices("train")
+
+    def __call__(self, group: ParametricGroup, first_frame: int, quantizer: Quantizer) -> None:
+        """Refines `group`, which begins at `first_frame`.
+
+        Raises:
+            CaptureError: a picture cannot be read.
+        """
+        s, cameras = self._settings, self._capture.cameras
+        usual = min(s.passes * len(self._trained), s.frame_pictures) * quantizer.frames
+        count = usual if self._views is None else self._views
+        if not count:
+            return
+        pixels = sum(cameras[i].width * cameras[i].height for i in self._trained)
+        reach = min(s.reach_max, s.reach * (pixels / max(quantizer.gaussians, 1)) ** 0.5)
+        targets = self._pictures(group.calibration, first_frame, count, quantizer.frames)
+        quantizer.follow(targets, count, reach / count**0.5)
+
+    def _pictures(self, calibration: Calibration, first_frame: int, count: int, frames: int) -> Iterator[Picture]:
+        """All cameras of a frame before any one again, all frames in turn, each picture over a background of its own: a
+        haze in the colour of a known background would pass for opacity."""
+
+        def read(camera: int, t: int) -> tuple[View, Camera]:
+            view, there = self._capture.view(camera, first_frame + t), self._capture.camera(camera, first_frame + t)
+            return cropped(view, calibration.camera(there, camera))
+
+        largest = max(4 * c.width * c.height for c in self._capture.cameras)
+        cached = lru_cache(max(1, self._settings.cache_bytes // largest))(read)
+        random, order = np.random.default_rng(0), [[] for _ in range(frames)]
+        rounds = [random.permutation(frames) for _ in range(0, count, frames)]
+        for t in np.concatenate(rounds)[:count].tolist():
+            order[t] = order[t] or random.permutation(self._trained).tolist()
+            i = order[t].pop()
+            view, camera = cached(i, t)
+            background = tuple(random.uniform(0, 1, 3).tolist())
+            evened = View(view.rgb / calibration.gains[i], view.alpha)
+            yield t, camera, background, np.ascontiguousarray(blend(evened, background) / 255, np.float32)

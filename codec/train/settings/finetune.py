@@ -1,0 +1,67 @@
+"""Settings of the joint fine-tuning of a group, and of its entropy model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ...render.optimizer import AdamSettings
+
+
+@dataclass(frozen=True)
+class TemporalFrequencies:
+    """Temporal frequencies (DCT) that residuals may use in a group of `frames` frames; a longer group uses more in
+    proportion, a shorter one as many as it has. Attributes without a field are constant in a group."""
+
+    means: int = 10
+    quats: int = 4
+    log_scales: int = 3
+    logit_opacities: int = 3
+    sh0: int = 6
+
+
+@dataclass(frozen=True)
+class FinetuneSettings:
+    """Joint optimisation of a group: canonical attributes and residual coefficients."""
+
+    frequencies: TemporalFrequencies = field(default_factory=TemporalFrequencies)
+    frequencies_frames: int = 20  # frames that `frequencies` is for
+    free_min: float = 0.5  # quantization steps: a residual from the start, so that a resting Gaussian stays free
+    dead_zone: float = 0.1  # quantization steps more than half of one, below which a coefficient is not coded
+    coefficient_rate: float = 0.05  # quantization steps
+    log_scale_start: float = -1.0  # log of a Laplace scale, quantization steps
+    log_scale_rate: float = 0.02
+    coefficient_adam: AdamSettings = field(default_factory=lambda: AdamSettings(eps=1e-8))
+    canonical_means_rate: float = 4e-5  # radii
+    canonical_rate_share: float = 0.3  # of the keyframe's rates, for all other canonical attributes
+    canonical_bit_weight: float = 3.0  # of a canonical bit, in bits of residuals
+    canonical_noise: bool = True  # uniform noise in place of quantization, on canonical attributes
+    rate_decay: float = 0.05  # rates at the last step, times those at the first
+    rate_every: int = 8  # steps: the rate term has every coefficient, an image few; its weight grows by as much
+    loss_smoothing: float = 0.05  # share of one step in the running mean of the loss
+
+
+@dataclass(frozen=True)
+class EntropyModelSettings:
+    """Laplace model of canonical integers, in quantization steps."""
+
+    spread_min: float = 0.5  # added to the mean difference of a value's neighbours
+    scale_min: float = 0.05  # of the Laplace distribution
+
+
+@dataclass(frozen=True)
+class RefinementSettings:
+    """Refinement of the integers of a coded group by the pictures of the capture (`refinement.py`).
+
+    Attributes:
+        passes: times that each training picture of a frame is used; frame_pictures: pictures of a frame at most.
+        reach: quantization steps that the first picture moves a value, times the root of the pictures, for one pixel per
+            Gaussian; it grows with the root of the pixels per Gaussian, since few pixels are soon overfitted.
+        reach_max: bound on it.
+        cache_bytes: of pictures held in memory.
+    """
+
+    passes: int = 4
+    frame_pictures: int = 80
+    reach: float = 0.03
+    reach_max: float = 1.0
+    cache_bytes: int = 1 << 30

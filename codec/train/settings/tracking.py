@@ -1,0 +1,100 @@
+"""Settings of tracking: what changes, the nodes that carry it, what is added, where a group ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ...render.optimizer import AdamSettings
+from .learning_rates import LearningRates
+
+
+@dataclass(frozen=True)
+class ChangeDetectionSettings:
+    """Pixels that have changed, and the Gaussians behind them."""
+
+    width: int = 256  # pixels of the images that are compared; noise averages out
+    threshold: float = 6.0  # grey levels, after a mean over 3 x 3: above the noise of sensors; -1: everything changes
+    margin: float = 0.02  # of the width, around a change: parts without texture move with it
+    seen_share: float = 0.5  # of the cameras that see a Gaussian must see a change there
+
+
+@dataclass(frozen=True)
+class DeformationGraphSettings:
+    """Nodes that carry the Gaussians."""
+
+    nodes: int = 256  # 1000 track as well
+    still_share: float = 0.25  # of the nodes for Gaussians at rest, if these are as large a share of all
+    blended: int = 4  # nodes that carry one Gaussian
+    edges: int = 8  # neighbours of a node in the rigidity term
+    edge_falloff: float = 1.5  # median edge lengths at which an edge counts half: long ones bridge gaps
+    carrier_weight_min: float = 0.1  # blending weight from which a node counts as a carrier of a Gaussian
+    lattice: float = 1e-3  # radii, spacing of the lattice on which neighbours and weights are computed
+    added_nodes: int = 16  # for Gaussians that come in together
+    extent_max: float = 2.0  # of the lattice of the stream along each axis, in extents of the keyframe
+    places_max: int = 16  # tried for new nodes to rest
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """Optimisation of one frame from the one before: nodes and the Gaussians' own attributes together."""
+
+    node_rotation_rate: float = 2e-2  # radians
+    node_translation_rate: float = 3e-3  # radii
+    node_adam: AdamSettings = field(default_factory=lambda: AdamSettings(eps=1e-8))
+    # Light changes fast; place and shape are slow, so that the nodes take the motion.
+    rates: LearningRates = field(
+        default_factory=lambda: LearningRates(
+            means=3e-5, quats=6e-4, log_scales=6e-3, logit_opacities=2e-2, sh0=5e-2, shN=2.5e-3
+        )
+    )
+    rate_decay: float = 0.1  # rates at the last step of a round, times those at the first
+    rounds_max: int = 4  # of motion_steps each, until the loss is near that of the frame before
+    loss_ratio: float = 1.2  # times the loss of the frame before: near enough
+    loss_floor: float = 0.001  # loss added to that bound
+    progress_ratio: float = 0.9  # a round that leaves more of the loss than this is the last
+    loss_window: int = 20  # steps whose mean is the loss of a round: about every view once
+    small_scale: float = 0.5  # of the images in the first half of the first round: large motion, cheap steps
+    # Without a known velocity, a first round: stiff nodes and slow attributes, or else far-moved Gaussians take the
+    # colours of what they lie over.
+    first_round_rigidity: float = 25.0  # times `rigidity`
+    first_round_rates: float = 0.1  # times `rates`
+    mask_factor: float = 3.0  # times mask_lambda: the silhouette does not depend on light
+    gradient_quantile: float = 0.995  # of the screen gradients in a keyframe: the reference for densification
+    stored_factor: int = 2  # times gaussians_max: all Gaussians of a group, with those already removed
+    separate_distance: float = 4.0  # spacings of new Gaussians; so far from all others they get their own nodes
+    separate_min: int = 8  # new Gaussians that are worth nodes of their own
+    visible_weight: float = 0.05  # blending weight from which a camera sees a Gaussian
+
+
+@dataclass(frozen=True)
+class DensificationSettings:
+    """Gaussians that a tracked frame adds."""
+
+    max_share: float = 0.05  # of the Gaussians, in one frame; 0: none is added
+    spawn_min: int = 8  # fewer are not worth a unit in the stream
+    steps: int = 100  # optimisation steps of the new Gaussians among the others
+    gradient_min: float = 2.0  # screen gradient of a parent, times that of the keyframe
+    child_opacity: float = 0.3
+    error_min: float = 40.0  # grey levels: the Gaussians do not show this pixel at all
+    opening: int = 7  # pixels at the size of change detection: edges and highlights are thinner than missing parts
+    error_share_min: float = 0.002  # of the image in half of the views; an error in fewer views is a highlight
+
+
+@dataclass(frozen=True)
+class RelocalizationSettings:
+    """Search for Gaussians that have moved out of reach of the gradient."""
+
+    error_ratio: float = 1.002  # times the error without them; hidden Gaussians cause no error, and are not lost
+    points: int = 1000  # of the plane sweep at most
+    places: int = 8  # centres that are tried
+    mean_shift_rounds: int = 5
+    radius_quantile: float = 0.9  # of the distances from their centre: radius of the mean shift
+
+
+@dataclass(frozen=True)
+class GroupSettings:
+    """Where a group ends early."""
+
+    cut_loss_floor: float = 0.004  # loss: clean images fit far better than they need to, and no frame is cut for it
+    changed_fraction_max: float = 0.15  # of the Gaussians, that begin to change in one frame
+    changed_frames_min: int = 4  # frames that a group has before `changed_fraction_max` may end it
