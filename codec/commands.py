@@ -128,8 +128,9 @@ def _restrict(sequence: GaussianSequence, frames: str | None) -> GaussianSequenc
 def _encode_capture(source, out, settings, preset, frames, gop, cluster, bar) -> EncodeReport:
     require("torch", "training a capture")
     limit_torch_threads()
+    from .train.checkpoint import Checkpoint
     from .train.settings import train_settings
-    from .train.train import Checkpoint, train_groups
+    from .train.train import train_groups
 
     capture = _open_capture(source, frames)
     recipe = train_settings(preset, gop=gop, quality=settings.quality)
@@ -223,8 +224,9 @@ def train_to_folder(
     require("torch", "training a capture")
     limit_torch_threads()
     from .splats import SequenceWriter
+    from .train.checkpoint import Checkpoint
     from .train.settings import train_settings
-    from .train.train import Checkpoint, train_groups
+    from .train.train import train_groups
 
     capture = _open_capture(source, frames)
     recipe = train_settings(preset, gop=gop, quality=quality)

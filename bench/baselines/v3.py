@@ -20,11 +20,11 @@ import torch
 from bench.baselines.hashgrid import HashGrid
 from gscodec.bitstream.quantization import subject_radius
 from gscodec.render.cpu import CpuBackend
-from gscodec.train.deformation_graph import quat_multiply, rotvec_to_quat
+from gscodec.train.initialization import initial_model
 from gscodec.train.keyframe import train_keyframe
 from gscodec.train.model import Model
+from gscodec.train.rotations import quat_multiply, rotvec_to_quat
 from gscodec.train.settings import TrainSettings
-from gscodec.train.train import initial_model
 from gscodec.train.views import Views, photometric_loss
 
 STEPS = (90, 225)  # a frame: as long as the preset medium takes, 800 : 2000
