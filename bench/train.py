@@ -210,8 +210,8 @@ def every_frame_alone(capture: Capture, frames: range, settings) -> tuple[list[G
 
     from gscodec.bitstream.quantization import subject_radius
     from gscodec.render.cpu import CpuBackend
+    from gscodec.train.initialization import initial_model
     from gscodec.train.keyframe import train_keyframe
-    from gscodec.train.train import initial_model
     from gscodec.train.views import Views
 
     torch.set_num_threads(1)  # as the commands do

@@ -21,7 +21,7 @@ from gscodec.cli import main
 from gscodec.encode import encode, writer
 from gscodec.render import sensitivity
 from gscodec.splats import sequence_writer
-from gscodec.train import settings, train
+from gscodec.train import checkpoint, settings
 
 TINY = {"keyframe_steps": 40, "motion_steps": 8, "finetune_steps": 4, "gaussians_max": 200, "initial_points": 150}
 
@@ -91,6 +91,6 @@ def _arm(where: str, n: int, stop) -> None:
 
     progress.Bar = Stopping
     writer.write_arrays = half("state", part_file.write_arrays)
-    train.write_arrays = half("checkpoint", part_file.write_arrays)
+    checkpoint.write_arrays = half("checkpoint", part_file.write_arrays)
     sequence_writer.write_ply = half("sequence", sequence_writer.write_ply)
     encode.StreamWriter = Fragments

@@ -20,22 +20,25 @@ from gscodec.model.camera import Camera, look_at
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.model.gaussians import concatenate
 from gscodec.model.rotations import quat_to_matrix, rotvec_to_quat
+from gscodec.render.cpu import CpuBackend
 from gscodec.render.image import render_image, render_rgba
 from gscodec.train.calibration import Extrinsics
 from gscodec.train.change_detection import Changes
+from gscodec.train.checkpoint import Checkpoint
 from gscodec.train.deformation_graph import NodeGraph, Pose
 from gscodec.train.entropy_model import CanonicalRate, laplace_bits
 from gscodec.train.finetune import GroupModel
-from gscodec.train.keyframe import Statistics, grow, prune, train_keyframe
+from gscodec.train.initialization import initial_model
+from gscodec.train.keyframe import Statistics, densify, prune, train_keyframe
 from gscodec.train.model import from_gaussians
 from gscodec.train.plane_sweep import shell, sweep
 from gscodec.train.ray_jobs import train_segment
-from gscodec.train.relocalization import whereabouts
+from gscodec.train.relocalization import relocalize
 from gscodec.train.settings import TrainSettings, train_settings
 from gscodec.train.tracking import Tracker
-from gscodec.train.train import Checkpoint, initial_model, segments, train_groups
+from gscodec.train.train import segments, train_groups
 from gscodec.train.views import Views
-from gscodec.train.visual_hull import carve, meeting_point, project
+from gscodec.train.visual_hull import hull_points, meeting_point, project
 
 SIZE = 64
 TINY = TrainSettings(
@@ -92,7 +95,7 @@ def test_axes_meet_where_the_cameras_look():
 
 def test_hull_lies_on_the_subject(capture):
     views = [(c, capture.view(i, 0).rgb, capture.view(i, 0).alpha) for i, c in enumerate(capture.cameras)]
-    points, colors = carve(capture.cameras, views, 500, TINY.visual_hull)
+    points, colors = hull_points(capture.cameras, views, 500, TINY.visual_hull)
     assert 300 < len(points) < 800
     distance = np.linalg.norm(points, axis=1)
     assert np.median(distance) == pytest.approx(1.1, abs=0.2), "a sphere of radius 1, and the width of its Gaussians"
@@ -183,7 +186,7 @@ def test_exposure_of_each_camera_is_found(darkest):
     true = np.log(gains[:-1]) - np.log(gains[:-1]).mean()
     np.testing.assert_allclose(views.exposure.values[:-1], true[:, None] + np.zeros(3), atol=0.04)
     assert darkest < 1 or not views.exposure.values.any()
-    shown = render_image(views.exposure.seen(model.gaussians(), 0), capture.cameras[0], (0, 0, 0))
+    shown = render_image(views.exposure.applied_to(model.gaussians(), 0), capture.cameras[0], (0, 0, 0))
     plain = render_image(model.gaussians(), capture.cameras[0], (0, 0, 0))
     np.testing.assert_allclose(shown, plain * views.exposure.gain(0), atol=2)
 
@@ -240,7 +243,7 @@ def test_tracking_finds_the_turn(capture):
     still = np.abs(truth.frame(2).means - truth.frame(0).means).mean()
     missed = np.abs(truth.frame(2).means - tracker.model.params["means"].numpy()).mean()
     assert missed < 0.25 * still, (missed, still)
-    angle = 2 * np.arccos(np.abs(tracker.pose.turned[:, 0].numpy()).clip(0, 1))
+    angle = 2 * np.arccos(np.abs(tracker.pose.rotations[:, 0].numpy()).clip(0, 1))
     assert np.median(angle) == pytest.approx(0.2, abs=0.08), "0.1 rad a frame"
     group = GroupModel(
         tracker.graph, None, models, poses, steps_for(50, 1.0), torch.ones(len(key), dtype=torch.bool), TINY
@@ -256,7 +259,7 @@ def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
     turn = rotvec_to_quat(torch.tensor([[0.3, -0.2, 0.5]])).repeat(len(graph), 1)
     R = quat_to_matrix(turn)
     nodes = torch.einsum("nij,nj->ni", R, graph.nodes) + 1
-    pose = dataclasses.replace(Pose.rest(graph), nodes=nodes, turned=turn)
+    pose = dataclasses.replace(Pose.rest(graph), nodes=nodes, rotations=turn)
     means, turned = graph.carry(x, pose)
     np.testing.assert_allclose(means, x @ R[0].T + 1, atol=1e-5)
     np.testing.assert_allclose(turned, turn[:1].expand(200, 4), atol=1e-5)
@@ -267,18 +270,18 @@ def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
 
 def test_newcomers_have_nodes_of_their_own_that_change_nothing_for_others():
     x = torch.from_numpy(blob(200).means)
-    young = 0.2 * torch.from_numpy(blob(60, seed=1).means) + torch.tensor([0.9, 0, 0])  # amid the others
+    spawned = 0.2 * torch.from_numpy(blob(60, seed=1).means) + torch.tensor([0.9, 0, 0])  # amid the others
     graph = NodeGraph.of(x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), FEW_NODES)
     pose = dataclasses.replace(Pose.rest(graph), nodes=1.1 * graph.nodes)
     before, known = graph.carry(x, pose)[0], len(graph)
-    shift = graph.settle(young)
-    pose = pose.joined(graph.nodes[known:] - shift)
-    graph.extend(young + shift)
-    np.testing.assert_array_equal(graph.family_of() == 1, np.arange(260) >= 200)
+    shift = graph.add_nodes(spawned)
+    pose = pose.extended(graph.nodes[known:] - shift)
+    graph.extend(spawned + shift)
+    np.testing.assert_array_equal(graph.batch_of() == 1, np.arange(260) >= 200)
     pose.nodes[known:] += 3
     means, _ = graph.carry(graph.means, pose)
     np.testing.assert_array_equal(means[:200], before)
-    np.testing.assert_allclose(means[200:], young + 3, atol=1e-5)
+    np.testing.assert_allclose(means[200:], spawned + 3, atol=1e-5)
     again = NodeGraph.restored(graph.state(), FEW_NODES)
     np.testing.assert_array_equal(again.carry(again.means, pose)[0], means)
 
@@ -292,9 +295,9 @@ def test_what_jumps_is_found_and_what_is_gone_is_not():
     capture = Capture("patch", 25.0, cameras, 3, False, read)
     views, model, some = Views(capture, TINY, CpuBackend()), from_gaussians(frames[0]), torch.arange(3800) >= 3000
     changes = Changes.since(views, 0, TINY.change_detection)
-    shift = whereabouts(model, some, 1, changes, changes.advance(1), TINY)
+    shift = relocalize(model, some, 1, changes, changes.advance(1), TINY)
     np.testing.assert_allclose(shift, [1, 0, 0], atol=0.25)
-    assert whereabouts(model, some, 2, changes, changes.advance(2), TINY) is None
+    assert relocalize(model, some, 2, changes, changes.advance(2), TINY) is None
 
 
 def test_a_longer_group_has_more_temporal_frequencies():
@@ -315,7 +318,7 @@ def test_masks_say_where_nothing_is():
         for g, x in ((blob(100), -0.7), (blob(100, seed=1), 0.7))
     )
     whole, none = concatenate([left, right]), left.take(np.zeros(0, int))
-    capture = capture_of(GaussianSequence(25.0, [Group([g]) for g in (whole, left, none, none)]))
+    capture = capture_of(GaussianSequence(25.0, [DenseGroup([g]) for g in (whole, left, none, none)]))
     tracker = Tracker.start(from_gaussians(whole), Views(capture, TINY, CpuBackend()), TINY, 0.01, range(4))
     models, poses = [tracker.model], [tracker.pose]
     for frame in (1, 2, 3):
@@ -420,17 +423,17 @@ def test_growing_and_pruning_keep_the_moments_in_step():
     model.start_optimizer(CpuBackend(), TINY.adam)
     model.step({n: torch.ones_like(p) for n, p in model.params.items()}, dict.fromkeys(model.params, 0.0))
     stats = Statistics(100, 1e-8)
-    stats.pull += torch.linspace(0, 1, 100)
+    stats.screen_gradient += torch.linspace(0, 1, 100)
     stats.seen += 1
-    stats.weight += 0.5
-    grow(model, stats, 105, np.random.default_rng(0), TINY.keyframe)
+    stats.max_weight += 0.5
+    densify(model, stats, 105, np.random.default_rng(0), TINY.keyframe)
     assert len(model) == 105, "no more than the most that is allowed"
     model.params["logit_opacities"][:10] = -9
     prune(model, Statistics(len(model), 1e-8), TINY.keyframe)
     assert len(model) == 95
     stats = Statistics(95, 1e-8)
-    stats.weight += 0.5
-    stats.pulse[:90] = 1
+    stats.max_weight += 0.5
+    stats.squared_opacity_gradient[:90] = 1
     prune(model, stats, TINY.keyframe, thin=True)
     assert len(model) == 90, "what changes nothing in the picture is not worth its bits"
     model.step({n: torch.ones_like(p) for n, p in model.params.items()}, {"means": 0.1})

@@ -20,10 +20,10 @@ import torch
 from gscodec.bitstream.quantization import subject_radius
 from gscodec.model.rotations import quat_multiply, rotvec_to_quat
 from gscodec.render.cpu import CpuBackend
+from gscodec.train.initialization import initial_model
 from gscodec.train.keyframe import train_keyframe
 from gscodec.train.model import Model
 from gscodec.train.settings import TrainSettings
-from gscodec.train.train import initial_model
 from gscodec.train.views import Views, photometric_loss
 
 from .hashgrid import HashGrid

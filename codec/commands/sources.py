@@ -156,9 +156,9 @@ def _restricted(sequence, frames: str | None):
 def capture_source(path: Path, out: Path, settings: EncodeSettings, options: TrainOptions, bar: Bar) -> Source:
     """A capture that is trained group by group, while the group before is coded and safe on disk."""
     require("torch", "training a capture")
+    from ..train.checkpoint import Checkpoint
     from ..train.refinement import PictureRefinement
     from ..train.settings import train_settings
-    from ..train.train import Checkpoint
 
     limit_torch_threads()
     capture = open_frames(path, options.frames)

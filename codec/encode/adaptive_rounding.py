@@ -3,8 +3,8 @@ more than their bits cost.
 
 Rounding each value on its own leaves errors that another value could make up for. The decoded frame is drawn and
 compared with a target picture; the gradient of the squared difference moves the latent under each integer, straight
-through the rounding (Bengio et al. 2013). Integers that others are decoded from stay: positions, nodes, rotations. Of a single
-frame, sizes move too, and its rotations are coded again; of a predicted group, only trajectories move.
+through the rounding (Bengio et al. 2013). Integers that others are decoded from stay: positions, nodes, rotations. Of a
+single frame, sizes move too, and its rotations are coded again; of a predicted group, only trajectories move.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from .. import _native
 from ..bitstream.color import correlate, decorrelate
 from ..model.gaussians import Gaussians
+from ..render.cpu import CpuBackend
 from ..render.optimizer import Adam
 from ..render.sensitivity import derivatives
 from ..threads import prefetched

@@ -1,5 +1,5 @@
-"""ParametricGroup <-> arrays of an .npz, beside the .ply frames of a sequence; exact, so that what is coded from the file
-is what would have been coded from memory."""
+"""ParametricGroup <-> arrays of an .npz, beside the .ply frames of a sequence. They are exact, so that a stream made of
+the file equals one made in memory."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""The node graph of a subject: a few hundred control points whose rigid motions carry all Gaussians.
+"""Deformation graph: a few hundred nodes whose rigid motions carry all Gaussians (HiFi4G's coarse graph).
 
-HiFi4G's coarse deformation graph, and what the stream's nodes are (spec 13.2 and 13.3: same neighbours, same weights):
-tracking optimises the nodes, so a smooth motion is smooth by construction and cheap to code.
+The stream holds the same nodes (spec 13.2 and 13.3: same neighbours, same weights). Tracking optimises them, so that a
+smooth motion is smooth by construction and cheap to code.
 
-What comes in later has nodes of its own. The decoder knows no owner, it takes the nearest nodes; so newcomers rest with
-their nodes at a free place beside all others, from which the nodes' translations bring them in.
+Gaussians that come in later have nodes of their own. The decoder blends the nearest nodes and knows no owner. So new
+Gaussians and their nodes rest at a free place beside all others, and the nodes' translations move them to the scene.
 """
 
 from __future__ import annotations
@@ -22,26 +22,34 @@ from .settings import DeformationGraphSettings
 
 @dataclass
 class Pose:
-    """Where the nodes are (`nodes` [M, 3]), how far they `turned` since the keyframe ([M, 4]), and their last step."""
+    """Motion of the nodes since the keyframe, and their last step.
+
+    Attributes:
+        nodes: [M, 3] positions, world units.
+        rotations: [M, 4] unit wxyz.
+        angular_velocity: [M, 3] rotation vectors, radians a frame.
+        velocity: [M, 3] world units a frame.
+    """
 
     nodes: torch.Tensor
-    turned: torch.Tensor
-    turn: torch.Tensor  # [M, 3] rotation vector of the last step
-    move: torch.Tensor  # [M, 3]
+    rotations: torch.Tensor
+    angular_velocity: torch.Tensor
+    velocity: torch.Tensor
 
     @staticmethod
     def rest(graph: NodeGraph) -> Pose:
-        """The keyframe's."""
+        """The pose of the keyframe."""
         zero = torch.zeros_like(graph.nodes)
         return Pose(graph.nodes, rotvec_to_quat(zero), zero, zero)
 
-    def ahead(self) -> Pose:
-        """One more such step."""
-        turned = torch.nn.functional.normalize(quat_multiply(rotvec_to_quat(self.turn), self.turned), dim=1)
-        return Pose(self.nodes + self.move, turned, self.turn, self.move)
+    def next(self) -> Pose:
+        """The pose a frame later, at constant velocity."""
+        step = rotvec_to_quat(self.angular_velocity)
+        rotations = torch.nn.functional.normalize(quat_multiply(step, self.rotations), dim=1)
+        return Pose(self.nodes + self.velocity, rotations, self.angular_velocity, self.velocity)
 
-    def joined(self, nodes: torch.Tensor) -> Pose:
-        """With more nodes, which come in at `nodes` [K, 3] and have not turned or moved yet."""
+    def extended(self, nodes: torch.Tensor) -> Pose:
+        """With more nodes at `nodes` [K, 3], which have not moved yet."""
         zero = torch.zeros_like(nodes)
         more = Pose(nodes, rotvec_to_quat(zero), zero, zero)
         return Pose(*(torch.cat([getattr(self, f.name), getattr(more, f.name)]) for f in fields(Pose)))
@@ -64,19 +72,20 @@ class _Blend(torch.autograd.Function):
 
 
 class NodeGraph:
-    """Nodes of a keyframe and of what has come in since, and the weights by which they carry Gaussians.
+    """Nodes of a keyframe and of Gaussians added since, and the weights by which they carry Gaussians.
 
     Args:
-        means: [N, 3] positions at rest; of what was there in the keyframe, those in the keyframe.
-        low, step: [3] and world units, origin and spacing of the lattice; chosen: [M, 3] u32, nodes on it.
-        family: [M] int, 0: of the keyframe; else the number of the newcomers whose node it is.
-        extent: [3], of the keyframe.
+        means: [N, 3] positions at rest; Gaussians of the keyframe rest where the keyframe has them.
+        low: [3], origin of the lattice, world units.
+        step: spacing of the lattice, world units.
+        chosen: [M, 3] u32, nodes on the lattice.
+        batch: [M] int; 0 for nodes of the keyframe, else the number of the batch of Gaussians that a node came in with.
+        extent: [3], of the keyframe, world units.
 
     Attributes:
-        means: as given.
-        neighbors: [N, k] u32, nodes that carry each Gaussian, the nearest first; weights: [N, k] f32.
         nodes: [M, 3] positions of the nodes at rest.
-        spacing: usual distance of neighbouring nodes.
+        neighbors: [N, k] u32, nodes that carry each Gaussian, the nearest first; weights: [N, k] f32.
+        spacing: median distance of neighbouring nodes.
     """
 
     def __init__(
@@ -85,19 +94,19 @@ class NodeGraph:
         low: torch.Tensor,
         step: float,
         chosen: np.ndarray,
-        family: np.ndarray,
+        batch: np.ndarray,
         extent: torch.Tensor,
         settings: DeformationGraphSettings,
     ):
         self.settings = settings
         self.low, self.step, self.extent = low, step, extent
-        self.chosen, self.family = chosen, family
+        self.chosen, self.batch = chosen, batch
         self._connect()
         self.means = means[:0]
         self.extend(means)
 
     def _connect(self) -> None:
-        """Positions of the nodes, and the edges between them."""
+        """Sets positions of the nodes and the edges between them."""
         from scipy.spatial import cKDTree
 
         self.nodes = self.low + self.step * torch.from_numpy(self.chosen.astype(np.float32))
@@ -108,7 +117,7 @@ class NodeGraph:
         middle = length.median() if k else torch.ones(())
         hold = torch.exp2(
             -((length / (self.settings.edge_falloff * middle)) ** 2)
-        )  # long edges bridge gaps: they hold less
+        )  # long edges bridge gaps: less weight
         self._hold, self.spacing = hold * self.settings.lattice / self.step, float(middle)
 
     @staticmethod
@@ -119,11 +128,17 @@ class NodeGraph:
         moving: torch.Tensor,
         settings: DeformationGraphSettings,
     ) -> NodeGraph:
-        """Nodes for Gaussians at `means` [N, 3] of `sizes` [N], most of them where `moving` ([N] bool); `radius` of
-        these. They are dense where the Gaussians are small: a wall behind needs few."""
+        """Nodes for the Gaussians of a keyframe, dense where these move and where they are small.
+
+        Args:
+            means: [N, 3] world units.
+            sizes: [N], proportional to the distance of nodes.
+            radius: of the moving Gaussians, world units.
+            moving: [N] bool.
+        """
         low, step = means.min(0).values, settings.lattice * radius
         grid = torch.round((means - low) / step).numpy().astype(np.uint32)
-        if (~moving).float().mean() < settings.still_share:  # nodes that stay among others that move would hold them
+        if (~moving).float().mean() < settings.still_share:  # nodes at rest among moving ones would hold these back
             moving = torch.ones_like(moving)
         still = int(settings.still_share * settings.nodes) if (~moving).any() else 0
         some = [np.zeros((0, 3), np.uint32)]
@@ -143,34 +158,34 @@ class NodeGraph:
         self.means = torch.cat([self.means, means])
 
     def _weights(self, means: torch.Tensor, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes of `chosen` that carry Gaussians at `means` [N, 3], and their weights, [N, k] both."""
+        """Nodes of `chosen` that carry Gaussians at `means` [N, 3] (indices [N, k]), and their weights [N, k]."""
         return _native.node_weights(self._on_lattice(means), chosen, self.settings.blended)
 
     def _on_lattice(self, means: torch.Tensor) -> np.ndarray:
         return torch.round((means - self.low) / self.step).clamp(min=0).numpy().astype(np.uint32)
 
-    def settle(self, means: torch.Tensor) -> torch.Tensor | None:
-        """Gives Gaussians that come in at `means` [K, 3] nodes of their own, at the end, and a place to rest.
+    def add_nodes(self, means: torch.Tensor) -> torch.Tensor | None:
+        """Adds nodes for Gaussians that come in at `means` [K, 3], and finds a place where both rest.
 
         Returns:
-            [3], from `means` to where they rest: there nobody else's nodes or weights change. None: no room is left.
+            Shift [3] from `means` to that place, where no other Gaussian's nodes or weights change. None: no room.
         """
         own = means[torch.from_numpy(farthest_points(means.numpy(), self.settings.added_nodes))]
         before = self._weights(self.means, self.chosen)
         for shift in self._places(means):
-            young = np.unique(self._on_lattice(own + shift), axis=0)
-            chosen = np.concatenate([self.chosen, young[_native.morton_order(young)]])
+            more = np.unique(self._on_lattice(own + shift), axis=0)
+            chosen = np.concatenate([self.chosen, more[_native.morton_order(more)]])
             after = self._weights(self.means, chosen)
             alone = (self._weights(means + shift, chosen)[0] >= len(self.chosen)).all()
             if alone and all(np.array_equal(a, b) for a, b in zip(before, after, strict=True)):
-                self.family = np.concatenate([self.family, np.full(len(young), self.family.max() + 1)])
+                self.batch = np.concatenate([self.batch, np.full(len(more), self.batch.max() + 1)])
                 self.chosen = chosen
                 self._connect()
                 return shift
         return None
 
     def _places(self, means: torch.Tensor):
-        """Shifts [3] of `means` to beside all that rest, along the axis with most room in the lattice."""
+        """Shifts [3] of `means` to beside all Gaussians at rest, along the axis with most room on the lattice."""
         low, high = means.min(0).values, means.max(0).values
         start, size = self.means.max(0).values, high - low
         room = self.low + self.settings.extent_max * self.extent.max() - size - start
@@ -183,22 +198,22 @@ class NodeGraph:
             shift[axis] = start[axis] + away - low[axis]
             yield shift
 
-    def family_of(self) -> np.ndarray:
-        """[N] int, the family of the nodes that carry each Gaussian."""
-        return self.family[self.neighbors[:, 0]]
+    def batch_of(self) -> np.ndarray:
+        """Batch of the nodes that carry each Gaussian, [N] int."""
+        return self.batch[self.neighbors[:, 0]]
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays."""
-        return {n: np.asarray(getattr(self, n)) for n in ("means", "low", "step", "chosen", "family", "extent")}
+        return {n: np.asarray(getattr(self, n)) for n in ("means", "low", "step", "chosen", "batch", "extent")}
 
     @staticmethod
     def restored(state: dict[str, np.ndarray], settings: DeformationGraphSettings) -> NodeGraph:
         """Inverse of `state`."""
         means, low, extent = (torch.from_numpy(state[n]) for n in ("means", "low", "extent"))
-        return NodeGraph(means, low, float(state["step"]), state["chosen"], state["family"], extent, settings)
+        return NodeGraph(means, low, float(state["step"]), state["chosen"], state["batch"], extent, settings)
 
-    def keep(self, chosen: torch.Tensor) -> None:
-        """Carries only the Gaussians of `chosen` ([N] bool)."""
+    def select(self, chosen: torch.Tensor) -> None:
+        """Keeps the Gaussians of `chosen` ([N] bool)."""
         self.means = self.means[chosen]
         self.neighbors, self.weights = (np.ascontiguousarray(a[chosen.numpy()]) for a in (self.neighbors, self.weights))
 
@@ -214,23 +229,24 @@ class NodeGraph:
         Returns:
             means [N, 3] and the blended rotation [N, 4] unit wxyz.
         """
-        poses = rigid_poses(self.nodes, pose.turned, pose.nodes - self.nodes)
+        poses = rigid_poses(self.nodes, pose.rotations, pose.nodes - self.nodes)
         return _Blend.apply(poses, x, self.neighbors, self.weights)
 
     def carriers(self, chosen: torch.Tensor) -> torch.Tensor:
-        """[M] bool: nodes that carry a Gaussian of `chosen` ([N] bool) with a weight of more than
-        `carrier_weight_min`."""
+        """Nodes that carry a Gaussian of `chosen` ([N] bool) with a weight of more than
+        `carrier_weight_min`, [M] bool."""
         some = chosen.numpy()
         carried = self.neighbors[some][self.weights[some] > self.settings.carrier_weight_min]
         return torch.from_numpy(np.isin(np.arange(len(self)), carried))
 
     def rigidity(self, pose: Pose) -> torch.Tensor:
-        """Mean weighted length by which the edges between nodes miss their rotated selves (Sorkine and Alexa 2007)."""
+        """As-rigid-as-possible term: mean weighted difference between edges as they are and as their node rotates them
+        (Sorkine and Alexa 2007), in lattice spacings times `lattice`."""
         if self._edges.numel() == 0:
             return pose.nodes.sum() * 0
         edge = self.nodes[self._edges] - self.nodes[:, None]
-        turned = torch.einsum("mij,mkj->mki", quat_to_matrix(pose.turned), edge)
-        missed = turned - (pose.nodes[self._edges] - pose.nodes[:, None])
+        rotated = torch.einsum("mij,mkj->mki", quat_to_matrix(pose.rotations), edge)
+        missed = rotated - (pose.nodes[self._edges] - pose.nodes[:, None])
         return (self._hold * missed).square().sum(2).add(1e-12).sqrt().mean()
 
 

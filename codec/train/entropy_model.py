@@ -1,10 +1,10 @@
-"""What a model costs in the stream, differentiable: the rate terms of training.
+"""Entropy model of training: differentiable bits of canonical attributes and of residual coefficients.
 
-Bits are code lengths of integers under Laplace laws, with uniform noise in place of rounding (Balle et al. 2017). A
-residual coefficient is held against zero. A canonical value is held against what the coder knows when it comes to it:
-the nearest Gaussians before it in Morton order (spec 7.3), all in the form that the encoder gives them (axes by falling
-scale, rotations as turns from the nearest of them, colours as Y, Co, Cg). Positions have no term: they cost the same
-wherever they are.
+Bits are code lengths of integers under Laplace distributions, with uniform noise in place of rounding (Balle et al.
+2017). The mean of a residual coefficient is 0. The mean of a canonical value follows from the context of the coder: the
+nearest Gaussians before it in Morton order (spec 7.3), in the form that the encoder codes (axes by falling scale,
+rotations relative to that of the nearest Gaussian, colours as Y, Co, Cg). Positions have no term, because they cost the
+same wherever they are.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ CONTEXT_NEIGHBOURS, CONTEXT_WINDOW = 4, 32  # the nearest so many of the so many
 GRID_MAX = 2**20  # steps along an axis, what the Morton order takes: far floaters make steps coarser
 LN2 = float(np.log(2))
 _H = 0.5**0.5
-_TURNS = torch.zeros(27, 4)  # [9 a + 3 b + c] the turn after which axes a, b, c are the first, second, third
-_TURNS[[5, 7, 11, 15, 19, 21]] = torch.tensor(
+_AXIS_ROTATIONS = torch.zeros(27, 4)  # [9 a + 3 b + c]: rotates axes a, b, c to first, second, third
+_AXIS_ROTATIONS[[5, 7, 11, 15, 19, 21]] = torch.tensor(
     [[1, 0, 0, 0], [0, 0, _H, -_H], [0, _H, -_H, 0], [0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [0, _H, 0, -_H]]
 )
 
 
 def laplace_bits(x: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
-    """Bits of integers under a Laplace law of scale exp(log_scale), at real x (the relaxed quantizer's output).
+    """Bits of integers under a Laplace distribution of scale exp(log_scale), at real x (a relaxed quantizer's output).
 
     Probability of the unit interval around x, computed without cancellation; differentiable in both.
     """
@@ -37,7 +37,7 @@ def laplace_bits(x: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
 
 
 class _LaplaceBits(torch.autograd.Function):
-    """With its derivatives in closed form: a few passes over memory in place of one for each operation."""
+    """Derivatives in closed form: a few passes over memory instead of one for each operation."""
 
     @staticmethod
     def forward(ctx, x: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
@@ -45,7 +45,7 @@ class _LaplaceBits(torch.autograd.Function):
         a = x.abs()
         inside, near = a < 0.5, a.clamp(max=0.5)
         rising, falling = torch.exp((near - 0.5) * rate), torch.exp(-(near + 0.5) * rate)
-        p = (1 - 0.5 * (rising + falling)).clamp(min=1e-9)  # a law so wide that it would be rounded to 0
+        p = (1 - 0.5 * (rising + falling)).clamp(min=1e-9)  # so wide that it would be rounded to 0
         off, beyond = (a - 0.5) * rate, -torch.expm1(-rate)
         bits = torch.where(inside, -torch.log2(p), off / LN2 + 1 - torch.log2(beyond))
         share = rate / (2 * LN2) / p
@@ -65,8 +65,8 @@ class _LaplaceBits(torch.autograd.Function):
 
 
 def neighbours(means: torch.Tensor, step: float) -> torch.Tensor:
-    """[N, 4] the nearest Gaussians among the 32 before each in Morton order, as contexts see them; itself where there
-    is none."""
+    """Context of each Gaussian: indices [N, 4] of the nearest among the 32 before it in Morton order; its own index
+    where there is none."""
     low, high = means.min(0).values, means.max(0).values
     step = max(step, float((high - low).max()) / GRID_MAX)
     grid = torch.round((means - low) / step).numpy().astype(np.uint32)
@@ -85,10 +85,10 @@ def neighbours(means: torch.Tensor, step: float) -> torch.Tensor:
 
 
 class CanonicalRate:
-    """Bits of the canonical attributes of N Gaussians that hardly move.
+    """Bits of the canonical attributes of N Gaussians, whose neighbours stay the same.
 
     Args:
-        means: [N, 3], which make the order and the neighbours.
+        means: [N, 3], from which order and neighbours follow.
         steps: of the stream.
     """
 
@@ -106,11 +106,11 @@ class CanonicalRate:
         }
 
     def channels(self, params: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """[N, C] of each attribute in the form and the steps of the encoder; differentiable."""
+        """Integers-to-be of each attribute, [N, C], as the encoder codes them, in steps; differentiable."""
         order = params["log_scales"].detach().argsort(dim=1, descending=True, stable=True)
         values = {
             "log_scales": params["log_scales"].gather(1, order),
-            "quats": turns(params["quats"], order, self.near[:, 0]),
+            "quats": rotation_residuals(params["quats"], order, self.near[:, 0]),
             "logit_opacities": params["logit_opacities"][:, None],
             "sh0": params["sh0"] @ self.to_ycocg,
             "shN": params["shN"] @ self.to_ycocg,
@@ -124,16 +124,16 @@ class CanonicalRate:
     def _bits(self, attribute: str, x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         x = x + torch.rand(x.shape, generator=generator) - 0.5
         around = x[self.near]
-        mean = torch.zeros_like(x) if attribute == "quats" else around.mean(1)  # a turn may be to either side
-        with torch.no_grad():  # the law's width follows the neighbours' own differences
+        mean = torch.zeros_like(x) if attribute == "quats" else around.mean(1)  # a rotation may be to either side
+        with torch.no_grad():  # the scale follows the differences of the neighbours
             spread = (around - mean[:, None]).abs().mean(1) + self.settings.spread_min
-            width = spread * (x - mean).abs().mean(0) / spread.mean(0)
-        return laplace_bits(x - mean, width.clamp(min=self.settings.scale_min).log()).sum()
+            scale = spread * (x - mean).abs().mean(0) / spread.mean(0)
+        return laplace_bits(x - mean, scale.clamp(min=self.settings.scale_min).log()).sum()
 
     def gradients(
         self, params: dict[str, torch.Tensor], generator: torch.Generator
     ) -> tuple[float, dict[str, torch.Tensor]]:
-        """All bits, and their gradients by the attributes that have any."""
+        """Sum of all bits, and its gradients by the attributes that have bits."""
         leaves = {n: p.detach().clone().requires_grad_() for n, p in params.items()}
         bits = self.bits(leaves, generator)
         total = sum(bits.values())
@@ -141,11 +141,17 @@ class CanonicalRate:
         return float(total.detach()), dict(zip(bits, grads, strict=True))
 
 
-def turns(quats: torch.Tensor, order: torch.Tensor, nearest: torch.Tensor) -> torch.Tensor:
-    """[N, 3] sines of half the angles by which each of the quaternions [N, 4], axes in `order` ([N, 3]), is turned from
-    that of its `nearest` ([N]) about its first, second and third axis (spec 13.1), in the form that turns least."""
+def rotation_residuals(quats: torch.Tensor, order: torch.Tensor, nearest: torch.Tensor) -> torch.Tensor:
+    """Rotation of each Gaussian relative to that of its nearest one (spec 13.1): sines of half the angles about the
+    first, second and third axis, [N, 3]. Of the equal forms of an ellipsoid, the one with the smallest rotation.
+
+    Args:
+        quats: [N, 4] wxyz.
+        order: [N, 3], axes by falling scale.
+        nearest: [N] index.
+    """
     own = torch.nn.functional.normalize(quats, dim=1)
-    own = quat_multiply(own, _TURNS[order[:, 0] * 9 + order[:, 1] * 3 + order[:, 2]])
+    own = quat_multiply(own, _AXIS_ROTATIONS[order[:, 0] * 9 + order[:, 1] * 3 + order[:, 2]])
     between = quat_multiply(quat_conjugate(own[nearest]), own)
     form = torch.eye(4)[between.detach().abs().argmax(1)]
     w, x, y, z = quat_multiply(between, quat_conjugate(form)).unbind(1)

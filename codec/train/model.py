@@ -12,7 +12,7 @@ from ..render.backend import Backend
 from ..render.optimizer import Adam, AdamSettings
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
-HIDDEN = -20.0  # logit of the opacity of what is not there
+REMOVED_LOGIT = -20.0  # logit of the opacity of a Gaussian that is removed, or not there yet
 
 
 class Model:
@@ -27,7 +27,7 @@ class Model:
 
     @property
     def degree(self) -> int:
-        """Of the spherical harmonics."""
+        """Degree of the spherical harmonics."""
         return math.isqrt(self.params["shN"].shape[1] + 1) - 1
 
     def start_optimizer(self, backend: Backend, settings: AdamSettings) -> None:
@@ -67,12 +67,13 @@ class Model:
         return Gaussians(**arrays)
 
 
-def from_points(points: np.ndarray, colors: np.ndarray, *, opacity: float, sh_count: int = 0) -> Model:
-    """Round Gaussians half as wide as the distance to their neighbours, in the given colours (0..1).
+def from_points(points: np.ndarray, colors: np.ndarray, *, opacity: float) -> Model:
+    """Round Gaussians half as wide as the distance to their neighbours, with SH of degree 0.
 
     Args:
-        points: [N, 3]; colors: [N, 3].
-        opacity: high where points are known to lie on the subject, low where they are guesses.
+        points: [N, 3] world units.
+        colors: [N, 3] in 0..1.
+        opacity: of all Gaussians, 0..1.
     """
     from scipy.spatial import cKDTree
 
@@ -89,7 +90,7 @@ def from_points(points: np.ndarray, colors: np.ndarray, *, opacity: float, sh_co
             "log_scales": tensor(np.log(0.5 * spacing)[:, None].repeat(3, 1)),
             "logit_opacities": torch.full((n,), float(np.log(opacity / (1 - opacity)))),
             "sh0": tensor((colors - 0.5) / SH_C0),
-            "shN": torch.zeros(n, sh_count, 3),
+            "shN": torch.zeros(n, 0, 3),
         }
     )
 

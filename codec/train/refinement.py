@@ -42,8 +42,8 @@ class PictureRefinement:
         views: pictures of each group; None: as `settings` say.
     """
 
-    def __init__(self, capture: Capture, settings: RefinementSettings = RefinementSettings(), views: int | None = None):
-        self._capture, self._settings, self._views = capture, settings, views
+    def __init__(self, capture: Capture, settings: RefinementSettings | None = None, views: int | None = None):
+        self._capture, self._settings, self._views = capture, settings or RefinementSettings(), views
         self._trained = capture.indices("train")
 
     def __call__(self, group: ParametricGroup, first_frame: int, quantizer: Quantizer) -> None:

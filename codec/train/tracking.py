@@ -1,16 +1,16 @@
 """Tracking: the Gaussians of one frame -> those of the next, the same ones moved.
 
-Two things are optimised together against the views: the rigid motions of a node graph, which carry everything, and the
-Gaussians' own attributes. The colours must be free while the nodes move: shading changes on a turning surface, and
-with fixed colours the motion follows the shading instead of the surface (lumberjack: 22.5 dB after 6 frames, with free
-colours 26.1). The first half of the steps looks at small pictures, where large motion is near and a step is cheap.
+Optimised together against the views: the rigid motions of the nodes, which carry all Gaussians, and the Gaussians' own
+attributes (frame_fit.py). Colours must be free while nodes move: shading changes on a rotating surface, and with fixed
+colours the motion follows the shading instead of the surface (lumberjack after 6 frames: 22.5 dB, with free colours
+26.1). The first half of the steps sees small images, in which large motion is near and a step is cheap.
 
-What does not change in the pictures (changes.py) does not move: its Gaussians and nodes stay as they are, to the bit.
-What comes in (births.py) has nodes of its own, unless it is beside what is there, and is looked for where it moves too
-fast to be followed (lost.py). What has faded away, or lies outside of the masks, is dead.
+Gaussians behind pixels that do not change (change_detection.py) stay as they are, to the bit, and so do their nodes.
+New Gaussians (densification.py) have nodes of their own, unless they lie beside others; those that move too fast for
+the gradient are searched for (relocalization.py). Gaussians that have faded, or lie outside of the masks, are removed.
 
-A hash grid and MLP (V3) on top of the nodes gave nothing here, so that there is none: the nodes are what the stream can
-carry. V3's recipe, with the grid, is a baseline in bench/baselines/v3.py.
+A hash grid and an MLP (V3) on top of the nodes improved nothing here, and the stream carries nodes: there is none. V3's
+recipe, with its grid, is a baseline in bench/baselines/v3.py.
 """
 
 from __future__ import annotations
@@ -22,34 +22,37 @@ import numpy as np
 import torch
 
 from ..bitstream.quantization import subject_radius
-from ..model.rotations import quat_conjugate, quat_multiply, rotvec_to_quat
-from ..render.optimizer import Adam
+from ..model.rotations import quat_conjugate, quat_multiply, rotate, rotvec_to_quat
 from .change_detection import Changes
 from .deformation_graph import NodeGraph, Pose
-from .densification import born, wrong_pixels
-from .keyframe import Statistics, rotate
-from .model import HIDDEN, NAMES, Model
-from .relocalization import whereabouts
+from .densification import error_masks, spawn
+from .frame_fit import FrameFit
+from .keyframe import Statistics
+from .model import NAMES, REMOVED_LOGIT, Model
+from .relocalization import relocalize
 from .settings import TrainSettings
-from .views import Views, photometric_loss, view_losses
+from .views import Views, view_losses
+
+OnStep = Callable[[int, float], None] | None  # called with (step, loss)
 
 
 class Tracker:
-    """Follows the Gaussians of a keyframe through the frames after it; `start` makes one.
+    """Tracks the Gaussians of a keyframe through the frames after it; `start` makes one.
 
     Args:
-        graph: nodes in the keyframe; own: see below.
-        radius: of what moves, world units.
-        loss: see below; calm: pull on a Gaussian (`Statistics.mean_pull`) that hardly any has in the keyframe.
+        graph: nodes, at rest in the keyframe.
+        own: see below.
+        numbers: radius of the moving Gaussians in world units; `loss`, see below; `keyframe_gradient`, the reference
+            of screen gradients (`gradient_quantile` of those in the keyframe).
         changes: what has been fitted so far.
 
     Attributes:
-        own: the Gaussians as they would be in the keyframe's pose; `means` is what they moved besides the nodes.
-        pose: the nodes in the last frame.
-        moving: [N] bool, Gaussians that were free to change in the last frame.
-        loss: image loss of the last frame that had changed, without the mask's.
-        masks: what has changed in the last frame's pictures, as of `Changes.advance`.
-        pull: [N], mean pull of the last frame's pictures on each Gaussian.
+        own: the Gaussians in the pose of the keyframe; `means` are the offsets from where the nodes carry them.
+        pose: of the nodes in the last frame.
+        moving: [N] bool, Gaussians that were optimised in the last frame.
+        loss: image loss of the last frame with changes, without the mask term.
+        masks: changed pixels of the last frame, as of `Changes.advance`.
+        screen_gradient: [N], mean in the last frame.
     """
 
     def __init__(
@@ -57,245 +60,197 @@ class Tracker:
     ):
         self.graph, self.own, self.pose, self.views = graph, own, Pose.rest(graph), views
         self.settings = replace(settings, mask_lambda=settings.tracking.mask_factor * settings.mask_lambda)
-        self.radius, self.loss, self.calm = numbers.tolist()
+        self.radius, self.loss, self.keyframe_gradient = numbers.tolist()
         self.changes = changes
         self.moving = torch.zeros(len(own), dtype=torch.bool)
 
     @staticmethod
     def start(key: Model, views: Views, settings: TrainSettings, loss: float, frames: range) -> Tracker:
-        """Follows `key`, the keyframe of frames[0] with image loss `loss`; most nodes go where frames[1] differs."""
-        changes = Changes.since(views, frames[0], settings.change_detection)
+        """Tracks `key`, the keyframe of frames[0] with image loss `loss`; nodes are dense where frames[1] changes."""
+        s, changes = settings.tracking, Changes.since(views, frames[0], settings.change_detection)
         stats, visible = Statistics(len(key), settings.keyframe.mse_min), []
         for result in view_losses(key.params, views, frames[0], settings):
             stats.add(result)
-            visible.append(result.max_weight > settings.tracking.visible_weight)
+            visible.append(result.max_weight > s.visible_weight)
         means = key.params["means"]
         moving = np.ones(len(key), bool)
         if len(frames) > 1:
-            seen = changes.behind(frames[1], changes.copy().advance(frames[1]), means.numpy(), visible)
-            moving = seen if seen.any() else moving
+            changed = changes.behind(frames[1], changes.copy().advance(frames[1]), means.numpy(), visible)
+            moving = changed if changed.any() else moving
         radius = subject_radius(means[moving].numpy())
         sizes = torch.ones(len(key))
         if not views.capture.has_alpha:  # there is a background
             sizes = key.params["log_scales"].sort(1).values[:, 1:].mean(1).exp()  # without the thin axis
         graph = NodeGraph.of(means, sizes, radius, torch.from_numpy(moving), settings.graph)
         own = Model({**key.params, "means": torch.zeros_like(means)})
-        calm = float(torch.quantile(stats.mean_pull(), settings.tracking.gradient_quantile))
-        return Tracker(graph, own, views, settings, np.array([radius, loss, calm]), changes)
+        gradient = float(torch.quantile(stats.mean_screen_gradient(), s.gradient_quantile))
+        return Tracker(graph, own, views, settings, np.array([radius, loss, gradient]), changes)
 
     def carried(self, own: Model, pose: Pose) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-        """Attributes in the frame of `pose`, and how far the nodes have turned each Gaussian, [N, 4]."""
-        means, turned = self.graph.carry(self.graph.means, pose)
-        quats = quat_multiply(turned, own.params["quats"])
-        return {**own.params, "means": means + own.params["means"], "quats": quats}, turned
+        """Attributes of `own` carried to `pose`, and the rotation of each Gaussian by the nodes, [N, 4]."""
+        means, rotations = self.graph.carry(self.graph.means, pose)
+        quats = quat_multiply(rotations, own.params["quats"])
+        return {**own.params, "means": means + own.params["means"], "quats": quats}, rotations
 
     @property
     def model(self) -> Model:
         """The Gaussians in the last frame."""
         return Model(self.carried(self.own, self.pose)[0])
 
-    def advance(self, frame: int, on_step: Callable[[int, float], None] | None = None) -> float | None:
-        """Moves model and pose on to `frame`, the next one; returns the image loss at the end, without the mask's, or
-        None where nothing has changed or nothing is left; infinity if something comes after that."""
+    @property
+    def alive(self) -> torch.Tensor:
+        """[N] bool: Gaussians that have not been removed."""
+        return self.own.params["logit_opacities"] > REMOVED_LOGIT
+
+    def advance(self, frame: int, on_step: OnStep = None) -> float | None:
+        """Tracks on to `frame`, the next one.
+
+        Returns:
+            Image loss at the end, without the mask term. None: nothing has changed, or no Gaussian is left and no pixel
+            needs one. Infinity: no Gaussian is left, and pixels change.
+        """
         self.moving = torch.from_numpy(self._moving(frame))
-        self.pull = torch.zeros(len(self.own))
+        self.screen_gradient = torch.zeros(len(self.own))
         changed = any(m.any() for m in self.masks)
         if not self.alive.any():
             return np.inf if changed else None
         if self.moving.any():
-            self._find(frame)
+            self._relocalize(frame)
             self._fit(frame, on_step)
         else:
-            self.pose = replace(self.pose, turn=0 * self.pose.turn, move=0 * self.pose.move)
+            still = {n: 0 * getattr(self.pose, n) for n in ("angular_velocity", "velocity")}
+            self.pose = replace(self.pose, **still)
+        faded = torch.sigmoid(self.own.params["logit_opacities"]) < self.settings.keyframe.prune_opacity
         outside = self.changes.outside(frame, self.model.params["means"].numpy())
-        self._bury(torch.from_numpy(outside) | (self.moving & self._faded))
+        self._remove(torch.from_numpy(outside) | (self.moving & faded))
         return self.loss if changed and self.alive.any() else None
 
-    def _fit(self, frame: int, on_step) -> None:
-        fit = _Fit(self, np.random.default_rng([self.settings.seed, frame, 1]))
+    def _fit(self, frame: int, on_step: OnStep) -> None:
+        """Rounds of `motion_steps`, until the loss is near that of the frame before or falls no more."""
+        fit = FrameFit(self, np.random.default_rng([self.settings.seed, frame, 1]))
         s = self.settings.tracking
         bound, loss = s.loss_ratio * self.loss + s.loss_floor, np.inf
-        if not self.pose.move.any():
+        if not self.pose.velocity.any():
             self._round(fit, frame, 1.0, on_step)
-        for turn in range(s.rounds_max):
-            before, loss = loss, self._round(fit, frame, 0.5 if turn == 0 else 0.0, on_step)
+        for i in range(s.rounds_max):
+            before, loss = loss, self._round(fit, frame, 0.5 if i == 0 else 0.0, on_step)
             if loss < bound or loss > s.progress_ratio * before:
                 break
         self.own, self.pose = fit.result()
         self.loss = loss
-        self.pull = fit.pull.mean_pull()
+        self.screen_gradient = fit.statistics.mean_screen_gradient()
 
-    def _find(self, frame: int) -> None:
-        """Newcomers that are lost go to where `frame` shows them, with that speed, or die."""
-        family, next_pose = self.graph.family_of(), self.pose.ahead()
-        for k in np.setdiff1d(family[(self.moving & self.alive).numpy()], [0]):
-            some = torch.from_numpy(family == k) & self.alive
-            model = Model(self.carried(self.own, next_pose)[0])
-            shift = whereabouts(model, some, frame, self.changes, self.masks, self.settings)
-            if shift is None:
-                self._bury(some)
-            else:
-                self.moving |= some
-                self.pose.move[torch.from_numpy(self.graph.family == k)] += shift
-
-    @property
-    def _faded(self) -> torch.Tensor:
-        return torch.sigmoid(self.own.params["logit_opacities"]) < self.settings.keyframe.prune_opacity
-
-    def _bury(self, dead: torch.Tensor) -> None:
-        """Gaussians of `dead` ([N] bool) do not come back."""
-        self.own.params["logit_opacities"][dead] = HIDDEN
-        self.moving &= ~dead
-
-    @property
-    def alive(self) -> torch.Tensor:
-        """[N] bool: Gaussians that have not died."""
-        return self.own.params["logit_opacities"] > HIDDEN
-
-    def keep(self, chosen: torch.Tensor) -> None:
-        """Forgets the Gaussians outside of `chosen` ([N] bool)."""
-        self.graph.keep(chosen)
-        self.own.select(chosen)
-        self.moving = self.moving[chosen]
-
-    def bear(self, frame: int, on_step: Callable[[int, float], None] | None = None) -> None:
-        """Adds the Gaussians that `frame` needs besides, after `advance`."""
-        most = self.settings.gaussians_max
-        room = min(most - int(self.alive.sum()), self.settings.tracking.stored_factor * most - len(self.own))
-        pull = self.pull / self.calm
-        wrong = wrong_pixels(self.model, self.masks, frame, self.views, self.settings.densification)
-        young = born(self.model, pull, wrong, frame, self.views, self.settings, room, on_step)
-        if young is not None:
-            self._add(young)
-
-    def _add(self, young: Model) -> None:
-        """Takes in Gaussians that were born in the pose of the last frame."""
-        self.graph.extend(self._rest(young.params["means"]))
-        means, turned = (x[len(self.own) :] for x in self.graph.carry(self.graph.means, self.pose))
-        quats = quat_multiply(quat_conjugate(turned), young.params["quats"])
-        self.own.append({**young.params, "means": young.params["means"] - means, "quats": quats})
-        self.moving = torch.cat([self.moving, torch.ones(len(young), dtype=torch.bool)])
-
-    def _rest(self, means: torch.Tensor) -> torch.Tensor:
-        """[K, 3] where Gaussians rest that are born at `means`: beside the nearest one that there is, whose nodes carry
-        them, too. Strangers, away from all, have nodes of their own, and what is nearest to these goes with them."""
-        from scipy.spatial import cKDTree
-
-        s = self.settings.tracking
-        params, turned = self.carried(self.own, self.pose)
-        there, turned, rest = params["means"][self.alive], turned[self.alive], self.graph.means[self.alive]
-        among = np.median(cKDTree(means.numpy()).query(means.numpy(), 2)[0][:, 1])
-        strange = torch.from_numpy(cKDTree(there.numpy()).query(means.numpy())[0] > s.separate_distance * among)
-        first = len(self.graph)
-        shift = self.graph.settle(means[strange]) if strange.sum() >= s.separate_min else None
-        if shift is not None:
-            self.pose = self.pose.joined(self.graph.nodes[first:] - shift)
-            there, rest = torch.cat([there, means[strange]]), torch.cat([rest, means[strange] + shift])
-            turned = torch.cat([turned, rotvec_to_quat(torch.zeros(int(strange.sum()), 3))])
-        near = torch.from_numpy(cKDTree(there.numpy()).query(means.numpy())[1])
-        return rest[near] + rotate(quat_conjugate(turned[near]), means - there[near])
-
-    def _round(self, fit: _Fit, frame: int, coarse: float, on_step) -> float:
-        """`motion_steps` views, the first share of them, `coarse`, small; returns the image loss at the end."""
-        s = self.settings.tracking
-        losses, steps = [], self.settings.motion_steps
+    def _round(self, fit: FrameFit, frame: int, small: float, on_step: OnStep) -> float:
+        """`motion_steps` views, the first share of them, `small`, at small size; returns the image loss at the end."""
+        s, steps = self.settings.tracking, self.settings.motion_steps
+        losses = []
         for step in range(steps):
-            full = step >= coarse * steps
+            full = step >= small * steps
             target = self.views.draw(frame, 1.0 if full else s.small_scale)
-            losses.append(fit.step(target, s.rate_decay ** (step / steps), full, stiff=coarse == 1))
+            losses.append(fit.step(target, s.rate_decay ** (step / steps), full=full, first=small == 1))
             if on_step:
                 on_step(step, losses[-1])
         return float(np.mean(losses[-s.loss_window :]))
 
-    def stirred(self, frame: int, before: torch.Tensor) -> float:
-        """Share of the Gaussians that `frame`, the next one, shows otherwise, beyond those of `before` ([N] bool)."""
+    def _relocalize(self, frame: int) -> None:
+        """Moves each batch of new Gaussians that is lost to where `frame` shows it, or removes it."""
+        batch, next_pose = self.graph.batch_of(), self.pose.next()
+        for k in np.setdiff1d(batch[(self.moving & self.alive).numpy()], [0]):
+            some = torch.from_numpy(batch == k) & self.alive
+            model = Model(self.carried(self.own, next_pose)[0])
+            shift = relocalize(model, some, frame, self.changes, self.masks, self.settings)
+            if shift is None:
+                self._remove(some)
+            else:
+                self.moving |= some
+                self.pose.velocity[torch.from_numpy(self.graph.batch == k)] += shift
+
+    def _remove(self, removed: torch.Tensor) -> None:
+        """Removes Gaussians ([N] bool) for good; they keep their index until the group ends."""
+        self.own.params["logit_opacities"][removed] = REMOVED_LOGIT
+        self.moving &= ~removed
+
+    def select(self, chosen: torch.Tensor) -> None:
+        """Keeps the Gaussians of `chosen` ([N] bool)."""
+        self.graph.select(chosen)
+        self.own.select(chosen)
+        self.moving = self.moving[chosen]
+
+    def densify(self, frame: int, on_step: OnStep = None) -> None:
+        """Adds the Gaussians that `frame` needs besides, after `advance`."""
+        s, most = self.settings, self.settings.gaussians_max
+        room = min(most - int(self.alive.sum()), s.tracking.stored_factor * most - len(self.own))
+        gradient = self.screen_gradient / self.keyframe_gradient
+        wrong = error_masks(self.model, self.masks, frame, self.views, s.densification)
+        spawned = spawn(self.model, gradient, wrong, frame, self.views, s, room, on_step)
+        if spawned is not None:
+            self._add(spawned)
+
+    def _add(self, spawned: Model) -> None:
+        """Adds Gaussians that were made in the pose of the last frame."""
+        params = spawned.params
+        self.graph.extend(self._rest_positions(params["means"]))
+        means, rotations = (x[len(self.own) :] for x in self.graph.carry(self.graph.means, self.pose))
+        quats = quat_multiply(quat_conjugate(rotations), params["quats"])
+        self.own.append({**params, "means": params["means"] - means, "quats": quats})
+        self.moving = torch.cat([self.moving, torch.ones(len(spawned), dtype=torch.bool)])
+
+    def _rest_positions(self, means: torch.Tensor) -> torch.Tensor:
+        """Where new Gaussians at `means` [K, 3] rest: beside the nearest Gaussian, whose nodes carry them, too.
+
+        Those that are far from all others get nodes of their own, which also carry the new ones nearest to them.
+        """
+        from scipy.spatial import cKDTree
+
+        s = self.settings.tracking
+        params, rotations = self.carried(self.own, self.pose)
+        old, rotations, rest = params["means"][self.alive], rotations[self.alive], self.graph.means[self.alive]
+        spacing = np.median(cKDTree(means.numpy()).query(means.numpy(), 2)[0][:, 1])
+        separate = torch.from_numpy(cKDTree(old.numpy()).query(means.numpy())[0] > s.separate_distance * spacing)
+        first = len(self.graph)
+        shift = self.graph.add_nodes(means[separate]) if separate.sum() >= s.separate_min else None
+        if shift is not None:
+            self.pose = self.pose.extended(self.graph.nodes[first:] - shift)
+            old, rest = torch.cat([old, means[separate]]), torch.cat([rest, means[separate] + shift])
+            rotations = torch.cat([rotations, rotvec_to_quat(torch.zeros(int(separate.sum()), 3))])
+        near = torch.from_numpy(cKDTree(old.numpy()).query(means.numpy())[1])
+        return rest[near] + rotate(quat_conjugate(rotations[near]), means - old[near])
+
+    def changed_fraction(self, frame: int, before: torch.Tensor) -> float:
+        """Fraction of the Gaussians that `frame`, the next one, changes, beyond those of `before` ([N] bool)."""
         new = self._behind(self.changes.copy().advance(frame), frame) & ~before.numpy()
         return float(new.mean()) if len(new) else 0.0
 
     def _moving(self, frame: int) -> np.ndarray:
-        """[N] bool: Gaussians that `frame` shows otherwise."""
+        """Gaussians that `frame` changes, [N] bool; sets `masks`."""
         self.masks = self.changes.advance(frame)
         return self._behind(self.masks, frame)
 
     def _behind(self, masks: list[np.ndarray], frame: int) -> np.ndarray:
-        """[N] bool: Gaussians behind the changed pixels of `frame` (`masks`)."""
-        model = self.model
+        """Gaussians behind the changed pixels `masks` of `frame`, [N] bool."""
+        model, s = self.model, self.settings.tracking
         if not any(m.any() for m in masks):
             return np.zeros(len(model), bool)
-        s = self.settings.tracking
-        looks = view_losses(model.params, self.views, frame, self.settings, s.small_scale)
-        visible = [result.max_weight > s.visible_weight for result in looks]
+        losses = view_losses(model.params, self.views, frame, self.settings, s.small_scale)
+        visible = [result.max_weight > s.visible_weight for result in losses]
         return self.changes.behind(frame, masks, model.params["means"].numpy(), visible)
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays, for a checkpoint."""
         own = {f"own.{n}": p.numpy() for n, p in self.own.params.items()}
         pose = {f"pose.{f.name}": getattr(self.pose, f.name).numpy() for f in fields(Pose)}
-        fitted = {f"fitted.{i}": picture for i, picture in enumerate(self.changes.fitted)}
+        fitted = {f"fitted.{i}": image for i, image in enumerate(self.changes.fitted)}
         graph = {f"graph.{n}": a for n, a in self.graph.state().items()}
-        numbers = np.array([self.radius, self.loss, self.calm])
+        numbers = np.array([self.radius, self.loss, self.keyframe_gradient])
         return {"numbers": numbers, **graph, **own, **pose, **fitted}
 
     @staticmethod
     def restored(state: dict[str, np.ndarray], views: Views, settings: TrainSettings) -> Tracker:
         """Inverse of `state`."""
         own = Model({n: torch.from_numpy(state[f"own.{n}"]) for n in NAMES})
-        graph = NodeGraph.restored({n[6:]: a for n, a in state.items() if n.startswith("graph.")}, settings.graph)
+        graph = {n.removeprefix("graph."): a for n, a in state.items() if n.startswith("graph.")}
         fitted = [state[f"fitted.{i}"] for i in range(len(views.train_cameras))]
         changes = Changes(views, fitted, settings.change_detection)
-        tracker = Tracker(graph, own, views, settings, state["numbers"], changes)
+        tracker = Tracker(NodeGraph.restored(graph, settings.graph), own, views, settings, state["numbers"], changes)
         tracker.pose = Pose(*(torch.from_numpy(state[f"pose.{f.name}"]) for f in fields(Pose)))
         return tracker
-
-
-class _Fit:
-    """The optimisation of one frame, from constant velocity, of the Gaussians that are moving and their nodes.
-
-    Means are always the keyframe's, carried by the whole motion since, plus what each Gaussian moved besides: what the
-    stream can say with nodes is said with nodes, and does not creep into the Gaussians step by step.
-    """
-
-    def __init__(self, tracker: Tracker, rng: np.random.Generator):
-        self.t, self.rng = tracker, rng
-        self.moving = tracker.moving.float()
-        self.carriers = tracker.graph.carriers(tracker.moving).float()[:, None]
-        self.turn = (tracker.pose.turn * self.carriers).requires_grad_()
-        self.move = (tracker.pose.move * self.carriers).requires_grad_()
-        s = tracker.settings.tracking
-        self.node_rates = {"rotation": s.node_rotation_rate, "translation": s.node_translation_rate * tracker.radius}
-        self.node_adam = Adam(tracker.views.backend, s.node_adam)
-        self.own = Model(tracker.own.params)
-        self.own.start_optimizer(tracker.views.backend, tracker.settings.adam)
-        self.pull = Statistics(len(self.own), tracker.settings.keyframe.mse_min)
-
-    def _pose(self) -> Pose:
-        return replace(self.t.pose, turn=self.turn, move=self.move).ahead()
-
-    def step(self, target, fade: float, full: bool, stiff: bool) -> float:
-        """One view; rates times `fade`; a `full` one counts for what pulls at the Gaussians; `stiff`: see
-        `first_round_rigidity`."""
-        t, pose, s = self.t, self._pose(), self.t.settings.tracking
-        params, turned = t.carried(self.own, pose)
-        result = photometric_loss(params, target, t.settings, self.rng, t.views.backend)
-        if full:
-            self.pull.add(result)
-        grads = result.grads
-        rigid = (s.first_round_rigidity if stiff else 1.0) * t.settings.rigidity * t.graph.rigidity(pose)
-        self.turn.grad = self.move.grad = None
-        heads, seeds = [params["means"], params["quats"], rigid], [grads["means"], grads["quats"], torch.ones(())]
-        torch.autograd.backward(heads, seeds)
-        nodes = {"rotation": self.turn, "translation": self.move}
-        by_nodes = {n: p.grad * self.carriers for n, p in nodes.items()}
-        self.node_adam.step(nodes, by_nodes, {n: r * fade for n, r in self.node_rates.items()})
-        back = quat_multiply(quat_conjugate(turned.detach()), grads["quats"])
-        fade *= s.first_round_rates if stiff else 1.0
-        own = {n: g * self.moving.view(-1, *[1] * (g.dim() - 1)) for n, g in {**grads, "quats": back}.items()}
-        self.own.step(own, s.rates.scaled(t.radius, fade))
-        return result.loss - t.settings.mask_lambda * result.mask
-
-    @torch.no_grad()
-    def result(self) -> tuple[Model, Pose]:
-        """The Gaussians' own attributes and the nodes."""
-        quats = torch.nn.functional.normalize(self.own.params["quats"], dim=1)
-        pose = self._pose()
-        return Model({**self.own.params, "quats": quats}), Pose(*(getattr(pose, f.name).detach() for f in fields(Pose)))

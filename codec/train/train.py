@@ -1,40 +1,47 @@
-"""Capture -> groups of tracked Gaussians: keyframe, motion, joint fine-tuning, group after group.
+"""Capture -> groups of tracked Gaussians: keyframe, tracking, fine-tuning, group after group.
 
-Groups come out one at a time, so that they are encoded and safe on disk while the next one trains. After each, a
-checkpoint holds what the next one starts from; a run that stops goes on there.
+Each group is yielded when it is done, so that it is encoded and safe on disk while the next one trains. A checkpoint
+after each group holds the state that the next one starts from; a run that was stopped continues from it.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from ..atomic_write import read_arrays, write_arrays
-from ..bitstream.quantization import Steps, steps_for, subject_radius
-from ..errors import CaptureError
+from ..bitstream.quantization import steps_for, subject_radius
 from ..model.parametric_group import ParametricGroup
 from ..render.backend import Backend
 from ..render.cpu import CpuBackend
 from ..render.sensitivity import measured_steps
+from .checkpoint import Checkpoint
 from .deformation_graph import Pose
-from .finetune import GroupModel, finetune
+from .finetune import GroupModel
+from .initialization import initial_model
+from .joint_optimization import finetune
 from .keyframe import train_keyframe
-from .model import NAMES, Model, from_points
-from .plane_sweep import shell, sweep
+from .model import Model
 from .settings import TrainSettings
+from .subject import Subject
 from .tracking import Tracker
 from .views import Views
-from .visual_hull import carve, random_box
 
 
 @dataclass
 class Progress:
-    """Where a run is: `done` of `total` steps; `stage` in words, `loss` of the last step."""
+    """Progress of a run.
+
+    Attributes:
+        total, done: optimisation steps; the total is an estimate while groups may be cut.
+        stage: a word and the frames, such as "track 7".
+        loss: of the last step.
+        started: time.monotonic() at the start.
+    """
 
     total: int
     done: int = 0
@@ -45,114 +52,6 @@ class Progress:
     def eta(self) -> float:
         """Seconds left at the pace so far."""
         return (time.monotonic() - self.started) * (self.total - self.done) / max(self.done, 1)
-
-
-def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
-    """Gaussians from the visual hull of the masks, or a plane sweep where there are none, or at random.
-
-    Raises:
-        CaptureError: nothing to start from.
-    """
-    cameras = capture.indices("train")
-    if not cameras:
-        raise CaptureError(f"{capture.name}: no training camera, expected at least one with split 'train'")
-    i, views = settings.initialization, []
-    for camera in cameras:
-        v = capture.view(camera, frame)
-        views.append((capture.camera(camera, frame), v.rgb, v.alpha))
-    known = [c for c, _, _ in views]
-    if all(alpha is not None for _, _, alpha in views):
-        points, colors = carve(known, views, settings.initial_points, settings.visual_hull)
-        if len(points):
-            return from_points(points, colors, opacity=i.surface_opacity)
-    if i.use_plane_sweep:
-        points, colors = sweep(views, settings.initial_points, settings.seed, settings.plane_sweep)
-        if len(points) >= i.sweep_min_share * settings.initial_points:
-            surface = zip((points, colors), shell(views, settings.plane_sweep), strict=True)
-            return from_points(*(np.concatenate(pair) for pair in surface), opacity=i.surface_opacity)
-    points, colors = random_box(known, views, settings.initial_points, settings.seed, settings.visual_hull)
-    if len(points) == 0:
-        raise CaptureError(f"{capture.name}: no point is seen by two cameras, expected cameras that overlap")
-    return from_points(points, colors, opacity=i.random_opacity)
-
-
-class Checkpoint:
-    """What the group after the last finished one starts from, on disk."""
-
-    def __init__(self, folder: Path | None):
-        self.folder = folder
-
-    def _path(self, next_frame: int) -> Path:
-        return self.folder / f"before_{next_frame:06d}.npz"
-
-    def save(self, next_frame: int, subject: Subject | None) -> None:
-        """Writes the subject as it is before `next_frame`, atomically; None needs no file. Of the older ones the last
-        stays, since the stream may not have the group between them yet."""
-        if self.folder is None or subject is None:
-            return
-        self.folder.mkdir(parents=True, exist_ok=True)
-        write_arrays(self._path(next_frame), subject.state())
-        for path in sorted(p for p in self.folder.glob("before_*.npz") if p < self._path(next_frame))[:-1]:
-            path.unlink()
-
-    def load(self, next_frame: int) -> dict | None:
-        """The state that `save` wrote for `next_frame`, or None."""
-        return None if self.folder is None else read_arrays(self._path(next_frame))
-
-    def clear(self) -> None:
-        """Removes the folder: the run is complete, or another one begins."""
-        if self.folder is not None and self.folder.is_dir():
-            for path in self.folder.glob("before_*"):
-                path.unlink()
-            self.folder.rmdir()
-
-
-@dataclass
-class Subject:
-    """What lasts from group to group: Gaussians that are being followed.
-
-    Attributes:
-        tracker: where they are in the last frame.
-        loss: image loss of their keyframe, which tells when they no longer serve.
-        radius: of all Gaussians in the keyframe, world units.
-        canonical: what all groups since the keyframe refer to; None before the first one is fine-tuned.
-        parents: [N], where each Gaussian is in the group before.
-        steps: of the stream, for all groups since the keyframe; None before the first one is fine-tuned.
-    """
-
-    tracker: Tracker
-    loss: float
-    radius: float
-    canonical: Model | None = None
-    parents: np.ndarray | None = None
-    steps: Steps | None = None
-
-    def bury(self, canonical: Model) -> None:
-        """Goes on with `canonical`, all Gaussians of a group, but for the dead."""
-        alive = self.tracker.alive
-        self.parents = np.flatnonzero(alive.numpy())
-        self.tracker.keep(alive)
-        self.canonical = Model({n: p[alive] for n, p in canonical.params.items()})
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Everything as arrays."""
-        canonical = {f"canonical.{n}": p.numpy() for n, p in self.canonical.params.items()}
-        gains, poses = self.tracker.views.exposure, self.tracker.views.extrinsics
-        cameras = {"exposure": gains.values, "extrinsics": poses.values, "middle": poses.middle}
-        whole = {"loss_radius": np.array([self.loss, self.radius]), "parents": self.parents}
-        whole["steps"] = np.array([] if self.steps is None else astuple(self.steps))
-        return {**whole, **cameras, **canonical, **self.tracker.state()}
-
-    @staticmethod
-    def restored(state: dict[str, np.ndarray], views: Views, settings: TrainSettings) -> Subject:
-        """Inverse of `state`."""
-        canonical = {n: torch.from_numpy(state[f"canonical.{n}"]) for n in NAMES}
-        loss, radius = state["loss_radius"].tolist()
-        views.exposure.values, views.extrinsics.values = state["exposure"], state["extrinsics"]
-        views.extrinsics.about(state["middle"], radius)
-        steps = Steps(*state["steps"].tolist()) if len(state["steps"]) else None
-        tracker = Tracker.restored(state, views, settings)
-        return Subject(tracker, loss, radius, Model(canonical), state["parents"], steps)
 
 
 def train_groups(
@@ -167,15 +66,15 @@ def train_groups(
 ) -> Iterator[ParametricGroup]:
     """Trains `capture` from `first_frame` on and yields each group when it is done.
 
-    A group continues the Gaussians of the one before (`parents`) as long as they serve; where the image loss of a
-    tracked frame is `cut_ratio` times the keyframe's, the group ends and the next one starts anew. Where much that
-    stood still begins to change at once, it ends, and the next one continues. Every segment of `random_access` frames
-    starts anew, too: segments depend on nothing but their own frames.
+    A group continues the Gaussians of the one before (`parents`). It ends before a frame whose image loss is
+    `cut_ratio` times that of the keyframe, and the next group starts with a keyframe. It also ends before a frame in
+    which a large fraction of the Gaussians begins to change; then the next group continues. Every segment of
+    `random_access` frames starts with a keyframe: a segment depends on no frames but its own.
 
     Args:
-        first_frame: where an earlier run stopped; a group starts there.
+        first_frame: where an earlier run stopped, the first frame of a group.
         random_access: see `segments`.
-        checkpoints: folder for what the next group starts from; None keeps it in memory only.
+        checkpoints: folder of the states that groups start from; None: nothing is written.
         on_progress: called after every step.
         backend: device that renders and optimises; a new CpuBackend if None.
 
@@ -188,7 +87,7 @@ def train_groups(
     store = Checkpoint(checkpoints)
     run = _Run(capture, settings, backend or CpuBackend(), on_progress)
     if not first_frame:
-        store.clear()  # what an earlier run with other settings may have left
+        store.clear()  # an earlier run with other settings may have left some
     state = store.load(first_frame) if first_frame else None  # absent after a cut, too
     if state is not None:
         run.subject = Subject.restored(state, run.views, settings)
@@ -200,19 +99,19 @@ def train_groups(
             start += len(group)
             if start == segment.stop:
                 run.subject = None
-            store.save(start, run.subject)
+            store.save(start, run.subject.state() if run.subject else None)
             yield replace(group, calibration=run.views.calibration())
 
 
 def segments(frame_count: int, gop: int, random_access: int) -> list[range]:
-    """Frames that are trained without a look at others: `random_access` of them, or a group where that is longer, each;
-    all in one where it is 0."""
+    """Ranges of frames that are trained independently of each other: `random_access` frames each, or `gop` if that is
+    longer; 0: all frames in one."""
     length = max(random_access, gop) if random_access else max(frame_count, 1)
     return [range(a, min(a + length, frame_count)) for a in range(0, frame_count, length)]
 
 
 class _Run:
-    """What the groups of one run share. `subject` is None where the next frame needs a keyframe."""
+    """State that the groups of one run share. `subject` is None where the next frame needs a keyframe."""
 
     def __init__(self, capture, settings: TrainSettings, backend: Backend, on_progress):
         self.capture, self.settings, self.on_progress = capture, settings, on_progress
@@ -221,13 +120,15 @@ class _Run:
         self.subject: Subject | None = None
 
     def estimate(self, frames: int) -> None:
-        """Sets the total of the progress, if no group is cut."""
+        """Sets the total of the progress for so many frames left, if no group is cut."""
         s = self.settings
         key = s.keyframe_steps if self.subject is None else 0
         finetune = s.finetune_steps if s.gop > 1 else 0
         self.progress.total = self.progress.done + key + frames * (s.motion_steps + finetune)
 
-    def _report(self, stage: str) -> Callable:
+    def _report(self, stage: str) -> Callable[[int, float], None]:
+        """Callback of a stage, called with (step, loss)."""
+
         def on_step(_, loss):
             p = self.progress
             p.done, p.stage, p.loss = p.done + 1, stage, float(loss)
@@ -238,17 +139,17 @@ class _Run:
         return on_step
 
     def group(self, frames: range) -> ParametricGroup:
-        """Trains one group; it ends before `frames` does where the Gaussians no longer serve."""
-        track = _Track()
-        self.views.restart()
-        lost = self.subject is not None and self._follow(frames, track)
+        """Trains one group, of all `frames` or of the first ones."""
+        track = _TrackedFrames()
+        self.views.restart_order()
+        cut = self.subject is not None and self._track(frames, track)
         parents = self.subject.parents if track.models else None
-        if parents is None:  # nothing to follow, or lost at once
+        if parents is None:  # no Gaussians to track, or cut at once
             self.subject = self._keyframe(frames)
             track.add(self.subject.tracker)
-            lost = self._follow(frames[1:], track)
+            cut = self._track(frames[1:], track)
         subject, done = self.subject, frames[: len(track.models)]
-        if lost:
+        if cut:
             self.subject = None
         if len(done) == 1 and parents is None:
             subject.canonical = track.models[0]
@@ -256,15 +157,15 @@ class _Run:
             return ParametricGroup(1, subject.canonical.gaussians(), rate_optimized=False)
         model = self._finetuned(subject, done, track)
         known = len(model.key) if parents is None else len(parents)
-        born = np.full(len(model.key) - known, -1)
-        group = model.group(None if parents is None else np.append(parents, born).astype(np.int32))
-        subject.bury(model.key)
+        new = np.full(len(model.key) - known, -1)
+        group = model.group(None if parents is None else np.append(parents, new).astype(np.int32))
+        subject.start_next_group(model.key)
         if not len(subject.parents):
             self.subject = None
         return group
 
     def _keyframe(self, frames: range) -> Subject:
-        """Of the first of `frames`."""
+        """A new subject from the first of `frames`."""
         s = self.settings
         model = initial_model(self.capture, frames[0], s)
         radius = subject_radius(model.params["means"].numpy())
@@ -272,25 +173,30 @@ class _Run:
         loss = train_keyframe(model, self.views, frames[0], s, steps=s.keyframe_steps, radius=radius, on_step=on_step)
         return Subject(Tracker.start(model, self.views, s, loss, frames), loss, radius)
 
-    def _follow(self, frames: range, track: _Track) -> bool:
-        """Adds the frames to `track`; True: until the subject was lost. It also ends where much that has stood still
-        changes at once: with few temporal frequencies, light that comes on would show in all frames of the group."""
+    def _track(self, frames: range, track: _TrackedFrames) -> bool:
+        """Tracks `frames` up to the end of the group and adds them to `track`.
+
+        The group ends where a large fraction of resting Gaussians changes at once: with few temporal frequencies, a
+        light that is switched on would show in all frames of the group.
+
+        Returns:
+            Whether the group was cut, so that the next one needs a keyframe.
+        """
         subject, g = self.subject, self.settings.group
         for frame in frames:
-            if (
-                len(track.models) >= g.changed_frames_min
-                and subject.tracker.stirred(frame, track.moved()) > g.changed_fraction_max
-            ):
+            long_enough = len(track.models) >= g.changed_frames_min
+            if long_enough and subject.tracker.changed_fraction(frame, track.moved()) > g.changed_fraction_max:
                 return False
             loss = subject.tracker.advance(frame, self._report(f"track {frame}"))
             if loss is not None and loss > self.settings.cut_ratio * subject.loss + g.cut_loss_floor:
                 return True
             if loss is not None:
-                subject.tracker.bear(frame, self._report(f"births {frame}"))
+                subject.tracker.densify(frame, self._report(f"densify {frame}"))
             track.add(subject.tracker)
         return False
 
-    def _finetuned(self, subject: Subject, frames: range, track: _Track) -> GroupModel:
+    def _finetuned(self, subject: Subject, frames: range, track: _TrackedFrames) -> GroupModel:
+        """The fine-tuned model of a group."""
         quality = self.settings.quality
         if subject.steps is None:
             middle = len(frames) // 2
@@ -305,21 +211,22 @@ class _Run:
 
 
 @dataclass
-class _Track:
-    """Frame by frame the Gaussians, the nodes, and which Gaussians tracking has touched ([N] bool)."""
+class _TrackedFrames:
+    """For each frame of a group the Gaussians, the pose of the nodes, and the moving Gaussians ([N] bool)."""
 
     models: list[Model] = field(default_factory=list)
     poses: list[Pose] = field(default_factory=list)
     moving: list[torch.Tensor] = field(default_factory=list)
 
     def add(self, tracker: Tracker) -> None:
+        """The last frame of `tracker`."""
         self.models.append(tracker.model)
         self.poses.append(tracker.pose)
         self.moving.append(tracker.moving)
 
     def moved(self) -> torch.Tensor:
-        """[N] bool: touched in any frame."""
-        moved = torch.ones(len(self.moving[-1]), dtype=torch.bool)  # what is born moves
+        """Gaussians that have moved in any frame, [N] bool."""
+        moved = torch.ones(len(self.moving[-1]), dtype=torch.bool)  # new Gaussians move
         moved[: len(self.moving[0])] = False
         for moving in self.moving:
             moved[: len(moving)] |= moving

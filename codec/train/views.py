@@ -1,7 +1,7 @@
-"""Views of a capture as training targets: decoded on demand, kept while memory allows, drawn in random order.
+"""Views of a capture as training targets: decoded on demand, cached, drawn in random order; and their loss.
 
-A view is drawn as a crop around the subject where there is a mask: outside it the target is known to be background,
-and the mask term needs only a margin of it.
+Where there is a mask, a target is a crop around the subject: the rest of the image is known to be background, and the
+mask term needs only a margin of it.
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ GREY = (0.5, 0.5, 0.5)  # background of images that are compared
 
 @dataclass(frozen=True)
 class Target:
-    """One image to be matched.
+    """One image that a step trains on.
 
     Attributes:
-        camera: pinhole camera of the crop.
-        rgb: [H, W, 3] u8, unassociated.
-        alpha: [H, W] u8 or None.
-        index: of the camera in the capture; gain: [3], its exposure.
+        camera: pinhole camera of the crop, in its calibrated pose.
+        rgb: [H, W, 3] u8, unassociated colour.
+        alpha: [H, W] u8, or None where the capture has no masks.
+        index: of the camera in the capture.
+        gain: [3], exposure of the camera.
     """
 
-    camera: object
+    camera: Camera
     rgb: np.ndarray
     alpha: np.ndarray | None
     index: int
@@ -43,8 +44,15 @@ class Target:
 
 
 class Views:
-    """The training views of a capture, `train_cameras` being their indices; `exposure` and `extrinsics` say by how much
-    each differs from what the capture tells."""
+    """The training views of a capture and the calibration of their cameras.
+
+    Args:
+        backend: device of everything that is rendered or optimised against these views.
+
+    Attributes:
+        train_cameras: indices of the training cameras in the capture.
+        exposure, extrinsics: corrections of each camera.
+    """
 
     def __init__(self, capture, settings: TrainSettings, backend: Backend):
         self.capture, self.backend = capture, backend
@@ -52,21 +60,24 @@ class Views:
         self.exposure = Exposure(len(capture.cameras), self.train_cameras, settings, backend)
         self.extrinsics = Extrinsics(len(capture.cameras), self.train_cameras, settings, backend)
         self._seed = settings.seed
-        self._held: OrderedDict[tuple, View | Target] = OrderedDict()
+        self._cache: OrderedDict[tuple, View | Target] = OrderedDict()
         self._bytes = 0
         self._order: dict[int, list[int]] = {}
         self._rounds: dict[int, int] = {}
 
     def view(self, camera: int, frame: int) -> View:
-        """Image of camera index `camera` at `frame`, as the capture has it."""
-        return self._hold((camera, frame), lambda: self.capture.view(camera, frame))
+        """Image of camera `camera` at `frame` as the capture gives it."""
+        return self._cached((camera, frame), lambda: self.capture.view(camera, frame))
 
     def target(self, camera: int, frame: int, scale: float = 1.0) -> Target:
-        """View of camera index `camera` at `frame`, cropped to the subject, `scale` times its size (at most 1)."""
-        load = lambda: self._cropped(camera, frame) if scale == 1 else shrink(self.target(camera, frame), scale)  # noqa: E731
-        held = self._hold((camera, frame, scale), load)
-        there = self.extrinsics.camera(camera, held.camera)
-        return replace(held, camera=there, gain=self.exposure.gain(camera))
+        """View of camera `camera` at `frame`, cropped to the subject; `scale` (at most 1) times its size."""
+
+        def load() -> Target:
+            return self._cropped(camera, frame) if scale == 1 else shrink(self.target(camera, frame), scale)
+
+        target = self._cached((camera, frame, scale), load)
+        moved = self.extrinsics.camera(camera, target.camera)
+        return replace(target, camera=moved, gain=self.exposure.gain(camera))
 
     def camera(self, index: int, frame: int) -> Camera:
         """Camera `index` at `frame`, in its calibrated pose."""
@@ -86,32 +97,38 @@ class Views:
         """
         camera = self.camera(index, frame)
         camera = camera if size is None else camera.resized(*size)
-        image, _ = self.backend.render(params_of(self.exposure.seen(g, index)), camera, GREY)
+        image, _ = self.backend.render(params_of(self.exposure.applied_to(g, index)), camera, GREY)
         return np.floor(255 * image.clip(0, 1) + 0.5).astype(np.uint8)
 
-    def _hold(self, key: tuple, load: Callable[[], View | Target]):
-        """What `load` gives, which is kept as long as there is room."""
-        if key not in self._held:
-            self._held[key] = load()
-            self._bytes += self._size(self._held[key])
-            while self._bytes > CACHE_BYTES and len(self._held) > 1:
-                _, old = self._held.popitem(last=False)
+    def _cached(self, key: tuple, load: Callable[[], View | Target]) -> View | Target:
+        """The result of `load`, cached up to CACHE_BYTES; the least recently used goes first."""
+        if key not in self._cache:
+            self._cache[key] = load()
+            self._bytes += self._size(self._cache[key])
+            while self._bytes > CACHE_BYTES and len(self._cache) > 1:
+                _, old = self._cache.popitem(last=False)
                 self._bytes -= self._size(old)
-        self._held.move_to_end(key)
-        return self._held[key]
+        self._cache.move_to_end(key)
+        return self._cache[key]
 
-    def restart(self) -> None:
-        """Draws anew, as a run that goes on from here will."""
+    def reset_calibration(self, center: np.ndarray, radius: float) -> None:
+        """Exposures and poses as the capture gives them, for a subject around `center` ([3], world units)."""
+        self.exposure.reset()
+        self.extrinsics.reset()
+        self.extrinsics.set_subject(center, radius)
+
+    def restart_order(self) -> None:
+        """Draws views in the order of a run that starts here, so that a resumed run draws the same ones."""
         self._order.clear()
         self._rounds.clear()
 
     def draw(self, frame: int, scale: float = 1.0) -> Target:
-        """The next view of `frame`; every camera once before any comes again, in an order that depends on the frame
-        and not on what was drawn before (a resumed run draws the same)."""
+        """The next view of `frame`: every camera once, then every camera again. The order depends on the frame and on
+        nothing that was drawn before it."""
         order = self._order.get(frame)
         if not order:
-            turn = self._rounds[frame] = self._rounds.get(frame, 0) + 1
-            rng = np.random.default_rng([self._seed, frame, turn])
+            number = self._rounds[frame] = self._rounds.get(frame, 0) + 1
+            rng = np.random.default_rng([self._seed, frame, number])
             order = self._order[frame] = rng.permutation(self.train_cameras).tolist()
         return self.target(order.pop(), frame, scale)
 
@@ -120,12 +137,12 @@ class Views:
         return t.rgb.nbytes + (0 if t.alpha is None else t.alpha.nbytes)
 
     def _cropped(self, camera: int, frame: int) -> Target:
-        view, there = cropped(self.view(camera, frame), self.capture.camera(camera, frame))
-        return Target(there, view.rgb, view.alpha, camera)
+        view, crop = cropped(self.view(camera, frame), self.capture.camera(camera, frame))
+        return Target(crop, view.rgb, view.alpha, camera)
 
 
 def shrink(target: Target, scale: float) -> Target:
-    """The same view on fewer pixels, each the mean of those it covers."""
+    """The same view at `scale` times its size; each pixel is the mean of those it covers."""
     import cv2
 
     height, width = target.rgb.shape[:2]
@@ -145,8 +162,8 @@ def shrink(target: Target, scale: float) -> Target:
 def photometric_loss(
     params: dict, target: Target, settings: TrainSettings, rng: np.random.Generator, backend: Backend
 ) -> RenderLoss:
-    """Loss of Gaussians against one target (`Backend.photometric_loss`). The background is random in each step, so that
-    opacity is learned instead of a background painted with Gaussians."""
+    """Loss of Gaussians against one target (`Backend.photometric_loss`), over a random background: with a known one,
+    Gaussians in its colour could stand for transparency."""
     background = tuple(rng.uniform(0, 1, 3))
     crop = Crop(target.camera, target.rgb, target.alpha, background, target.gain)
     return backend.photometric_loss(params, [crop], ssim_lambda=settings.ssim_lambda, mask_lambda=settings.mask_lambda)

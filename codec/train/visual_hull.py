@@ -1,7 +1,7 @@
-"""First points of a keyframe: the visual hull of the masks, or a random box where there are none.
+"""Initial points of a keyframe: the surface of the visual hull of the masks, or random points without masks.
 
-In: capture, frame. Out: points and colours. The volume is found from the cameras alone (where their axes meet), carved
-coarsely, then again inside the box of what is left; only the hull's surface is kept, since nobody sees the inside.
+In: views of one frame. Out: points and colours. The volume is found from the cameras alone (where their optical axes
+meet), carved coarsely, then again inside the box of the coarse hull. Only the surface is kept: no view shows more.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ OPAQUE = 128  # of 255, alpha from which a pixel belongs to the subject
 
 
 def meeting_point(cameras) -> np.ndarray:
-    """[3] f64, the point nearest to all optical axes (least squares)."""
+    """Point nearest to all optical axes (least squares), [3] f64."""
     A, b = 1e-6 * np.eye(3), np.zeros(3)
     for c in cameras:
         axis = c.viewmat[2, :3]
@@ -25,20 +25,21 @@ def meeting_point(cameras) -> np.ndarray:
 
 
 def project(camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[N, 3] world -> [N, 2] pixels and [N] depth."""
+    """World points [N, 3] -> pixels [N, 2] and depth [N]."""
     x = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     p = x @ camera.K.T
     return p[:, :2] / np.where(np.abs(p[:, 2:]) < 1e-9, 1e-9, p[:, 2:]), x[:, 2]
 
 
 def _lattice(low: np.ndarray, high: np.ndarray, step: float) -> tuple[np.ndarray, tuple[int, int, int]]:
+    """Centers of the voxels [V, 3] of a box, and their number along each axis."""
     axes = [np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True)]
     shape = tuple(len(a) for a in axes)
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3), shape
 
 
 def _inside(points: np.ndarray, views, settings: VisualHullSettings) -> np.ndarray:
-    """[N] bool: in the mask of every view that sees the point, and seen by most (masks say nothing of what is off)."""
+    """[N] bool: the point is seen by most views, and in the mask of every view that sees it."""
     seen = np.zeros(len(points), np.int32)
     missed = np.zeros(len(points), np.int32)
     for camera, _, alpha in views:
@@ -51,7 +52,7 @@ def _inside(points: np.ndarray, views, settings: VisualHullSettings) -> np.ndarr
 
 
 def colors_of(points: np.ndarray, views) -> np.ndarray:
-    """[N, 3] 0..1: median over the views that look at the subject there (occlusion is left to training)."""
+    """Colours of points, [N, 3] in 0..1: median over the views that have them in the subject. Occlusion is ignored."""
     colors = np.full((len(views), len(points), 3), np.nan, np.float32)
     for i, (camera, rgb, alpha) in enumerate(views):
         p, depth = project(camera, points)
@@ -65,12 +66,13 @@ def colors_of(points: np.ndarray, views) -> np.ndarray:
     return np.nanmedian(colors, axis=0)
 
 
-def carve(cameras, views, count: int, settings: VisualHullSettings) -> tuple[np.ndarray, np.ndarray]:
-    """Surface of the visual hull.
+def hull_points(cameras, views, count: int, settings: VisualHullSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Points on the surface of the visual hull.
 
     Args:
-        cameras: training cameras; views: (camera, rgb u8, alpha u8) of each.
-        count: about so many points.
+        cameras: training cameras.
+        views: (camera, rgb u8, alpha u8) of each.
+        count: of points, about.
 
     Returns:
         points [P, 3], colours [P, 3] in 0..1. P may be 0 if the masks agree nowhere.
@@ -102,8 +104,8 @@ def carve(cameras, views, count: int, settings: VisualHullSettings) -> tuple[np.
     return surface, colors_of(surface, views)
 
 
-def random_box(cameras, views, count: int, seed: int, settings: VisualHullSettings) -> tuple[np.ndarray, np.ndarray]:
-    """Random points in what the cameras see, nearer ones denser; for captures without masks.
+def random_points(cameras, views, count: int, seed: int, settings: VisualHullSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Random points in the view of the cameras, denser near them; for captures without masks.
 
     Depths along random pixels of random cameras are uniform in 1/depth; points that fewer than
     two cameras see are dropped.

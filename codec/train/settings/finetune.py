@@ -54,8 +54,8 @@ class RefinementSettings:
 
     Attributes:
         passes: times that each training picture of a frame is used; frame_pictures: pictures of a frame at most.
-        reach: quantization steps that the first picture moves a value, times the root of the pictures, for one pixel per
-            Gaussian; it grows with the root of the pixels per Gaussian, since few pixels are soon overfitted.
+        reach: quantization steps that the first picture moves a value, times the root of the pictures, for one pixel
+            per Gaussian; it grows with the root of the pixels per Gaussian, since few pixels are soon overfitted.
         reach_max: bound on it.
         cache_bytes: of pictures held in memory.
     """

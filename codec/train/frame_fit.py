@@ -1,0 +1,88 @@
+"""Fit of one tracked frame: nodes and the Gaussians' own attributes are optimised together, from constant velocity.
+
+In: a tracker in the pose of the frame before. Out: the Gaussians' own attributes and the pose of the nodes. Means are
+those of the keyframe, carried by the whole motion since, plus an own offset. So motion that nodes can express is
+expressed by nodes, and does not accumulate in the Gaussians frame by frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from ..model.rotations import quat_conjugate, quat_multiply
+from ..render.optimizer import Adam
+from .deformation_graph import Pose
+from .keyframe import Statistics
+from .model import Model
+from .views import Target, photometric_loss
+
+if TYPE_CHECKING:
+    from .tracking import Tracker
+
+
+class FrameFit:
+    """Optimisation of the moving Gaussians of `tracker` and of the nodes that carry them.
+
+    Attributes:
+        own: the Gaussians' own attributes, as of `Tracker`.
+        statistics: of the full-size views.
+    """
+
+    def __init__(self, tracker: Tracker, rng: np.random.Generator):
+        s, backend = tracker.settings.tracking, tracker.views.backend
+        self.tracker, self._rng = tracker, rng
+        self._moving = tracker.moving.float()
+        carriers = tracker.graph.carriers(tracker.moving).float()[:, None]
+        self._nodes = {
+            "angular_velocity": (tracker.pose.angular_velocity * carriers).requires_grad_(),
+            "velocity": (tracker.pose.velocity * carriers).requires_grad_(),
+        }
+        self._carriers, self._adam = carriers, Adam(backend, s.node_adam)
+        self._rates = {"angular_velocity": s.node_rotation_rate, "velocity": s.node_translation_rate * tracker.radius}
+        self.own = Model(tracker.own.params)
+        self.own.start_optimizer(backend, tracker.settings.adam)
+        self.statistics = Statistics(len(self.own), tracker.settings.keyframe.mse_min)
+
+    def _pose(self) -> Pose:
+        return replace(self.tracker.pose, **self._nodes).next()
+
+    def step(self, target: Target, decay: float, *, full: bool, first: bool) -> float:
+        """One view; returns its image loss without the mask term.
+
+        Args:
+            decay: multiplies all learning rates.
+            full: the view has its full size, and counts in the statistics.
+            first: a round without known velocity, see `TrackingSettings.first_round_rigidity`.
+        """
+        t, s, pose = self.tracker, self.tracker.settings.tracking, self._pose()
+        params, rotations = t.carried(self.own, pose)
+        result = photometric_loss(params, target, t.settings, self._rng, t.views.backend)
+        if full:
+            self.statistics.add(result)
+        grads = result.grads
+        rigidity = (s.first_round_rigidity if first else 1.0) * t.settings.rigidity * t.graph.rigidity(pose)
+        self._step_nodes(params, grads, rigidity, decay)
+        grads = {**grads, "quats": quat_multiply(quat_conjugate(rotations.detach()), grads["quats"])}  # before rotation
+        free = {n: g * self._moving.view(-1, *[1] * (g.dim() - 1)) for n, g in grads.items()}
+        self.own.step(free, s.rates.scaled(t.radius, decay * (s.first_round_rates if first else 1.0)))
+        return result.loss - t.settings.mask_lambda * result.mask
+
+    def _step_nodes(self, params: dict, grads: dict, rigidity: torch.Tensor, decay: float) -> None:
+        """One step of the nodes along the gradients by the carried means and quats, and along that of `rigidity`."""
+        for p in self._nodes.values():
+            p.grad = None
+        heads = [params["means"], params["quats"], rigidity]
+        torch.autograd.backward(heads, [grads["means"], grads["quats"], torch.ones(())])
+        by_nodes = {n: p.grad * self._carriers for n, p in self._nodes.items()}
+        self._adam.step(self._nodes, by_nodes, {n: r * decay for n, r in self._rates.items()})
+
+    @torch.no_grad()
+    def result(self) -> tuple[Model, Pose]:
+        """The Gaussians' own attributes and the pose of the nodes."""
+        quats = torch.nn.functional.normalize(self.own.params["quats"], dim=1)
+        pose = self._pose()
+        return Model({**self.own.params, "quats": quats}), Pose(*(getattr(pose, f.name).detach() for f in fields(Pose)))
