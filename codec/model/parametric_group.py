@@ -73,6 +73,10 @@ class ParametricGroup:
     def __len__(self) -> int:
         return self.frame_count
 
+    def __getstate__(self) -> dict:
+        """For pickle: the fields, without the native evaluator."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
     def frame(self, t: int) -> Gaussians:
         """All N Gaussians at frame `t` of the group, as `lifetimes` may hide them.
 
