@@ -135,6 +135,20 @@ def test_sweep_finds_a_textured_wall():
     assert (behind[:, 1] > 8).all()
 
 
+def test_initial_points_do_without_shell_or_sweep():
+    """The ablations of the initial points, by settings alone."""
+    wall = splat_wall()
+    cameras = [dataclasses.replace(c, split="train") for c in arc()]
+    read = lambda camera, _: View(render_image(wall, cameras[camera], (0, 0, 0)), None)  # noqa: E731
+    capture = Capture("wall", 25.0, cameras, 1, False, read)
+    no_shell = dataclasses.replace(TINY, plane_sweep=dataclasses.replace(TINY.plane_sweep, shell_points=0))
+    no_sweep = dataclasses.replace(TINY, initialization=dataclasses.replace(TINY.initialization, use_plane_sweep=False))
+    with_shell, without, random = (initial_model(capture, 0, s) for s in (TINY, no_shell, no_sweep))
+    assert len(with_shell) > len(without) == TINY.initial_points
+    opacities = [float(torch.sigmoid(m.params["logit_opacities"][0])) for m in (without, random)]
+    assert opacities == pytest.approx([TINY.initialization.surface_opacity, TINY.initialization.random_opacity])
+
+
 def test_projection_is_the_renderers(capture):
     camera = capture.cameras[0]
     g = blob(1)

@@ -1,7 +1,4 @@
-"""Gaussians + Camera -> a picture as numpy arrays. No torch.
-
-The player's side: `gscodec render`, `eval` and the metrics.
-"""
+"""Gaussians + Camera -> image, for the player's side: `gscodec render`, `eval` and the metrics. Needs no torch."""
 
 from __future__ import annotations
 
@@ -12,11 +9,11 @@ from ..model.gaussians import Gaussians
 from .backend import PARAMETERS
 from .workspace import Workspace
 
-_shared: list[Workspace] = []  # one workspace for callers that bring none
+_shared: list[Workspace] = []  # the workspace of callers that pass none
 
 
 def render_rgba(gaussians: Gaussians, camera: Camera, *, workspace: Workspace | None = None) -> np.ndarray:
-    """Draws Gaussians over nothing.
+    """Renders Gaussians without a background.
 
     Returns:
         [H, W, 4] f32: colour premultiplied by alpha (not clamped at 1), and alpha.
@@ -32,7 +29,7 @@ def render_image(
     *,
     workspace: Workspace | None = None,
 ) -> np.ndarray:
-    """Draws Gaussians over a background colour in [0, 1].
+    """Renders Gaussians over a background colour in [0, 1].
 
     Returns:
         [H, W, 3] uint8, rounded.

@@ -1,4 +1,4 @@
-"""Frames of a stream to pictures: camera path -> CPU rasterizer -> .mp4 or a folder of .png."""
+"""Frames of a stream -> images: camera path -> CPU rasterizer -> .mp4 or a folder of .png."""
 
 from __future__ import annotations
 
@@ -108,24 +108,24 @@ def render_stream(stream, dest: Path, *, camera: str, size: str | None, frames: 
         raise UsageError(f"{dest}: expected a name that ends in .mp4, or a folder for .png images")
     background = tuple(stream.config["background"])
     cameras = camera_path(stream, camera, size, frames)
-    pictures = (render_image(stream.frame(t), c, background) for t, c in zip(frames, cameras, strict=True))
+    images = (render_image(stream.frame(t), c, background) for t, c in zip(frames, cameras, strict=True))
     write = _write_movie if movie else _write_images
-    for done in write(pictures, dest, stream.fps, frames):
+    for done in write(images, dest, stream.fps, frames):
         bar.update("render", done, len(frames))
     return len(frames)
 
 
-def _write_images(pictures, folder: Path, fps: float, frames: range) -> Iterator[int]:
-    for done, (t, picture) in enumerate(zip(frames, pictures, strict=True), 1):
+def _write_images(images, folder: Path, fps: float, frames: range) -> Iterator[int]:
+    for done, (t, image) in enumerate(zip(frames, images, strict=True), 1):
         folder.mkdir(parents=True, exist_ok=True)  # not before there is something to put in it
-        write_png(folder / f"{t:06d}.png", picture)
+        write_png(folder / f"{t:06d}.png", image)
         yield done
 
 
-def _write_movie(pictures, path: Path, fps: float, frames: range) -> Iterator[int]:
+def _write_movie(images, path: Path, fps: float, frames: range) -> Iterator[int]:
     ffmpeg = require("imageio_ffmpeg", "writing .mp4 (a folder of .png needs nothing)")
     part = path.with_name(path.stem + ".part.mp4")
-    first = next(pictures)
+    first = next(images)
     h, w = first.shape[0] // 2 * 2, first.shape[1] // 2 * 2  # yuv420p has even sides
     writer = ffmpeg.write_frames(
         str(part), (w, h), fps=fps, codec="libx264", quality=None, macro_block_size=1, output_params=["-crf", "16"]
@@ -134,8 +134,8 @@ def _write_movie(pictures, path: Path, fps: float, frames: range) -> Iterator[in
     try:
         writer.send(np.ascontiguousarray(first[:h, :w]))
         yield 1
-        for done, picture in enumerate(pictures, 2):
-            writer.send(np.ascontiguousarray(picture[:h, :w]))
+        for done, image in enumerate(images, 2):
+            writer.send(np.ascontiguousarray(image[:h, :w]))
             yield done
         writer.close()
         os.replace(part, path)

@@ -1,9 +1,10 @@
-"""What the picture hears of each Gaussian: rendered sensitivity, and the quantization steps that follow from it.
+"""Sensitivity: d(mean squared error of the rendered views) / d(squared error of a parameter), per Gaussian; and the
+quantization steps that follow from it.
 
-If the parameters of a picture carry independent errors e, its mean squared error is the sum of W * e^2, where W is
-the mean over pixels and views of the squared derivative. A backward pass whose pixel gradients are random signs
-estimates all W at once, without bias (Hutchinson's estimator of a diagonal). Views stand on a sphere around the
-subject; those by which `gscodec eval` judges are others.
+If the parameters carry independent errors e, the mean squared error of the image is the sum of W * e^2, where W is the
+mean over pixels and views of the squared derivative. A backward pass whose pixel gradients are random signs estimates
+all W at once, without bias (Hutchinson's estimator of a diagonal). The views stand on a sphere around the subject; they
+are not those by which `gscodec eval` judges.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from .cpu import CpuBackend
 
 VIEWS, SIZE = 24, 512
 GREY = (0.5, 0.5, 0.5)
-# Beyond these steps the derivative says too little; means are in radii of the subject.
+# Steps up to which the derivative predicts the error; means in radii of the subject.
 COARSEST = {"means": 0.02, "log_scales": 1.0, "quats": 0.25, "logit_opacities": 2.0, "sh0": 1.0, "shN": 1.0}
 
 
@@ -31,10 +32,10 @@ class Importance:
     """Sensitivities in the units of the coded channels; pixels are 0 to 1.
 
     Attributes:
-        weights: attribute -> [N, C] f64, W of each channel; quats: of the vector part of a quaternion that the
-            Gaussian's is multiplied by from the right, which turns it about its own axes.
-        scene_rotations: [N, 3] f64, the same from the left, about the axes of the scene.
-        removal: [N] f64, mean squared error of the picture without this Gaussian.
+        weights: attribute -> [N, C] f64, W of each channel. quats: of rotations about the Gaussian's own axes, as the
+            vector part of a quaternion that its quaternion is multiplied by from the right.
+        scene_rotations: [N, 3] f64, W of rotations about the axes of the scene (multiplied from the left).
+        removal: [N] f64, mean squared error of the image without this Gaussian.
     """
 
     weights: dict[str, np.ndarray]
@@ -57,8 +58,12 @@ class Importance:
 
 
 def sensitivity_cameras(means: np.ndarray, given: list[Camera] = (), count: int = VIEWS) -> list[Camera]:
-    """`count` cameras on a Fibonacci sphere around the 1-99 % box of `means`, every other one at half the distance;
-    up to half of them are those of the capture, if they are `given`: they may stand within the scene."""
+    """`count` cameras on a Fibonacci sphere around the 1-99 % box of `means`, every other one at half the distance.
+
+    Args:
+        given: cameras of the capture; they take the place of up to half of the others, since they may stand within the
+            scene.
+    """
     taken = [given[i] for i in np.linspace(0, len(given) - 1, min(len(given), count // 2)).round().astype(int)]
     fitted = [c.resized(SIZE, max(1, round(SIZE * c.height / c.width))) for c in taken]
     return fitted + cameras_around(means, count - len(taken), name="sensitivity", turn=1.3)
@@ -67,10 +72,11 @@ def sensitivity_cameras(means: np.ndarray, given: list[Camera] = (), count: int 
 def measure(
     frames: list[Gaussians], cameras: list[Camera] = (), views: int = VIEWS, *, backend: Backend | None = None
 ) -> Importance:
-    """Sensitivity over `frames` (the same N >= 1 Gaussians), which share so many `views`.
+    """Sensitivity over `frames` (the same N >= 1 Gaussians).
 
     Args:
-        cameras: those of the capture.
+        cameras: of the capture.
+        views: rendered, all frames together.
         backend: a new CpuBackend if None.
     """
     signs = np.random.default_rng(0)
@@ -108,11 +114,12 @@ def derivatives(
     names: Iterable[str] = (*COARSEST, "turns"),
     background: tuple[float, ...] = GREY,
 ) -> dict[str, np.ndarray]:
-    """[N, C] derivatives by the channels that are coded, of quats by turns about the own axes; "turns": of the scene.
+    """Derivatives by the coded channels, attribute -> [N, C].
 
     Args:
-        by_picture: the picture of `camera`, over `background` -> the derivative by its pixels, [H, W, 3] f32 both.
-        names: of the channels; those of shN are left out where there are none.
+        by_picture: image of `camera` over `background` -> derivative by its pixels, [H, W, 3] f32 both.
+        names: attributes; quats by rotations about the Gaussian's own axes, "turns" about those of the scene. shN is
+            left out where there is none.
     """
     by_pixels = lambda image, alpha: (by_picture(image), np.zeros_like(alpha))  # noqa: E731
     grads = backend.backpropagate(params_of(g), camera, background, by_pixels)
@@ -120,6 +127,7 @@ def derivatives(
 
 
 def _by_channels(g: Gaussians, grads: dict, name: str) -> np.ndarray:
+    """[N, C] derivatives by the coded channels, from those by the parameters."""
     if name in ("quats", "turns"):
         w, x, y, z = g.quats.T
         scene = [[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]]  # i q, j q, k q: [3, 4, N]
@@ -133,14 +141,17 @@ def _by_channels(g: Gaussians, grads: dict, name: str) -> np.ndarray:
 def steps_for_error(
     weights: dict, values: dict, error: float, radius: float, shifts: dict | None = None
 ) -> dict[str, np.ndarray]:
-    """Steps [C] of each attribute at which the picture's mean squared error is `error`, at the fewest bits.
+    """Steps [C] of each attribute at which the mean squared error of the image is `error`, at the fewest bits.
 
     Every channel takes the same share of the error, or all of its energy where that is less (reverse water-filling:
     Cover and Thomas, 10.3.3).
 
     Args:
-        weights: of Importance. values: attribute -> [N, C], what is to be quantized; means: all axes have one step.
-        shifts: attribute -> [N], a Gaussian's steps are 2^shift times those of the attribute; None: all have the same.
+        weights: of `Importance`.
+        values: attribute -> [N, C], to be quantized. All axes of the means have one step.
+        error: mean squared, pixels 0 to 1.
+        radius: of the subject, world units.
+        shifts: attribute -> [N], the steps of a Gaussian are 2^shift times those of the attribute; None: all 0.
     """
     coarser = {n: 1.0 if shifts is None else 4.0 ** shifts[n][:, None] for n in weights}
     sums = {n: np.maximum((w * coarser[n]).sum(0), 1e-30) for n, w in weights.items()}
@@ -156,8 +167,13 @@ def steps_for_error(
 def measured_steps(
     g: Gaussians, quality: float, nominal: Steps, cameras: list[Camera] = (), *, backend: Backend | None = None
 ) -> Steps:
-    """About the steps that the encoder will find for a group that looks like `g`, in the form of `steps_for`: one for
-    all channels of an attribute, at the same rate. `cameras`: those of the capture; `nominal`: where nothing is seen.
+    """Estimate of the steps that the encoder will choose for a group like `g`: one step for all channels of an
+    attribute, at the same rate.
+
+    Args:
+        nominal: result where there are no Gaussians.
+        cameras: of the capture.
+        backend: a new CpuBackend if None.
     """
     if not len(g):
         return nominal
@@ -173,5 +189,5 @@ def measured_steps(
 
 
 def coarsest(attribute: str, radius: float) -> float:
-    """The largest step of an attribute at which its sensitivity means anything."""
+    """The largest step of an attribute for which its sensitivity predicts the error."""
     return COARSEST[attribute] * (radius if attribute == "means" else 1.0)

@@ -1,6 +1,6 @@
 """The native rasterizer with its buffers, shared by `image` and `cpu`. Needs no torch.
 
-A workspace keeps its buffers from call to call: make one per thread of control and use it for all views.
+A workspace keeps its buffers from call to call. Make one per thread of control and use it for all views.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def simd_levels() -> list[str]:
 
 
 class Workspace:
-    """A native rasterizer and the arrays its gradients are written to.
+    """A native rasterizer, and the arrays that its gradients are written to.
 
     Args:
         threads: 0 for all cores. Results do not depend on it.
@@ -51,7 +51,7 @@ class Workspace:
         return dict(self.native.timings())
 
     def forward(self, params, camera: Camera, background, region: Region | None = None, training: bool = False):
-        """Draws `params` (the six arrays in the order of PARAMETERS).
+        """Renders `params`, the six arrays in the order of PARAMETERS.
 
         Returns:
             image [H, W, 3] f32 and alpha [H, W] f32 of the region, new arrays.
@@ -61,13 +61,13 @@ class Workspace:
         return image.reshape(region[3], region[2], 3), alpha.reshape(region[3], region[2])
 
     def draw(self, params, camera: Camera, background) -> np.ndarray:
-        """Draws `params` and returns [H, W, 3] uint8, rounded."""
+        """Renders `params`; returns [H, W, 3] uint8, rounded."""
         whole = (0, 0, camera.width, camera.height)
         flat = call(self.native.draw, params, view(camera, whole), rgb(background))
         return flat.reshape(camera.height, camera.width, 3)
 
     def gradients(self, params) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-        """Arrays in the shapes of `params`, and three statistics [N]; the same ones as long as the shapes stay."""
+        """Arrays in the shapes of `params`, and three statistics [N]; the same arrays while the shapes stay."""
         n = len(params[0])
         shapes = {name: p.shape for name, p in zip(PARAMETERS, params, strict=True)}
         shapes |= {name: (n,) for name in STATISTICS}
@@ -78,10 +78,10 @@ class Workspace:
 
 
 def view(camera: Camera, region: Region) -> dict:
-    """The camera as the native side takes it.
+    """Camera and region as the native side takes them.
 
     Raises:
-        UsageError: the camera is no pinhole.
+        UsageError: the camera has distortion or skew.
     """
     K, m = np.asarray(camera.K, np.float64), np.asarray(camera.viewmat, np.float64)
     if np.any(np.asarray(camera.distortion)) or K[0, 1] != 0:

@@ -1,1 +1,1 @@
-"""Capture -> GaussianSequence: keyframe, tracking by a node graph, joint fine-tuning. Needs the extra `encode`."""
+"""Capture -> groups of tracked Gaussians: keyframe, tracking, fine-tuning. Needs the extra `encode`."""

@@ -114,11 +114,10 @@ class NodeGraph:
         near = cKDTree(self.nodes.numpy()).query(self.nodes.numpy(), k + 1)[1].reshape(m, -1)[:, 1:]
         self._edges = torch.from_numpy(near.astype(np.int64))
         length = (self.nodes[self._edges] - self.nodes[:, None]).norm(dim=2, keepdim=True)
-        middle = length.median() if k else torch.ones(())
-        hold = torch.exp2(
-            -((length / (self.settings.edge_falloff * middle)) ** 2)
-        )  # long edges bridge gaps: less weight
-        self._hold, self.spacing = hold * self.settings.lattice / self.step, float(middle)
+        median = length.median() if k else torch.ones(())
+        falloff = self.settings.edge_falloff * median
+        weight = torch.exp2(-((length / falloff) ** 2))  # long edges bridge gaps: less weight
+        self._edge_weights, self.spacing = weight * self.settings.lattice / self.step, float(median)
 
     @staticmethod
     def of(
@@ -247,7 +246,7 @@ class NodeGraph:
         edge = self.nodes[self._edges] - self.nodes[:, None]
         rotated = torch.einsum("mij,mkj->mki", quat_to_matrix(pose.rotations), edge)
         missed = rotated - (pose.nodes[self._edges] - pose.nodes[:, None])
-        return (self._hold * missed).square().sum(2).add(1e-12).sqrt().mean()
+        return (self._edge_weights * missed).square().sum(2).add(1e-12).sqrt().mean()
 
 
 def _padded(a: np.ndarray, width: int) -> np.ndarray:

@@ -18,8 +18,8 @@ from ..bitstream.quantization import Steps
 from ..model.rotations import quat_conjugate, quat_multiply
 from .settings import EntropyModelSettings
 
-CONTEXT_NEIGHBOURS, CONTEXT_WINDOW = 4, 32  # the nearest so many of the so many before (spec 7.3)
-GRID_MAX = 2**20  # steps along an axis, what the Morton order takes: far floaters make steps coarser
+CONTEXT_NEIGHBOURS, CONTEXT_WINDOW = 4, 32  # of a canonical value: nearest Gaussians, among those before it (spec 7.3)
+GRID_MAX = 2**20  # steps along an axis, bound of the Morton order: with far floaters steps are coarser
 LN2 = float(np.log(2))
 _H = 0.5**0.5
 _AXIS_ROTATIONS = torch.zeros(27, 4)  # [9 a + 3 b + c]: rotates axes a, b, c to first, second, third

@@ -87,7 +87,7 @@ class GroupModel:
 
     @property
     def born(self) -> torch.Tensor:
-        """The start of each lifetime."""
+        """Older name of `start`."""
         return self.start
 
     def _hold_outside_lifetime(self, x: list[torch.Tensor]) -> torch.Tensor:
@@ -114,7 +114,7 @@ class GroupModel:
         return self.graph.carry(self.key.params["means"], pose)
 
     def _project(self, tracked: list[Model]) -> dict[str, torch.Tensor]:
-        """Coefficients of the lowest frequencies of what the nodes do not explain in the tracked frames."""
+        """Lowest frequencies of the difference between the tracked frames and what the nodes carry."""
         p = self.key.params
         residual: dict[str, list] = {name: [] for name in vars(self.settings.frequencies)}
         for model, means, rotations in zip(tracked, self.means, self.rotations, strict=True):

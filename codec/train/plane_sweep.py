@@ -31,15 +31,15 @@ def sweep(
     """
     import cv2
 
-    cameras, pictures, where = [], [], []
+    cameras, images, where = [], [], []
     for i, (camera, rgb, _) in enumerate(views):
         scale = min(1.0, settings.width / camera.width)
         size = (round(scale * camera.width), round(scale * camera.height))
         cameras.append(camera.resized(*size))
-        pictures.append(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA))
+        images.append(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA))
         mask = np.ones((1, 1), np.uint8) if masks is None else masks[i].astype(np.uint8)
         where.append(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0)
-    greys = [cv2.cvtColor(p, cv2.COLOR_RGB2GRAY).astype(np.float32) for p in pictures]
+    greys = [cv2.cvtColor(p, cv2.COLOR_RGB2GRAY).astype(np.float32) for p in images]
     centre = meeting_point(cameras)
     distance = np.median([np.linalg.norm(c.center - centre) for c in cameras])
     inverse = np.linspace(1 / (settings.far * distance), 1 / (settings.near * distance), settings.planes)
@@ -55,7 +55,7 @@ def sweep(
             axis=0,
         )
         points.append(found[sure])
-        colors.append(pictures[i][y, x][sure] / 255)
+        colors.append(images[i][y, x][sure] / 255)
     points, colors = np.concatenate(points), np.concatenate(colors)
     chosen = np.random.default_rng(seed).permutation(len(points))[:count]
     return points[chosen], colors[chosen]

@@ -1,7 +1,7 @@
 """Training on a Ray cluster: one job per segment of `random_access` frames, the groups of a local run in its order.
 
-A segment is an independent group with the groups that follow it, and depends on nothing else (train.py). A job opens
-the capture by its path, so the machines of the cluster share the files. Needs the extra `ray`.
+A segment is an independent group and the groups that follow it, and depends on no other frames (train.py). A job opens
+the capture by its path, so that the machines of the cluster must share the files. Needs the extra `ray`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ..model.parametric_group import ParametricGroup
 from .settings import TrainSettings
 from .train import segments, train_groups
 
-CPUS = 2  # of a job, and its threads: segments side by side pay better than more threads in one
+CPUS = 2  # of a job, and threads of its kernels: parallel segments gain more than more threads in one
 RETRIES = 5  # of a segment whose worker died
 
 
@@ -68,7 +68,7 @@ def cluster_groups(
 
 
 def _knock(address: str) -> None:
-    """Raises OSError where nobody listens; Ray itself would try for ten minutes."""
+    """Raises OSError where no server answers; Ray itself would try for ten minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if port.isdigit():
         socket.create_connection((host, int(port)), timeout=10).close()
@@ -78,10 +78,8 @@ def train_segment(
     open_capture: Callable, settings: TrainSettings, random_access: int, frames: range
 ) -> list[ParametricGroup]:
     """One job: the groups of a segment."""
-    done, groups = (
-        frames.start,
-        train_groups(open_capture(), settings, first_frame=frames.start, random_access=random_access),
-    )
+    groups = train_groups(open_capture(), settings, first_frame=frames.start, random_access=random_access)
+    done = frames.start
     found = []
     while done < frames.stop:
         found.append(next(groups))

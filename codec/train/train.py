@@ -6,7 +6,6 @@ after each group holds the state that the next one starts from; a run that was s
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -40,18 +39,12 @@ class Progress:
         total, done: optimisation steps; the total is an estimate while groups may be cut.
         stage: a word and the frames, such as "track 7".
         loss: of the last step.
-        started: time.monotonic() at the start.
     """
 
     total: int
     done: int = 0
     stage: str = ""
     loss: float = 0.0
-    started: float = 0.0
-
-    def eta(self) -> float:
-        """Seconds left at the pace so far."""
-        return (time.monotonic() - self.started) * (self.total - self.done) / max(self.done, 1)
 
 
 def train_groups(
@@ -116,11 +109,11 @@ class _Run:
     def __init__(self, capture, settings: TrainSettings, backend: Backend, on_progress):
         self.capture, self.settings, self.on_progress = capture, settings, on_progress
         self.views = Views(capture, settings, backend)
-        self.progress = Progress(0, started=time.monotonic())
+        self.progress = Progress(0)
         self.subject: Subject | None = None
 
     def estimate(self, frames: int) -> None:
-        """Sets the total of the progress for so many frames left, if no group is cut."""
+        """Sets the total of the progress; `frames`: left to train, if no group is cut."""
         s = self.settings
         key = s.keyframe_steps if self.subject is None else 0
         finetune = s.finetune_steps if s.gop > 1 else 0

@@ -1,4 +1,4 @@
-"""Settings of tracking: what changes, the nodes that carry it, what is added, where a group ends."""
+"""Settings of tracking: change detection, deformation graph, frame fit, densification, relocalization, group ends."""
 
 from __future__ import annotations
 
