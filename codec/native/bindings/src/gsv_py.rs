@@ -89,7 +89,7 @@ fn code_turns<'py>(
             p.len()
         ));
     }
-    let turns = gsv::turns::Turns {
+    let turns = gsv::rotation_residuals::RotationResiduals {
         quats: quats.as_chunks().0,
         steps: steps.as_chunks().0,
         worth: worth.as_chunks().0,

@@ -6,7 +6,9 @@ mod kernels;
 use numpy::{PyArray1, PyReadonlyArrayDyn, PyReadwriteArrayDyn, prelude::*};
 use pyo3::exceptions::{PyOverflowError, PyValueError};
 use pyo3::prelude::*;
-use raster::{Gradients, Lambdas, Level, Projected, RasterError, Region, Shade, Splats, Step, Surface, Target, View};
+use raster::{
+    Background, Gradients, Lambdas, Projected, RasterError, Region, SimdLevel, Splats, Step, Surface, TargetImage, View,
+};
 
 type In<'py> = PyReadonlyArrayDyn<'py, f32>;
 type InOut<'py> = PyReadwriteArrayDyn<'py, f32>;
@@ -65,11 +67,11 @@ fn gradients<'a>(g: &'a mut Grads) -> PyResult<Gradients<'a>> {
     })
 }
 
-fn level(name: &str) -> PyResult<Level> {
+fn level(name: &str) -> PyResult<SimdLevel> {
     if name == "auto" {
-        return Ok(Level::best());
+        return Ok(SimdLevel::best());
     }
-    let available = Level::available();
+    let available = SimdLevel::available();
     let names: Vec<&str> = available.iter().map(|l| l.name()).collect();
     available.iter().copied().find(|l| l.name() == name).ok_or_else(|| {
         PyValueError::new_err(format!(
@@ -159,8 +161,11 @@ impl Rasterizer {
         training: bool,
     ) -> PyResult<Picture<'py>> {
         let (splats, view) = (splats(&params)?, view.view());
-        py.detach(|| self.inner.forward(&splats, &view, Shade::over(background), training))
-            .map_err(usage)?;
+        py.detach(|| {
+            self.inner
+                .forward(&splats, &view, Background::new(background), training)
+        })
+        .map_err(usage)?;
         Ok((
             PyArray1::from_slice(py, self.inner.image()),
             PyArray1::from_slice(py, self.inner.alpha()),
@@ -195,20 +200,20 @@ impl Rasterizer {
         let (step, inner) = (&mut self.step, &mut self.inner);
         let (mut values, mut radii) = (Vec::new(), vec![0.0f32; splats.len()]);
         for (view, (background, gain), (rgb, alpha, weight)) in &crops {
-            let target = Target {
+            let target = TargetImage {
                 rgb: contiguous(rgb.as_slice())?,
                 alpha: alpha.as_ref().map(|a| contiguous(a.as_slice())).transpose()?,
                 weight: weight.as_ref().map(|w| contiguous(w.as_slice())).transpose()?,
             };
-            let (view, shade) = (
+            let (view, background) = (
                 view.view(),
-                Shade {
-                    background: *background,
+                Background {
+                    rgb: *background,
                     gain: *gain,
                 },
             );
             let v = py
-                .detach(|| step.run(inner, &splats, &view, shade, target, lambdas, &mut out))
+                .detach(|| step.run(inner, &splats, &view, background, target, lambdas, &mut out))
                 .map_err(usage)?;
             values.push((v.loss, v.image.l1, v.image.mse, v.image.ssim, v.mask, v.gain));
             radii
@@ -232,7 +237,7 @@ impl Rasterizer {
         view.check().map_err(usage)?; // before its size is allocated
         let mut out = vec![[0; 3]; view.region.pixels()];
         let surface = Surface::Rgb(&mut out);
-        py.detach(|| self.inner.paint(surface, &splats, &view, Shade::over(background)))
+        py.detach(|| self.inner.paint(surface, &splats, &view, Background::new(background)))
             .map_err(usage)?;
         Ok(PyArray1::from_vec(py, out.into_flattened()))
     }
@@ -258,7 +263,7 @@ impl Rasterizer {
 /// Names of the instruction sets that this machine can use, fastest first.
 #[pyfunction]
 fn simd_levels() -> Vec<&'static str> {
-    Level::available().iter().map(|l| l.name()).collect()
+    SimdLevel::available().iter().map(|l| l.name()).collect()
 }
 
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {

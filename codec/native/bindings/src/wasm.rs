@@ -167,7 +167,7 @@ pub extern "C" fn pixels() -> *const u8 {
     with(|p| p.pixels.as_ptr().cast())
 }
 
-/// Chooses the instruction set by its place among `raster::Level::available`; for tests and measurements.
+/// Chooses the instruction set by its place among `raster::SimdLevel::available`; for tests and measurements.
 #[unsafe(no_mangle)]
 pub extern "C" fn use_level(i: usize) -> bool {
     with(|p| p.use_level(i))

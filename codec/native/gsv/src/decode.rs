@@ -7,12 +7,12 @@
 use crate::assemble::{LayerPoints, Part, Slot, append, assemble};
 use crate::attributes::Attribute;
 use crate::channels;
+use crate::conformance::{self, Damage};
 use crate::deaths;
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader};
 use crate::group::Group;
 use crate::header::{Header, LayerHeader, NodeHeader};
-use crate::inventory::{self, Damage};
 use crate::levels::Level;
 use crate::lifetimes;
 use crate::morton;
@@ -88,7 +88,7 @@ fn decode(units: &[Unit], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
     let before = how.reference.map(|g| &g.header);
     let header = Header::read(first.payload, before).map_err(|e| e.at(first.payload_offset, &first.label(0)))?;
     let known = header.check(how.level, before)?;
-    let damage = inventory::check(units, &header, before, how.layers)?;
+    let damage = conformance::check(units, &header, before, how.layers)?;
     let decoder = GroupDecoder {
         reference: how.reference.filter(|_| header.reference > 0),
         header: &header,
@@ -137,7 +137,7 @@ struct GroupDecoder<'a> {
 impl GroupDecoder<'_> {
     /// Points of a unit; none if it is damaged or not there.
     fn points(&self, kind: UnitType, layer: u8, count: u32) -> Result<Vec<[u32; 3]>> {
-        let Some(i) = inventory::find(self.units, (kind, layer, None)) else {
+        let Some(i) = conformance::find(self.units, (kind, layer, None)) else {
             return Ok(Vec::new());
         };
         let unit = &self.units[i];
@@ -182,7 +182,7 @@ impl GroupDecoder<'_> {
         };
         let range = r.range(k..k + 1);
         let all = range.start as u32..range.end as u32;
-        let unit = inventory::find(self.units, (UnitType::Deaths, k as u8, None)).filter(|_| !range.is_empty());
+        let unit = conformance::find(self.units, (UnitType::Deaths, k as u8, None)).filter(|_| !range.is_empty());
         let Some((i, unit)) = unit.and_then(|i| Some((i, self.units.get(i)?))) else {
             return Ok(all.collect());
         };
@@ -203,7 +203,7 @@ impl GroupDecoder<'_> {
     fn nodes(&self) -> Result<(Vec<[u32; 3]>, Trajectories)> {
         let h = &self.header.nodes;
         let positions = self.points(UnitType::NodePositions, 0, h.count)?;
-        let Some(i) = inventory::find(self.units, (UnitType::NodeTrajectories, 0, None)) else {
+        let Some(i) = conformance::find(self.units, (UnitType::NodeTrajectories, 0, None)) else {
             return Ok((positions, Trajectories::default()));
         };
         let (unit, near, k) = (
@@ -212,7 +212,7 @@ impl GroupDecoder<'_> {
             usize::from(h.coefficients),
         );
         let mut c = Decoder::new(unit.payload);
-        let t = trajectories::code(&mut c, Kind::Nodes, k, &near, &Trajectories::new(6), u64::MAX); // counted from the header
+        let t = trajectories::code(&mut c, Kind::Node, k, &near, &Trajectories::new(6), u64::MAX); // counted from the header
         finish(c, t.is_ok(), i, unit)?;
         Ok((positions, t.unwrap_or_default()))
     }

@@ -4,8 +4,8 @@
 //! follow from the sizes, since a turn moves what is long further than what is short.
 
 use crate::attributes::Attribute;
-use crate::curve::{Curve, Pieces};
-use crate::header::{Header, LEVER_UNIT};
+use crate::companding::{Companding, CompandingTable};
+use crate::header::{Header, SCALE_EXPONENT_UNIT};
 use crate::neighbors::Near;
 use rayon::prelude::*;
 
@@ -23,7 +23,7 @@ pub fn values(h: &Header, a: Attribute, integers: &[i32], shift: f32) -> Vec<f32
         return Vec::new();
     };
     let scales: Vec<(f32, f32)> = scale.steps.iter().copied().zip(scale.offsets.iter().copied()).collect();
-    let curves: Vec<Pieces> = h.curves_of(a).iter().map(Curve::pieces).collect();
+    let companding: Vec<CompandingTable> = h.companding_of(a).iter().map(Companding::table).collect();
     let mut out = vec![0.0; integers.len()];
     let channels = scales.len().max(1);
     let rows = RUN * channels;
@@ -34,7 +34,9 @@ pub fn values(h: &Header, a: Attribute, integers: &[i32], shift: f32) -> Vec<f32
                 for ((out, v), (step, offset)) in out.iter_mut().zip(row).zip(&scales) {
                     *out = offset + step * *v as f32;
                 }
-                out.iter_mut().zip(&curves).for_each(|(v, curve)| *v = curve.value(*v));
+                out.iter_mut()
+                    .zip(&companding)
+                    .for_each(|(v, table)| *v = table.expand(*v));
                 out.iter_mut().for_each(|v| *v += shift);
             }
         });
@@ -46,7 +48,7 @@ pub fn values(h: &Header, a: Attribute, integers: &[i32], shift: f32) -> Vec<f32
 fn steps(h: &Header, own: &[f32], log_scales: [f32; 3]) -> [f32; 3] {
     std::array::from_fn(|c| {
         let fall: f32 = (0..3)
-            .map(|j| f32::from(h.levers[c][j]) / LEVER_UNIT * log_scales[j])
+            .map(|j| f32::from(h.scale_exponents[c][j]) / SCALE_EXPONENT_UNIT * log_scales[j])
             .sum();
         (own.get(c).unwrap_or(&0.0) * (-fall).clamp(-64.0, 64.0).exp2()).min(1.0)
     })

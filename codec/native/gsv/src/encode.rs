@@ -148,7 +148,7 @@ fn layer<'a>(
 fn nodes<'a>(units: &mut Vec<Pending<'a>>, group: &'a Group, near: &'a [Near]) {
     let h = &group.header;
     let k = usize::from(h.nodes.coefficients);
-    let motion = trajectory(Kind::Nodes, k, near, group.node_trajectories.clone());
+    let motion = trajectory(Kind::Node, k, near, group.node_trajectories.clone());
     let coded = [
         (
             UnitType::NodePositions,

@@ -5,20 +5,20 @@
 
 use crate::attributes::Attribute;
 use crate::blend::NEIGHBORS_MAX;
-use crate::curve::Curve;
+use crate::companding::Companding;
 use crate::error::Result;
 use crate::fields::{Fields, Reader};
+use crate::hilbert_layout;
 use crate::levels::Level;
-use crate::map;
 
 const FLAG_PREDICTED: u8 = 1;
-const FLAG_CURVES: u8 = 2;
+const FLAG_COMPANDING: u8 = 2;
 const FLAG_UNIT_SIZES: u8 = 4;
 const FLAG_LAYER_SHIFTS: u8 = 8;
 /// Channels with a curve: those of log_scales, and logit_opacities.
-pub const CURVES: usize = 4;
-/// Levers of the header are in units of 1 / LEVER_UNIT.
-pub const LEVER_UNIT: f32 = 32.0;
+pub const COMPANDED_CHANNELS: usize = 4;
+/// Levers of the header are in units of 1 / SCALE_EXPONENT_UNIT.
+pub const SCALE_EXPONENT_UNIT: f32 = 32.0;
 /// Low bits that a layer may leave out.
 pub const SHIFT_MAX: u8 = 15;
 /// Layers of a group.
@@ -75,12 +75,12 @@ pub struct Header {
     pub layers: Vec<LayerHeader>,
     /// In the order of `Attribute::canonical(sh_degree)`.
     pub scales: Vec<Scale>,
-    /// Of each channel of quats: how its step falls with each of the log_scales, in octaves, times `LEVER_UNIT`.
-    pub levers: [[i8; 3]; 3],
+    /// Of each channel of quats: how its step falls with each of the log_scales, in octaves, times `SCALE_EXPONENT_UNIT`.
+    pub scale_exponents: [[i8; 3]; 3],
     /// Of each layer: how many low bits of positions, then of each attribute's integers, are 0 and not coded. Empty: none.
     pub shifts: Vec<[u8; 6]>,
     /// Of the channels of log_scales, then of logit_opacities. None: their values are as they are coded.
-    pub curves: Option<[Curve; CURVES]>,
+    pub companding: Option<[Companding; COMPANDED_CHANNELS]>,
     pub trajectories: Vec<TrajectoryHeader>,
     /// `count` 0: none.
     pub nodes: NodeHeader,
@@ -135,14 +135,14 @@ impl Header {
             self.grid(f)?;
             self.layers(f, None)?;
             self.scales(f)?;
-            for lever in self.levers.as_flattened_mut() {
-                let mut byte = lever.to_be_bytes();
+            for exponent in self.scale_exponents.as_flattened_mut() {
+                let mut byte = exponent.to_be_bytes();
                 f.bytes(&mut byte)?;
-                *lever = i8::from_be_bytes(byte);
+                *exponent = i8::from_be_bytes(byte);
             }
             self.shifts(f)?;
-            if let Some(curves) = &mut self.curves {
-                curves.iter_mut().try_for_each(|c| c.fields(f))?;
+            if let Some(companding) = &mut self.companding {
+                companding.iter_mut().try_for_each(|c| c.fields(f))?;
             }
         }
         self.trajectories(f)?;
@@ -159,12 +159,12 @@ impl Header {
         if self.reference == 0 && !self.shifts.is_empty() {
             flags |= FLAG_LAYER_SHIFTS;
         }
-        if self.reference == 0 && self.curves.is_some() {
-            flags |= FLAG_CURVES;
+        if self.reference == 0 && self.companding.is_some() {
+            flags |= FLAG_COMPANDING;
         }
         f.u8(&mut flags)?;
         let known = match flags & FLAG_PREDICTED {
-            0 => FLAG_UNIT_SIZES | FLAG_LAYER_SHIFTS | FLAG_CURVES,
+            0 => FLAG_UNIT_SIZES | FLAG_LAYER_SHIFTS | FLAG_COMPANDING,
             _ => FLAG_UNIT_SIZES | FLAG_PREDICTED,
         };
         f.must(flags & !known == 0, || {
@@ -173,8 +173,8 @@ impl Header {
         if flags & FLAG_LAYER_SHIFTS != 0 {
             self.shifts.resize(self.layers.len().max(1), Default::default());
         }
-        if flags & FLAG_CURVES != 0 {
-            self.curves.get_or_insert_default();
+        if flags & FLAG_COMPANDING != 0 {
+            self.companding.get_or_insert_default();
         }
         if flags & FLAG_PREDICTED != 0 {
             f.u16(&mut self.reference)?;
@@ -214,7 +214,7 @@ impl Header {
         self.layers.resize(usize::from(n), LayerHeader::default());
         for (k, layer) in self.layers.iter_mut().enumerate() {
             f.u32(&mut layer.count)?;
-            let width = map::width_log2(layer.count as usize) as u8;
+            let width = hilbert_layout::width_log2(layer.count as usize) as u8;
             let mut found = width;
             f.u8(&mut found)?;
             f.must(found == width, || format!("map_width_log2 {width}, found {found}"))?;
@@ -281,8 +281,8 @@ impl Header {
     }
 
     /// Of the channels of an attribute; empty if they have none.
-    pub fn curves_of(&self, attribute: Attribute) -> &[Curve] {
-        let all = self.curves.as_ref().map_or(&[][..], |c| &c[..]);
+    pub fn companding_of(&self, attribute: Attribute) -> &[Companding] {
+        let all = self.companding.as_ref().map_or(&[][..], |c| &c[..]);
         match attribute {
             Attribute::LogScales => all.get(..3).unwrap_or(&[]),
             Attribute::LogitOpacities => all.get(3..).unwrap_or(&[]),

@@ -7,8 +7,8 @@
 
 use crate::blend::NEIGHBORS_MAX;
 
-pub type Key = (u64, u32); // squared distance, index of the node
-const FAR: Key = (u64::MAX, u32::MAX);
+pub type Neighbor = (u64, u32); // squared distance, index of the node
+const FAR: Neighbor = (u64::MAX, u32::MAX);
 /// Most neighbours that are asked for: one more than there are weights.
 const NEAREST_MAX: usize = NEIGHBORS_MAX + 1;
 
@@ -17,12 +17,12 @@ const SHORT: usize = 16;
 
 /// Coordinates of nodes, axis by axis, and their numbers.
 #[derive(Default)]
-struct Nodes {
+struct NodeTable {
     axes: [Vec<f64>; 3],
     index: Vec<u32>,
 }
 
-impl Nodes {
+impl NodeTable {
     fn push(&mut self, place: [f64; 3], index: u32) {
         self.axes.iter_mut().zip(place).for_each(|(axis, v)| axis.push(v));
         self.index.push(index);
@@ -42,7 +42,7 @@ impl Nodes {
     }
 
     /// Into `few` those among which the `count` nearest to each of `points` are. `d`: space for distances.
-    fn near(&self, points: &[[u32; 3]], count: usize, d: &mut Vec<f64>, few: &mut Nodes) {
+    fn near(&self, points: &[[u32; 3]], count: usize, d: &mut Vec<f64>, few: &mut NodeTable) {
         let bounds = |a: usize| {
             points
                 .iter()
@@ -67,14 +67,14 @@ impl Nodes {
 }
 
 pub struct NodeSearch {
-    nodes: Nodes,
+    nodes: NodeTable,
     count: usize,
 }
 
 impl NodeSearch {
     /// For the `count` nearest, 1 to `NEIGHBORS_MAX + 1`.
     pub fn new(nodes: &[[u32; 3]], count: usize) -> Self {
-        let mut all = Nodes::default();
+        let mut all = NodeTable::default();
         nodes.iter().zip(0..).for_each(|(n, i)| all.push(n.map(f64::from), i));
         NodeSearch {
             nodes: all,
@@ -84,8 +84,8 @@ impl NodeSearch {
 
     /// Calls `found` with the nearest nodes of each point by (squared distance, index); places beyond the number of nodes hold
     /// the maximum.
-    pub fn run(&self, points: &[[u32; 3]], mut found: impl FnMut(&[Key])) {
-        let (mut d, mut some, mut few) = (Vec::new(), Nodes::default(), Nodes::default());
+    pub fn run(&self, points: &[[u32; 3]], mut found: impl FnMut(&[Neighbor])) {
+        let (mut d, mut some, mut few) = (Vec::new(), NodeTable::default(), NodeTable::default());
         self.nodes.near(points, self.count, &mut d, &mut some);
         for points in points.chunks(SHORT) {
             some.near(points, self.count, &mut d, &mut few);
@@ -121,8 +121,8 @@ mod tests {
     use proptest::prelude::*;
 
     /// Spec 13.2 as written.
-    fn brute_force(p: [u32; 3], nodes: &[[u32; 3]], count: usize) -> Vec<Key> {
-        let mut all: Vec<Key> = nodes.iter().map(|n| distance(p, *n)).zip(0..).collect();
+    fn brute_force(p: [u32; 3], nodes: &[[u32; 3]], count: usize) -> Vec<Neighbor> {
+        let mut all: Vec<Neighbor> = nodes.iter().map(|n| distance(p, *n)).zip(0..).collect();
         all.sort_unstable();
         all.resize(all.len().max(count), FAR);
         all.truncate(count);

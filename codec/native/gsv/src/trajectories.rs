@@ -99,14 +99,14 @@ impl Trajectories {
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     Gaussians,
-    Nodes,
+    Node,
 }
 
 impl Kind {
     fn class(self, k: usize, channel: usize) -> usize {
         match self {
             Kind::Gaussians => 3 * k.min(3) + channel % 3,
-            Kind::Nodes => 6 * k.min(3) + channel,
+            Kind::Node => 6 * k.min(3) + channel,
         }
     }
 }
@@ -133,7 +133,7 @@ pub fn code<C: Bins>(
     let mut coder = Coder {
         kind,
         lengths: Model::new(16 * LENGTHS + 4, 16 * LENGTHS + 2, LENGTHS + 1),
-        values: ValueModel::new(if kind == Kind::Nodes { 24 } else { 12 }),
+        values: ValueModel::new(if kind == Kind::Node { 24 } else { 12 }),
     };
     let mut out = Trajectories::new(channels);
     let mut before = [false; 2]; // whether blocks have any, the last one first

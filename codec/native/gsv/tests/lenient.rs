@@ -4,12 +4,12 @@ mod common;
 
 use common::{Random, small};
 use gsv::attributes::Attribute;
+use gsv::conformance::Damage;
 use gsv::decode::{Decoding, decode_damaged, decode_group};
 use gsv::encode::encode_group;
 use gsv::error::Error;
 use gsv::evaluate::{Evaluator, Frame};
 use gsv::group::Group;
-use gsv::inventory::Damage;
 use gsv::levels::LEVELS;
 use gsv::trajectories::Trajectories;
 use gsv::unit::{self, ALL_LAYERS, Unit, UnitType};

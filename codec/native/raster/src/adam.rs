@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use crate::scene::{RasterError, check_length};
-use crate::simd::{Level, Vector, c, dispatch};
+use crate::simd::{SimdLevel, Vector, c, dispatch};
 
 /// Values of one task.
 const SHARE: usize = 1 << 14;
@@ -24,7 +24,7 @@ impl Adam {
     /// Lengths that disagree.
     pub fn step(
         self,
-        level: Level,
+        level: SimdLevel,
         param: &mut [f32],
         grad: &[f32],
         first: &mut [f32],

@@ -7,9 +7,9 @@
 use std::sync::atomic::AtomicU32;
 
 use crate::constants::{ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_STOP};
-use crate::picture::Pixels;
+use crate::framebuffer::Pixels;
 use crate::project::Projected;
-use crate::rasterizer::Shade;
+use crate::scene::Background;
 use crate::simd::{Vector, c, dispatch};
 use crate::tile::{BATCH, BLOCK, BLOCKS, Batch, Hits, Local, PIXEL_X, PIXEL_Y, Plane, opacities};
 
@@ -177,11 +177,11 @@ fn backward_kernel<V: Vector>(
     pairs: &[AtomicU32],
     pixels: &Pixels,
     at: [usize; 2],
-    shade: Shade,
+    background: Background,
     hits: &[Hits],
     sums: &mut [Sums],
 ) {
-    let (adjoint, origin) = (&mut pixels.adjoint(at, shade), at.map(|v| v as f32));
+    let (adjoint, origin) = (&mut pixels.adjoint(at, background), at.map(|v| v as f32));
     let mut batch = Batch::new();
     let mut visits = Visits::new();
     for (i, (hits, sums)) in hits.iter().zip(sums.chunks_mut(BATCH)).enumerate() {
@@ -223,7 +223,7 @@ dispatch!(
         pairs: &[AtomicU32],
         pixels: &Pixels,
         at: [usize; 2],
-        shade: Shade,
+        background: Background,
         hits: &[Hits],
         sums: &mut [Sums],
     )

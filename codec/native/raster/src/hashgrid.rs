@@ -5,7 +5,7 @@
 
 use rayon::prelude::*;
 
-use crate::divide::divide;
+use crate::parallel::parallel_for;
 use crate::scene::{RasterError, check_length};
 
 const PRIMES: [u32; 3] = [1, 2_654_435_761, 805_459_861]; // x is not multiplied
@@ -15,13 +15,13 @@ const POINTS: usize = 256;
 /// Shape of a grid; the table is [entries, F], level after level.
 pub struct HashGrid {
     features: usize,
-    levels: Vec<Level>,
+    levels: Vec<GridLevel>,
     entries: usize,
     scratch: Vec<f32>, // [L, N, F] or [L, N, 3], kept from call to call
 }
 
 #[derive(Clone, Copy)]
-struct Level {
+struct GridLevel {
     cells: u32, // on a side
     first: usize,
     entries: usize,
@@ -35,7 +35,7 @@ struct Cell {
     inside: [bool; 3],
 }
 
-impl Level {
+impl GridLevel {
     #[inline(always)]
     fn cell(&self, point: &[f32; 3]) -> Cell {
         let (mut low, mut frac, mut inside) = ([0u32; 3], [0.0; 3], [true; 3]);
@@ -134,7 +134,7 @@ impl HashGrid {
             }
             let vertices = (cells as usize + 1).pow(3);
             let (dense, entries) = (vertices <= table, vertices.min(table));
-            levels.push(Level {
+            levels.push(GridLevel {
                 cells,
                 first,
                 entries,
@@ -248,7 +248,7 @@ impl HashGrid {
             let n = self.levels[middle].first - self.levels[levels.start].first;
             <[[f32; F]]>::split_at_mut(rows, n)
         };
-        divide(0..self.levels.len(), 1, rows, &cut, &|l, rows: &mut [[f32; F]]| {
+        parallel_for(0..self.levels.len(), 1, rows, &cut, &|l, rows: &mut [[f32; F]]| {
             let level = self.levels[l.start];
             for (g, point) in grad_out.chunks_exact(stride).zip(points.as_chunks::<3>().0) {
                 let g = &g[l.start * F..(l.start + 1) * F];

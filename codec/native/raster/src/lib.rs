@@ -1,6 +1,6 @@
 //! CPU rasterizer and training kernels: Gaussians + view -> image, and gradients back; image loss; hash grid.
 //!
-//! scene -> soa -> project -> sort -> bin -> forward (tiles) -> picture; backward (tiles) -> project_backward (Gaussians).
+//! scene -> soa -> project -> sort -> tile_binning -> forward (tiles) -> framebuffer; backward (tiles) -> project_backward (Gaussians).
 //! `simd` is the only place with `unsafe`. This crate never sees bytes of a stream: everything here may be fed floats of any value.
 
 // Kernels index several arrays in step; iterators over some of them would hide that.
@@ -9,14 +9,13 @@
 mod adam;
 mod backward;
 mod bands;
-mod bin;
 mod clock;
 pub mod constants;
-mod divide;
 mod forward;
+mod framebuffer;
 mod hashgrid;
 mod loss;
-mod picture;
+mod parallel;
 mod project;
 mod project_backward;
 mod rasterizer;
@@ -28,14 +27,15 @@ mod sort;
 mod ssim;
 mod step;
 mod tile;
+mod tile_binning;
 
 pub use adam::Adam;
 pub use bands::{Band, Bands};
+pub use framebuffer::Surface;
 pub use hashgrid::HashGrid;
 pub use loss::{ImageLoss, LossValue, Pair};
-pub use picture::Surface;
 pub use project::Projected;
-pub use rasterizer::{Rasterizer, Shade, Timings};
-pub use scene::{Gradients, RasterError, Region, Splats, View};
-pub use simd::Level;
-pub use step::{Lambdas, Step, StepValue, Target};
+pub use rasterizer::{Rasterizer, Timings};
+pub use scene::{Background, Gradients, RasterError, Region, Splats, View};
+pub use simd::SimdLevel;
+pub use step::{Lambdas, Step, StepValue, TargetImage};

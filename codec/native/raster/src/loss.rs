@@ -9,9 +9,9 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::divide::divide;
+use crate::parallel::parallel_for;
 use crate::scene::{RasterError, check_length};
-use crate::simd::{Level, Vector, c, dispatch};
+use crate::simd::{SimdLevel, Vector, c, dispatch};
 use crate::ssim::{ROWS, derivative_rows, gradient_rows};
 
 /// Means over the (weighted) pixels and channels.
@@ -56,7 +56,13 @@ impl ImageLoss {
     ///
     /// # Errors
     /// Lengths that disagree.
-    pub fn run(&mut self, level: Level, pair: Pair, lambda: f32, grad: &mut [f32]) -> Result<LossValue, RasterError> {
+    pub fn run(
+        &mut self,
+        level: SimdLevel,
+        pair: Pair,
+        lambda: f32,
+        grad: &mut [f32],
+    ) -> Result<LossValue, RasterError> {
         check_length("target", pair.target.len(), pair.image.len())?;
         check_length("gradient of the image", grad.len(), pair.image.len())?;
         check_length("image", pair.image.len(), pair.rows() * pair.row_values())?;
@@ -84,7 +90,7 @@ impl ImageLoss {
     }
 
     /// Pass 1: the maps times `scale` and the weight; returns sums of |x - y|, (x - y)^2 and SSIM.
-    fn derivatives(&mut self, level: Level, pair: Pair, scale: f64) -> [f64; 3] {
+    fn derivatives(&mut self, level: SimdLevel, pair: Pair, scale: f64) -> [f64; 3] {
         let (values, rows) = (pair.row_values(), pair.rows());
         self.partial.clear();
         self.partial.resize(rows, [0.0; 3]);
@@ -101,7 +107,7 @@ impl ImageLoss {
         }
         let spans = &self.spans;
         let [a, b, d] = &mut self.maps;
-        divide(
+        parallel_for(
             0..rows,
             ROWS,
             ([&mut a[..], &mut b[..], &mut d[..]], &mut self.partial[..]),
@@ -124,10 +130,10 @@ impl ImageLoss {
     }
 
     /// Pass 2: blurs the maps and adds the gradient of L1.
-    fn gradient(&self, level: Level, pair: Pair, l1: f32, grad: &mut [f32]) {
+    fn gradient(&self, level: SimdLevel, pair: Pair, l1: f32, grad: &mut [f32]) {
         let values = pair.row_values();
         let maps = [&self.maps[0][..], &self.maps[1][..], &self.maps[2][..]];
-        divide(
+        parallel_for(
             0..pair.rows(),
             ROWS,
             grad,

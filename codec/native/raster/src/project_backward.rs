@@ -3,12 +3,12 @@
 use std::ops::Range;
 
 use crate::backward::Sums;
-use crate::bin::Bins;
 use crate::project::{Ewa, Lens, WHITEN, colour, direction, dot3, ewa};
 use crate::scene::{Gradients, Splats};
 use crate::sh;
 use crate::simd::{Vector, c, dispatch, prefetch};
 use crate::soa::{CHUNK, Row, Soa, write_columns};
+use crate::tile_binning::TileBins;
 
 /// Gradients of a chunk as rows.
 struct GradientRows {
@@ -78,7 +78,7 @@ const AHEAD: usize = 24;
 
 /// Adds up the pairs of `n` Gaussians, in the order of their tiles. Bit i of the mask is set if Gaussian first + i has any.
 #[inline(always)] // into the kernel, whose wide instructions it needs
-fn gather(bins: &Bins, sums: &[Sums], first: usize, n: usize, rows: &mut [Row; 12]) -> u16 {
+fn gather(bins: &TileBins, sums: &[Sums], first: usize, n: usize, rows: &mut [Row; 12]) -> u16 {
     let mut seen = 0;
     for lane in 0..n {
         let g = first + lane;
@@ -238,7 +238,7 @@ fn chunk<V: Vector>(soa: &Soa, lens: &Lens, k: usize, sums: &[Row; 12], out: &mu
 fn project_backward_kernel<V: Vector>(
     splats: &Splats,
     lens: &Lens,
-    bins: &Bins,
+    bins: &TileBins,
     sums: &[Sums],
     range: Range<usize>,
     out: &mut Gradients,
@@ -257,7 +257,7 @@ dispatch!(
     pub fn project_backward = project_backward_kernel(
         splats: &Splats,
         lens: &Lens,
-        bins: &Bins,
+        bins: &TileBins,
         sums: &[Sums],
         range: Range<usize>,
         out: &mut Gradients,

@@ -9,17 +9,17 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use crate::backward::{Sums, backward};
-use crate::bin::{Bins, Tiles};
 use crate::clock::Clock;
-use crate::divide::divide;
 use crate::forward::{Canvas, forward};
-use crate::picture::{Pixels, Surface, finish, finish_empty};
+use crate::framebuffer::{Pixels, Surface, finish, finish_empty};
+use crate::parallel::parallel_for;
 use crate::project::{Lens, Projected, TILE, project};
 use crate::project_backward::project_backward;
-use crate::scene::{Gradients, MAX_PAIRS, RasterError, Region, Splats, View, check_length, check_size};
-use crate::simd::Level;
+use crate::scene::{Background, Gradients, MAX_PAIRS, RasterError, Region, Splats, View, check_length, check_size};
+use crate::simd::SimdLevel;
 use crate::sort::DepthSort;
 use crate::tile::{BLOCKS, Hits};
+use crate::tile_binning::{TileBins, Tiles};
 
 /// Gaussians of one task.
 const SHARE: usize = 256;
@@ -40,37 +40,23 @@ pub struct Timings {
     pub loss: f64,
 }
 
-/// Colours around and on the Gaussians.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Shade {
-    pub background: [f32; 3],
-    /// Per-camera exposure: what the Gaussians send is multiplied by it, the background is not.
-    pub gain: Option<[f32; 3]>,
-}
-
-impl Shade {
-    pub fn over(background: [f32; 3]) -> Shade {
-        Shade { background, gain: None }
-    }
-}
-
 pub struct Rasterizer {
-    level: Level,
+    level: SimdLevel,
     pool: Option<rayon::ThreadPool>,
     projected: Vec<Projected>,
     sort: DepthSort,
-    bins: Bins,
+    bins: TileBins,
     seen: Vec<Hits>,
     sums: Vec<Sums>,
     pub(crate) image: Vec<f32>, // [H, W, 3] of the region
     pub(crate) alpha: Vec<f32>, // [H, W]
-    drawn: Option<(Lens, Region, Shade)>,
+    drawn: Option<(Lens, Region, Background)>,
     pub timings: Timings,
 }
 
 impl Rasterizer {
     /// `threads` 0: the threads of the process-wide pool.
-    pub fn new(level: Level, threads: usize) -> Rasterizer {
+    pub fn new(level: SimdLevel, threads: usize) -> Rasterizer {
         let pool = if threads == 0 {
             None
         } else {
@@ -81,7 +67,7 @@ impl Rasterizer {
             pool,
             projected: Vec::new(),
             sort: DepthSort::default(),
-            bins: Bins::default(),
+            bins: TileBins::default(),
             seen: Vec::new(),
             sums: Vec::new(),
             image: Vec::new(),
@@ -91,7 +77,7 @@ impl Rasterizer {
         }
     }
 
-    pub fn level(&self) -> Level {
+    pub fn level(&self) -> SimdLevel {
         self.level
     }
 
@@ -137,7 +123,7 @@ impl Rasterizer {
         &mut self,
         surface: Surface,
         [width, height]: [usize; 2],
-        shade: Shade,
+        background: Background,
         fill: impl FnOnce(&mut Vec<Projected>),
     ) -> Result<(), RasterError> {
         fill(&mut self.projected);
@@ -150,17 +136,23 @@ impl Rasterizer {
         check_size(region, width, height)?;
         surface.check(region)?;
         self.drawn = None;
-        self.run(|s| s.draw_on(surface, region, shade, false))
+        self.run(|s| s.draw_on(surface, region, background, false))
     }
 
     /// Draws the view on a surface of the caller's; `image` and `alpha` stay what they are.
     ///
     /// # Errors
     /// As `forward`, or a surface of another size.
-    pub fn paint(&mut self, surface: Surface, splats: &Splats, view: &View, shade: Shade) -> Result<(), RasterError> {
+    pub fn paint(
+        &mut self,
+        surface: Surface,
+        splats: &Splats,
+        view: &View,
+        background: Background,
+    ) -> Result<(), RasterError> {
         self.project(splats, view)?;
         surface.check(view.region)?;
-        self.run(|s| s.draw_on(surface, view.region, shade, false))
+        self.run(|s| s.draw_on(surface, view.region, background, false))
     }
 
     /// Runs `f` with this workspace in its own threads.
@@ -179,17 +171,23 @@ impl Rasterizer {
     ///
     /// # Errors
     /// Wrong lengths, an empty or too large view, too many Gaussian-tile pairs.
-    pub fn forward(&mut self, splats: &Splats, view: &View, shade: Shade, training: bool) -> Result<(), RasterError> {
+    pub fn forward(
+        &mut self,
+        splats: &Splats,
+        view: &View,
+        background: Background,
+        training: bool,
+    ) -> Result<(), RasterError> {
         splats.check()?;
         view.check()?;
-        self.run(|s| s.forward_here(splats, view, shade, training))
+        self.run(|s| s.forward_here(splats, view, background, training))
     }
 
     pub(crate) fn forward_here(
         &mut self,
         splats: &Splats,
         view: &View,
-        shade: Shade,
+        background: Background,
         training: bool,
     ) -> Result<(), RasterError> {
         let lens = Lens::new(view);
@@ -202,11 +200,11 @@ impl Rasterizer {
             image: &mut image,
             alpha: &mut alpha,
         };
-        let drawn = self.draw_on(surface, view.region, shade, training);
+        let drawn = self.draw_on(surface, view.region, background, training);
         (self.image, self.alpha) = (image, alpha);
         drawn?;
         if training {
-            self.drawn = Some((lens, view.region, shade));
+            self.drawn = Some((lens, view.region, background));
         }
         Ok(())
     }
@@ -224,23 +222,23 @@ impl Rasterizer {
         &mut self,
         mut surface: Surface,
         region: Region,
-        shade: Shade,
+        background: Background,
         training: bool,
     ) -> Result<(), RasterError> {
         let start = Clock::start();
         self.sort.sort(&self.projected);
         (self.timings.bin, self.timings.blend) = (start.ms(), 0.0);
-        self.draw_tiles(&mut surface, Tiles::of(region), region, shade, training)
+        self.draw_tiles(&mut surface, Tiles::of(region), region, background, training)
     }
 
-    /// Bins and blends a rectangle of tiles; in halves if that would take too much memory, but for training, which needs all
+    /// TileBins and blends a rectangle of tiles; in halves if that would take too much memory, but for training, which needs all
     /// pairs afterwards.
     fn draw_tiles(
         &mut self,
         surface: &mut Surface,
         tiles: Tiles,
         region: Region,
-        shade: Shade,
+        background: Background,
         training: bool,
     ) -> Result<(), RasterError> {
         let (start, halves) = (Clock::start(), tiles.halves());
@@ -255,32 +253,32 @@ impl Rasterizer {
         self.timings.bin += start.ms();
         match (built, halves) {
             (Err(_), Some([first, second])) if !training => {
-                self.draw_tiles(surface, first, region, shade, training)?;
-                return self.draw_tiles(surface, second, region, shade, training);
+                self.draw_tiles(surface, first, region, background, training)?;
+                return self.draw_tiles(surface, second, region, background, training);
             }
             (built, _) => built?,
         }
         let start = Clock::start();
         let batches = self.bins.batches(self.bins.tiles.len());
         self.seen.resize(if training { batches } else { 0 }, [0; BLOCKS]);
-        self.blend(surface, region, shade);
+        self.blend(surface, region, background);
         self.timings.blend += start.ms();
         Ok(())
     }
 
-    fn blend(&mut self, surface: &mut Surface, region: Region, shade: Shade) {
+    fn blend(&mut self, surface: &mut Surface, region: Region, background: Background) {
         let (level, bins, projected, width) = (self.level, &self.bins, &self.projected[..], region.width);
         let (top, left) = (bins.tiles.rows.start, bins.tiles.columns.start);
         let pixels = top * TILE * width..(bins.tiles.rows.end * TILE).min(region.height) * width;
         let work = (surface.part(pixels), &mut self.seen[..]);
         let (rows, columns) = (bins.tiles.rows.len(), bins.tiles.columns.len());
-        divide(
+        parallel_for(
             0..rows,
             1,
             work,
             &|(band, seen), rows, middle| {
                 let (band, band_rest) = band.split_at((middle - rows.start) * TILE * width);
-                let (seen, seen_rest) = bins.cut(seen, rows.start, middle, Bins::batches);
+                let (seen, seen_rest) = bins.cut(seen, rows.start, middle, TileBins::batches);
                 ((band, seen), (band_rest, seen_rest))
             },
             &|row, (mut band, mut seen)| {
@@ -288,13 +286,13 @@ impl Rasterizer {
                 for column in 0..columns {
                     let t = row.start * columns + column;
                     let range = bins.tile(t);
-                    let (own, rest) = bins.cut_tile(seen, t, Bins::batches);
+                    let (own, rest) = bins.cut_tile(seen, t, TileBins::batches);
                     seen = rest;
                     let x = (left + column) * TILE;
                     if range.is_empty() {
                         continue;
                     }
-                    finish_empty(shade, empty..x, width, &mut band);
+                    finish_empty(background, empty..x, width, &mut band);
                     empty = x + TILE;
                     let mut canvas = Canvas::new(width - x, band.pixels() / width);
                     let origin = [x as f32, ((top + row.start) * TILE) as f32];
@@ -307,9 +305,14 @@ impl Rasterizer {
                         &mut canvas,
                         own,
                     );
-                    finish(&canvas, shade, x, width, &mut band);
+                    finish(&canvas, background, x, width, &mut band);
                 }
-                finish_empty(shade, empty..((left + columns) * TILE).min(width), width, &mut band);
+                finish_empty(
+                    background,
+                    empty..((left + columns) * TILE).min(width),
+                    width,
+                    &mut band,
+                );
             },
         );
     }
@@ -337,7 +340,7 @@ impl Rasterizer {
         out: &mut Gradients,
     ) -> Result<(), RasterError> {
         out.check(splats)?;
-        let Some((lens, region, shade)) = self.drawn.take() else {
+        let Some((lens, region, background)) = self.drawn.take() else {
             return Err(RasterError::NothingRendered);
         };
         check_length(
@@ -349,16 +352,16 @@ impl Rasterizer {
         check_length("gradient of alpha", grad_alpha.len(), region.pixels())?;
         let start = Clock::start();
         self.sums.resize(self.bins.pairs.len(), Sums::ZERO);
-        self.backward_tiles(region.width, shade, grad_image, grad_alpha);
+        self.backward_tiles(region.width, background, grad_image, grad_alpha);
         self.timings.backward_tiles = start.ms();
         let start = Clock::start();
         self.backward_gaussians(splats, &lens, out);
         self.timings.backward_project = start.ms();
-        self.drawn = Some((lens, region, shade));
+        self.drawn = Some((lens, region, background));
         Ok(())
     }
 
-    fn backward_tiles(&mut self, width: usize, shade: Shade, grad_image: &[f32], grad_alpha: &[f32]) {
+    fn backward_tiles(&mut self, width: usize, background: Background, grad_image: &[f32], grad_alpha: &[f32]) {
         let (level, bins, projected, seen) = (self.level, &self.bins, &self.projected[..], &self.seen[..]);
         let pixels = Pixels {
             image: &self.image,
@@ -367,19 +370,19 @@ impl Rasterizer {
             grad_alpha,
             width,
         };
-        let cut = |sums, rows: &Range<usize>, middle| bins.cut(sums, rows.start, middle, Bins::first);
+        let cut = |sums, rows: &Range<usize>, middle| bins.cut(sums, rows.start, middle, TileBins::first);
         let (rows, columns) = (bins.tiles.rows.len(), bins.tiles.columns.len());
-        divide(0..rows, 1, &mut self.sums[..], &cut, &|row, mut sums: &mut [Sums]| {
+        parallel_for(0..rows, 1, &mut self.sums[..], &cut, &|row, mut sums: &mut [Sums]| {
             for column in 0..columns {
                 let t = row.start * columns + column;
-                let (own, rest) = bins.cut_tile(sums, t, Bins::first);
+                let (own, rest) = bins.cut_tile(sums, t, TileBins::first);
                 sums = rest;
                 if own.is_empty() {
                     continue;
                 }
                 let (x, y) = (column * TILE, row.start * TILE);
                 let (pairs, hits) = (&bins.pairs[bins.first(t)..], &seen[bins.batches(t)..]);
-                backward(level, projected, pairs, &pixels, [x, y], shade, hits, own);
+                backward(level, projected, pairs, &pixels, [x, y], background, hits, own);
             }
         });
     }
@@ -387,7 +390,7 @@ impl Rasterizer {
     fn backward_gaussians(&self, splats: &Splats, lens: &Lens, out: &mut Gradients) {
         let n = splats.len();
         let out = out.reborrow();
-        divide(
+        parallel_for(
             0..n,
             SHARE,
             out,

@@ -178,6 +178,21 @@ impl View {
     }
 }
 
+/// What the Gaussians are composited over, and the exposure that they are multiplied by.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Background {
+    pub rgb: [f32; 3],
+    /// Per-camera exposure: multiplies the light of the Gaussians, not the background. None: 1.
+    pub gain: Option<[f32; 3]>,
+}
+
+impl Background {
+    /// The colour without an exposure.
+    pub fn new(rgb: [f32; 3]) -> Background {
+        Background { rgb, gain: None }
+    }
+}
+
 pub const MAX_SIDE: usize = 16384;
 pub const MAX_GAUSSIANS: usize = 1 << 26;
 /// Gaussian-tile pairs of one image; 2^28 of them take 16 GB in training.

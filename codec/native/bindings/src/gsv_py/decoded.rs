@@ -2,13 +2,13 @@
 
 use super::values::{bytes_of, raise};
 use gsv::attributes::{Attribute, sh_coefficients};
-use gsv::curve::Curve;
+use gsv::companding::Companding;
+use gsv::conformance::Damage;
 use gsv::decode::{Decoding, decode_damaged, decode_group};
 use gsv::evaluate::{Evaluator, FrameMut};
 use gsv::group::{BIRTH, Group};
-use gsv::inventory::Damage;
+use gsv::hilbert_layout::HilbertLayout;
 use gsv::levels::Level;
-use gsv::map::Map;
 use gsv::trajectories::Trajectories;
 use gsv::unit::{self, ALL_LAYERS};
 use numpy::ndarray::{Array2, Array3};
@@ -188,7 +188,7 @@ impl DecodedGroup {
         let d = PyDict::new(py);
         for k in 0..group.layers.len() {
             let range = group.range(k..k + 1);
-            let map = Map::new(range.len());
+            let map = HilbertLayout::new(range.len());
             let layer = if group.layers.len() > 1 {
                 format!("layer{k}_")
             } else {
@@ -252,7 +252,7 @@ fn parents_into<'py>(py: Python<'py>, parents: &[u32]) -> Bound<'py, PyArray1<i3
 }
 
 /// low, width, slopes.
-fn curve_row(c: &Curve) -> Vec<f32> {
+fn curve_row(c: &Companding) -> Vec<f32> {
     let slopes = c.slopes.iter().map(|s| f32::from(*s));
     [c.low, c.width].into_iter().chain(slopes).collect()
 }
@@ -273,10 +273,10 @@ fn integers<'py>(py: Python<'py>, e: &Evaluator) -> PyResult<Bound<'py, PyDict>>
         one.set_item("values", planes.into_pyarray(py))?;
         one.set_item("steps", scale.steps.clone())?;
         one.set_item("offsets", scale.offsets.clone())?;
-        let curves = h.curves_of(*a).iter().map(curve_row).collect::<Vec<_>>();
+        let curves = h.companding_of(*a).iter().map(curve_row).collect::<Vec<_>>();
         one.set_item("curves", curves)?;
         if *a == Attribute::Quats {
-            one.set_item("levers", h.levers.map(|l| l.to_vec()).to_vec())?;
+            one.set_item("levers", h.scale_exponents.map(|l| l.to_vec()).to_vec())?;
         }
         channels.set_item(a.name(), one)?;
     }

@@ -2,7 +2,7 @@
 
 use super::values::{array, invalid, item, optional, points, value};
 use gsv::attributes::{Attribute, sh_coefficients};
-use gsv::curve::{Curve, PIECES};
+use gsv::companding::{Companding, PIECES};
 use gsv::group::{BIRTH, Group};
 use gsv::header::{Header, LayerHeader, NodeHeader, Scale, TrajectoryHeader};
 use gsv::trajectories::Trajectories;
@@ -41,11 +41,11 @@ pub fn group_from(d: &Bound<PyDict>, reference: Option<&Group>) -> PyResult<Grou
         }
         header.scales.push(Scale { steps, offsets });
         if *a == Attribute::Quats && optional(&c, "levers")?.is_some() {
-            header.levers = value(&c, "levers")?;
+            header.scale_exponents = value(&c, "levers")?;
         }
     }
     header.shifts = shifts_from(d, &header)?;
-    header.curves = curves_from(&channels)?;
+    header.companding = curves_from(&channels)?;
     if let Some(t) = optional(d, "trajectories")? {
         let t: Bound<PyDict> = t.extract()?;
         motion_from(&t, &mut header, &mut group)?;
@@ -67,8 +67,13 @@ pub fn group_from(d: &Bound<PyDict>, reference: Option<&Group>) -> PyResult<Grou
     let same = |r: &Group| {
         let h = &r.header;
         (h.origin, h.grid_step, h.grid_bits) == (header.origin, header.grid_step, header.grid_bits)
-            && (&h.scales, &h.levers, &h.shifts, &h.curves)
-                == (&header.scales, &header.levers, &header.shifts, &header.curves)
+            && (&h.scales, &h.scale_exponents, &h.shifts, &h.companding)
+                == (
+                    &header.scales,
+                    &header.scale_exponents,
+                    &header.shifts,
+                    &header.companding,
+                )
     };
     if header.reference > 0 && !reference.is_some_and(same) {
         return invalid(
@@ -134,13 +139,13 @@ fn shifts_from(d: &Bound<PyDict>, header: &Header) -> PyResult<Vec<[u8; 6]>> {
 }
 
 /// `curves` of log_scales and logit_opacities: for each channel low, width, and the slopes.
-fn curves_from(channels: &Bound<PyDict>) -> PyResult<Option<[Curve; 4]>> {
+fn curves_from(channels: &Bound<PyDict>) -> PyResult<Option<[Companding; 4]>> {
     let mut found = Vec::new();
     for a in [Attribute::LogScales, Attribute::LogitOpacities] {
         let c: Bound<PyDict> = value(channels, a.name())?;
         if optional(&c, "curves")?.is_some() {
             let rows: Vec<[f32; 2 + PIECES]> = value(&c, "curves")?;
-            found.extend(rows.into_iter().map(|[low, width, slopes @ ..]| Curve {
+            found.extend(rows.into_iter().map(|[low, width, slopes @ ..]| Companding {
                 low,
                 width,
                 slopes: slopes.map(|s| s as u8),

@@ -5,8 +5,8 @@ use gsv::attributes::sh_coefficients;
 use gsv::container::demux::Demuxer;
 use gsv::decode::{Decoding, decode_group, reference_of};
 use gsv::evaluate::{Evaluator, Frame};
-use gsv::levels::Level as Caps;
-use raster::{Band, Bands, Level, Projected, Rasterizer, Region, Shade, Splats, Surface, View};
+use gsv::levels::Level;
+use raster::{Background, Band, Bands, Projected, Rasterizer, Region, SimdLevel, Splats, Surface, View};
 use std::fmt::Display;
 
 /// 4096 x 4096. A larger picture is refused; an allocation that fails would end the instance.
@@ -36,7 +36,7 @@ impl Default for Player {
             groups: Default::default(),
             frame: Frame::default(),
             sh_k: 0,
-            raster: Rasterizer::new(Level::best(), 0),
+            raster: Rasterizer::new(SimdLevel::best(), 0),
             bands: Bands::default(),
             splats: Vec::new(),
             pixels: Vec::new(),
@@ -64,7 +64,7 @@ impl Player {
 
     /// The reference of a predicted group is in its slot.
     pub fn decode(&mut self, slot: usize, level: u8, reference: usize, layers: usize) -> bool {
-        let decoded = Caps::get(level).and_then(|caps| {
+        let decoded = Level::get(level).and_then(|caps| {
             let how = Decoding {
                 level: &caps,
                 reference: self
@@ -180,16 +180,18 @@ impl Player {
     }
 
     pub fn draw(&mut self, size: [usize; 2], background: [f32; 3]) -> bool {
-        let (shade, splats) = (Shade::over(background), &mut self.splats);
+        let (background, splats) = (Background::new(background), &mut self.splats);
         self.pixels
             .resize(size[0].saturating_mul(size[1]).min(MAX_PIXELS), [255; 4]);
         let surface = Surface::Rgba(&mut self.pixels);
-        let drawn = self.raster.draw(surface, size, shade, |p| std::mem::swap(p, splats));
+        let drawn = self
+            .raster
+            .draw(surface, size, background, |p| std::mem::swap(p, splats));
         self.done(drawn)
     }
 
     pub fn use_level(&mut self, i: usize) -> bool {
-        let level = Level::available().get(i).copied();
+        let level = SimdLevel::available().get(i).copied();
         if let Some(level) = level {
             self.raster = Rasterizer::new(level, 0);
         }

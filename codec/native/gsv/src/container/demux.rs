@@ -4,7 +4,7 @@
 //! can seek asks `skippable` and leaves it out. Waiting for more bytes is a state, not an error.
 
 use super::config::Config;
-use super::movie::{self, Track};
+use super::isobmff::{self, Track};
 use crate::error::{Error, Result};
 
 /// Largest box that is read as a whole.
@@ -252,10 +252,10 @@ impl Demuxer {
 
     fn body(&mut self, kind: &[u8; 4], start: u64, body: &[u8]) -> Result<()> {
         match kind {
-            b"ftyp" => movie::brands(body),
+            b"ftyp" => isobmff::ftyp(body),
             b"moov" if self.track.is_some() => Err(Error::bitstream(0, "", "one moov box")),
             b"moov" => {
-                self.track = Some(movie::movie(body)?);
+                self.track = Some(isobmff::moov(body)?);
                 Ok(())
             }
             b"sidx" => {
@@ -263,7 +263,7 @@ impl Demuxer {
                 Ok(())
             }
             b"ssix" => {
-                let told = movie::layer_index(body).filter(|l| l.len() == self.index.len());
+                let told = isobmff::ssix(body).filter(|l| l.len() == self.index.len());
                 self.layers = told.unwrap_or_default();
                 Ok(())
             }
@@ -273,7 +273,7 @@ impl Demuxer {
 
     /// Spec 2.5.
     fn announced(&mut self, sidx: &[u8]) {
-        let (Some((first, references)), Some(track)) = (movie::index(sidx), &self.track) else {
+        let (Some((first, references)), Some(track)) = (isobmff::sidx(sidx), &self.track) else {
             return;
         };
         let frame = u64::from(track.config.frame_duration);
@@ -300,7 +300,7 @@ impl Demuxer {
         if self.pending.is_some() {
             return Err(Error::bitstream(0, "", "the mdat box of the moof before"));
         }
-        self.pending = movie::fragment(body, track, start)?;
+        self.pending = isobmff::moof(body, track, start)?;
         Ok(())
     }
 }

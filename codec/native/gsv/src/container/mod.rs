@@ -4,6 +4,6 @@
 
 pub mod config;
 pub mod demux;
-mod movie;
+mod isobmff;
 pub mod whole;
 pub mod write;

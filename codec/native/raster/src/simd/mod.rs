@@ -1,5 +1,5 @@
 //! One vector interface for all kernels. A kernel is written once, generic over `Vector`; the instances are `f32` (the plain
-//! reference), AVX2 + FMA and AVX-512, chosen at run time by `Level`, NEON and WebAssembly simd128, chosen by the build, and a
+//! reference), AVX2 + FMA and AVX-512, chosen at run time by `SimdLevel`, NEON and WebAssembly simd128, chosen by the build, and a
 //! portable one for all other machines. `dispatch!` makes the entry point of a kernel: it compiles the instance inside a
 //! function that has the target features, which is what lets the intrinsics inline.
 
@@ -148,7 +148,7 @@ pub(crate) fn exp2_polys<V: Vector, const N: usize>(x: [V; N], magic: V) -> ([V;
 
 /// An instruction set that this machine has been found to have. There is no other way to make one, so kernels may rely on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Level(Isa);
+pub struct SimdLevel(Isa);
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Isa {
@@ -165,11 +165,11 @@ pub(crate) enum Isa {
     Wasm128,
 }
 
-impl Level {
-    pub const SCALAR: Level = Level(Isa::Scalar);
+impl SimdLevel {
+    pub const SCALAR: SimdLevel = SimdLevel(Isa::Scalar);
 
     /// Fastest first.
-    pub fn available() -> Vec<Level> {
+    pub fn available() -> Vec<SimdLevel> {
         let mut found = Vec::new();
         #[cfg(target_arch = "x86_64")]
         {
@@ -179,24 +179,24 @@ impl Level {
             let fma = bits && is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
             let f = is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq");
             if fma && f && is_x86_feature_detected!("avx512vl") && is_x86_feature_detected!("avx512bw") {
-                found.push(Level(Isa::Avx512));
+                found.push(SimdLevel(Isa::Avx512));
             }
             if fma {
-                found.push(Level(Isa::Avx2));
+                found.push(SimdLevel(Isa::Avx2));
             }
         }
         #[cfg(all(target_arch = "wasm32", target_feature = "simd128"))]
-        found.push(Level(Isa::Wasm128));
+        found.push(SimdLevel(Isa::Wasm128));
         #[cfg(target_arch = "aarch64")]
-        found.push(Level(Isa::Neon));
+        found.push(SimdLevel(Isa::Neon));
         #[cfg(not(target_family = "wasm"))]
-        found.push(Level(Isa::Portable));
-        found.push(Level::SCALAR);
+        found.push(SimdLevel(Isa::Portable));
+        found.push(SimdLevel::SCALAR);
         found
     }
 
-    pub fn best() -> Level {
-        Level::available().first().copied().unwrap_or(Level::SCALAR)
+    pub fn best() -> SimdLevel {
+        SimdLevel::available().first().copied().unwrap_or(SimdLevel::SCALAR)
     }
 
     pub fn name(self) -> &'static str {
@@ -220,13 +220,13 @@ impl Level {
     }
 }
 
-/// `dispatch!(pub fn name = kernel(arg: Type, ...) -> Ret)`: a function that takes a `Level` first and runs
+/// `dispatch!(pub fn name = kernel(arg: Type, ...) -> Ret)`: a function that takes a `SimdLevel` first and runs
 /// `kernel::<V>` with the vector type of that level.
 macro_rules! dispatch {
     ($(#[$doc:meta])* $vis:vis fn $name:ident = $kernel:ident($($arg:ident: $ty:ty),* $(,)?) $(-> $ret:ty)?) => {
         $(#[$doc])*
         #[allow(clippy::too_many_arguments)]
-        $vis fn $name(level: $crate::simd::Level, $($arg: $ty),*) $(-> $ret)? {
+        $vis fn $name(level: $crate::simd::SimdLevel, $($arg: $ty),*) $(-> $ret)? {
             #[cfg(target_arch = "x86_64")]
             {
                 #[target_feature(enable = "avx2,fma,bmi1,bmi2,popcnt,avx512f,avx512dq,avx512vl,avx512bw")]
@@ -238,7 +238,7 @@ macro_rules! dispatch {
                     $kernel::<$crate::simd::avx2::F32x8>($($arg),*)
                 }
                 match level.isa() {
-                    // SAFETY: a Level of this value exists only after run-time detection of these features.
+                    // SAFETY: a SimdLevel of this value exists only after run-time detection of these features.
                     $crate::simd::Isa::Avx512 => return unsafe { avx512($($arg),*) },
                     // SAFETY: as above.
                     $crate::simd::Isa::Avx2 => return unsafe { avx2($($arg),*) },

@@ -5,8 +5,7 @@ use std::ops::Range;
 use crate::backward::Adjoint;
 use crate::forward::Canvas;
 use crate::project::TILE;
-use crate::rasterizer::Shade;
-use crate::scene::{RasterError, Region, check_length};
+use crate::scene::{Background, RasterError, Region, check_length};
 use crate::tile::{Plane, swizzle};
 
 /// What is drawn on: rows of pixels of the region, as floats or, for viewers, as bytes without a float image in between.
@@ -110,8 +109,8 @@ fn byte(v: f32) -> u8 {
 }
 
 /// Writes a finished tile to the rows of its band.
-pub fn finish(canvas: &Canvas, shade: Shade, x: usize, width: usize, band: &mut Surface) {
-    let (gain, back) = (shade.gain.unwrap_or([1.0; 3]), shade.background);
+pub fn finish(canvas: &Canvas, background: Background, x: usize, width: usize, band: &mut Surface) {
+    let (gain, back) = (background.gain.unwrap_or([1.0; 3]), background.rgb);
     let columns = TILE.min(width - x);
     for y in 0..band.pixels() / width {
         let mut rgb_row = [[0.0; 3]; TILE];
@@ -136,11 +135,11 @@ pub fn finish(canvas: &Canvas, shade: Shade, x: usize, width: usize, band: &mut 
 }
 
 /// Columns without Gaussians: whole stretches of rows, which memory likes better than tile after tile.
-pub fn finish_empty(shade: Shade, columns: Range<usize>, width: usize, band: &mut Surface) {
+pub fn finish_empty(background: Background, columns: Range<usize>, width: usize, band: &mut Surface) {
     if columns.is_empty() {
         return;
     }
-    let colour = shade.background;
+    let colour = background.rgb;
     for y in 0..band.pixels() / width {
         let row = y * width + columns.start..y * width + columns.end;
         match band {
@@ -170,7 +169,7 @@ impl Pixels<'_> {
     /// The tile at (x, y). With image = gain sum(w rgb) + T background and alpha = 1 - T, the remainder of the whole pixel,
     /// g . sum(w rgb) + T (g . background - g_alpha), is g . image - T g_alpha.
     #[inline(always)] // into the kernel, whose wide instructions it needs
-    pub fn adjoint(&self, [x, y]: [usize; 2], shade: Shade) -> Adjoint {
+    pub fn adjoint(&self, [x, y]: [usize; 2], background: Background) -> Adjoint {
         let mut a = Adjoint {
             transmittance: Plane::ZERO,
             remainder: Plane::ZERO,
@@ -178,7 +177,7 @@ impl Pixels<'_> {
         };
         let (rows, gain) = (
             (self.alpha.len() / self.width - y).min(TILE),
-            shade.gain.unwrap_or([1.0; 3]),
+            background.gain.unwrap_or([1.0; 3]),
         );
         let columns = TILE.min(self.width - x);
         for j in 0..rows {

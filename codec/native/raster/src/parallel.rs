@@ -4,7 +4,7 @@
 use std::ops::Range;
 
 /// `cut(work, range, middle)` splits the buffers of `range` at item `middle`.
-pub fn divide<W: Send>(
+pub fn parallel_for<W: Send>(
     range: Range<usize>,
     grain: usize,
     work: W,
@@ -21,8 +21,8 @@ pub fn divide<W: Send>(
     let (left, right) = cut(work, &range, middle);
     let (first, last) = (range.start..middle, middle..range.end);
     rayon::join(
-        || divide(first, grain, left, cut, run),
-        || divide(last, grain, right, cut, run),
+        || parallel_for(first, grain, left, cut, run),
+        || parallel_for(last, grain, right, cut, run),
     );
 }
 
@@ -34,7 +34,7 @@ mod tests {
     fn pieces_are_aligned_and_cover_the_range() {
         for n in [0, 1, 15, 16, 17, 1000] {
             let mut seen = vec![0usize; n];
-            divide(
+            parallel_for(
                 0..n,
                 16,
                 &mut seen[..],

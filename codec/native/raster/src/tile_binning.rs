@@ -80,7 +80,7 @@ impl Tiles {
 }
 
 #[derive(Default)]
-pub struct Bins {
+pub struct TileBins {
     pub tiles: Tiles,
     /// [tiles + 1] first pair of each tile
     pub starts: Vec<u32>,
@@ -183,7 +183,7 @@ fn index(key: &AtomicU64) -> usize {
     key.load(Relaxed) as u32 as usize
 }
 
-impl Bins {
+impl TileBins {
     /// Bytes of the buffers.
     pub fn memory(&self) -> usize {
         let lists = self.lists.iter().map(Vec::capacity).sum::<usize>();
@@ -210,7 +210,7 @@ impl Bins {
         items: &'a mut [T],
         first: usize,
         middle: usize,
-        start: fn(&Bins, usize) -> usize,
+        start: fn(&TileBins, usize) -> usize,
     ) -> (&'a mut [T], &'a mut [T]) {
         let columns = self.tiles.columns.len();
         let length = start(self, middle * columns) - start(self, first * columns);
@@ -222,7 +222,7 @@ impl Bins {
         &self,
         items: &'a mut [T],
         t: usize,
-        start: fn(&Bins, usize) -> usize,
+        start: fn(&TileBins, usize) -> usize,
     ) -> (&'a mut [T], &'a mut [T]) {
         let length = start(self, t + 1) - start(self, t);
         items.split_at_mut(length.min(items.len()))

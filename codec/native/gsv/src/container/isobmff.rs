@@ -65,7 +65,7 @@ fn find<'a>(data: &'a [u8], path: &[&[u8; 4]]) -> Result<(&'a [u8], usize)> {
 }
 
 /// Checks the body of ftyp.
-pub fn brands(body: &[u8]) -> Result<()> {
+pub fn ftyp(body: &[u8]) -> Result<()> {
     let brands = body.as_chunks::<4>().0;
     let known = brands.iter().enumerate().any(|(i, b)| i != 1 && b == BRAND); // the second word is minor_version
     if known {
@@ -80,7 +80,7 @@ pub fn brands(body: &[u8]) -> Result<()> {
 }
 
 /// What the body of moov says about the first track with handler volv.
-pub fn movie(body: &[u8]) -> Result<Track> {
+pub fn moov(body: &[u8]) -> Result<Track> {
     for b in boxes(body)?.into_iter().filter(|b| &b.kind == b"trak") {
         let (hdlr, _) = find(b.body, &[b"mdia", b"hdlr"]).map_err(|e| e.at(b.offset, ""))?;
         if hdlr.get(8..12) == Some(b"volv") {
@@ -159,10 +159,10 @@ fn extends(moov: &[u8], id: u32) -> Result<Defaults> {
 }
 
 /// A reference of sidx: bytes, units of the timescale, and whether it starts with a sync sample.
-pub type Reference = (u32, u32, bool);
+pub type SidxReference = (u32, u32, bool);
 
 /// Spec 2.5: first_offset and the references of sidx; None if it is malformed.
-pub fn index(body: &[u8]) -> Option<(u64, Vec<Reference>)> {
+pub fn sidx(body: &[u8]) -> Option<(u64, Vec<SidxReference>)> {
     let head = if body.first()? == &0 { 20 } else { 28 };
     let first_offset = match head {
         20 => u64::from(u32::from_be_bytes(body.get(16..20)?.try_into().ok()?)),
@@ -179,7 +179,7 @@ pub fn index(body: &[u8]) -> Option<(u64, Vec<Reference>)> {
 }
 
 /// Spec 2.6: for each reference of sidx the bytes of the fragment that end with each layer; None if it is malformed.
-pub fn layer_index(body: &[u8]) -> Option<Vec<Vec<u64>>> {
+pub fn ssix(body: &[u8]) -> Option<Vec<Vec<u64>>> {
     let (words, rest) = body.get(4..)?.as_chunks::<4>();
     let mut words = words.iter().map(|w| u32::from_be_bytes(*w));
     let mut all = Vec::new();
@@ -202,10 +202,10 @@ pub fn layer_index(body: &[u8]) -> Option<Vec<Vec<u64>>> {
     (rest.is_empty() && words.next().is_none()).then_some(all)
 }
 
-/// Spec 2.4: the group that a moof announces, None if it has none of the track. `moof`: where the moof box starts.
-pub fn fragment(body: &[u8], track: &Track, moof: u64) -> Result<Option<Entry>> {
+/// Spec 2.4: the group that a moof announces, None if it has none of the track. `start`: where the moof box starts.
+pub fn moof(body: &[u8], track: &Track, start: u64) -> Result<Option<Entry>> {
     for b in boxes(body)?.into_iter().filter(|b| &b.kind == b"traf") {
-        if let Some(group) = traf(b.body, track, moof).map_err(|e| e.at(b.offset, "traf box"))? {
+        if let Some(group) = traf(b.body, track, start).map_err(|e| e.at(b.offset, "traf box"))? {
             return Ok(Some(group));
         }
     }
@@ -213,10 +213,10 @@ pub fn fragment(body: &[u8], track: &Track, moof: u64) -> Result<Option<Entry>> 
 }
 
 /// The group of a traf, None if it is of another track.
-fn traf(body: &[u8], track: &Track, moof: u64) -> Result<Option<Entry>> {
+fn traf(body: &[u8], track: &Track, start: u64) -> Result<Option<Entry>> {
     let (tfhd, base) = find(body, &[b"tfhd"])?;
     let mut r = Reader::new(tfhd);
-    let Some((data, defaults)) = header(&mut r, track, moof).map_err(|e| e.at(base, ""))? else {
+    let Some((data, defaults)) = header(&mut r, track, start).map_err(|e| e.at(base, ""))? else {
         return Ok(None);
     };
     let (tfdt, base) = find(body, &[b"tfdt"])?;
@@ -242,8 +242,8 @@ fn traf(body: &[u8], track: &Track, moof: u64) -> Result<Option<Entry>> {
 }
 
 /// tfhd: base of data offsets and sample defaults, None for another track.
-fn header(r: &mut Reader, track: &Track, moof: u64) -> Result<Option<(u64, Defaults)>> {
-    let (mut flags, mut id, mut base, mut d) = (0, 0, moof, track.defaults);
+fn header(r: &mut Reader, track: &Track, start: u64) -> Result<Option<(u64, Defaults)>> {
+    let (mut flags, mut id, mut base, mut d) = (0, 0, start, track.defaults);
     r.u32(&mut flags)?;
     r.u32(&mut id)?;
     if flags & 0x01 != 0 {

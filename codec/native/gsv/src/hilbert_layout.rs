@@ -4,7 +4,7 @@
 //! Consecutive indices are neighbours in space (Morton order), so a map looks like a folded surface.
 
 /// The arrangement of N indices.
-pub struct Map {
+pub struct HilbertLayout {
     pub width: usize,
     pub height: usize,
     count: usize,
@@ -16,11 +16,11 @@ pub fn width_log2(n: usize) -> u32 {
     n.checked_ilog2().unwrap_or(0) >> 1
 }
 
-impl Map {
-    pub fn new(count: usize) -> Map {
+impl HilbertLayout {
+    pub fn new(count: usize) -> HilbertLayout {
         let bits = width_log2(count);
         let width = 1usize << bits;
-        Map {
+        HilbertLayout {
             width,
             height: count.div_ceil(width * width) * width,
             count,

@@ -18,10 +18,10 @@ pub struct Damage {
 }
 
 /// What there is one of in a group.
-pub type Key = (UnitType, u8, Option<Attribute>);
+pub type UnitKey = (UnitType, u8, Option<Attribute>);
 
 /// The sound unit of a type, layer and attribute.
-pub fn find(units: &[Unit], (kind, layer, attribute): Key) -> Option<usize> {
+pub fn find(units: &[Unit], (kind, layer, attribute): UnitKey) -> Option<usize> {
     let sought = |u: &Unit| (u.kind, u.layer, u.attribute) == (Some(kind), layer, attribute) && u.damage.is_none();
     units.iter().position(sought)
 }
@@ -83,7 +83,7 @@ pub fn check(units: &[Unit], header: &Header, reference: Option<&Header>, layers
     Ok(damage)
 }
 
-fn missing((kind, layer, attribute): Key) -> String {
+fn missing((kind, layer, attribute): UnitKey) -> String {
     let attribute = attribute.map_or("", Attribute::name);
     let of = if layer > 0 {
         format!(" of layer {layer}")
@@ -104,7 +104,7 @@ fn claimed((i, u): (usize, &Unit)) -> Option<Damage> {
 }
 
 /// Units that must be there, and those that may.
-fn announced(h: &Header, reference: Option<&Header>, layers: usize) -> (Vec<Key>, Vec<Key>) {
+fn announced(h: &Header, reference: Option<&Header>, layers: usize) -> (Vec<UnitKey>, Vec<UnitKey>) {
     let mut required = vec![(UnitType::GroupHeader, 0, None)];
     let mut optional = Vec::new();
     if h.nodes.count > 0 {

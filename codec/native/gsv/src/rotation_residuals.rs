@@ -14,7 +14,7 @@ pub const SIDE: usize = 2 * RANGE as usize + 1;
 
 /// Gaussians to be coded: of each its quaternion, the steps of its three integers, and what an error of a step is worth, in bits,
 /// squared.
-pub struct Turns<'a> {
+pub struct RotationResiduals<'a> {
     pub quats: &'a [Quat],
     pub steps: &'a [[f32; 3]],
     pub worth: &'a [[f32; 3]],
@@ -23,16 +23,16 @@ pub struct Turns<'a> {
 }
 
 /// A Gaussian as it is coded.
-pub struct Coded {
+pub struct QuantizedRotation {
     pub integers: [i32; 3],
     /// Of 1, i, j, k the one whose inverse the quaternion was multiplied by from the right.
     pub form: u8,
 }
 
-impl Turns<'_> {
+impl RotationResiduals<'_> {
     /// What each Gaussian is coded as. `near`: neighbours of each.
-    pub fn code(&self, near: &[Near]) -> Vec<Coded> {
-        let mut out: Vec<Coded> = Vec::with_capacity(self.quats.len());
+    pub fn code(&self, near: &[Near]) -> Vec<QuantizedRotation> {
+        let mut out: Vec<QuantizedRotation> = Vec::with_capacity(self.quats.len());
         let mut decoded = Vec::with_capacity(self.quats.len());
         for (i, (q, near)) in self.quats.iter().zip(near).enumerate() {
             let before = before(&decoded, i, near);
@@ -51,7 +51,7 @@ impl Turns<'_> {
             });
             let rounded = std::array::from_fn(|c| step[c] * integers[c] as f32);
             decoded.push(multiply(before, turn(rounded)));
-            out.push(Coded { integers, form });
+            out.push(QuantizedRotation { integers, form });
         }
         out
     }
