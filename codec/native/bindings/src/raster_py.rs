@@ -1,17 +1,14 @@
 //! `_native.Rasterizer`: numpy arrays in, numpy arrays out. Parameters come as the tuple (means, quats, log_scales,
 //! logit_opacities, sh0, shN), f32 and contiguous; gradients as those and (grad2d, max_weight, sum_weight), written in place.
 
+mod arrays;
 mod kernels;
 
-use numpy::{PyArray1, PyReadonlyArrayDyn, PyReadwriteArrayDyn, prelude::*};
-use pyo3::exceptions::{PyOverflowError, PyValueError};
+use arrays::{In, InOut, contiguous, level, usage};
+use numpy::{PyArray1, PyReadonlyArrayDyn, prelude::*};
 use pyo3::prelude::*;
-use raster::{
-    Background, Gradients, Lambdas, Projected, RasterError, Region, SimdLevel, Splats, Step, Surface, TargetImage, View,
-};
+use raster::{Background, Gradients, Lambdas, Projected, Region, SimdLevel, Splats, Step, Surface, TargetImage, View};
 
-type In<'py> = PyReadonlyArrayDyn<'py, f32>;
-type InOut<'py> = PyReadwriteArrayDyn<'py, f32>;
 type Bytes<'py> = PyReadonlyArrayDyn<'py, u8>;
 type Params<'py> = (In<'py>, In<'py>, In<'py>, In<'py>, In<'py>, In<'py>);
 type Grads<'py> = (
@@ -26,18 +23,6 @@ type Crop<'py> = (
 type Value = (f64, f64, f64, f64, f64, [f64; 3]);
 /// (image, alpha), flat
 type Picture<'py> = (Bound<'py, PyArray1<f32>>, Bound<'py, PyArray1<f32>>);
-
-/// ValueError for wrong arguments, OverflowError for what is too large.
-fn usage(e: RasterError) -> PyErr {
-    match e {
-        RasterError::TooMany { .. } => PyOverflowError::new_err(e.to_string()),
-        _ => PyValueError::new_err(e.to_string()),
-    }
-}
-
-fn contiguous<T>(r: Result<T, impl std::fmt::Display>) -> PyResult<T> {
-    r.map_err(|e| PyValueError::new_err(e.to_string()))
-}
 
 fn splats<'a>(p: &'a Params) -> PyResult<Splats<'a>> {
     Ok(Splats {
@@ -64,20 +49,6 @@ fn gradients<'a>(g: &'a mut Grads) -> PyResult<Gradients<'a>> {
         grad2d: contiguous(stats.0.as_slice_mut())?,
         max_weight: contiguous(stats.1.as_slice_mut())?,
         sum_weight: contiguous(stats.2.as_slice_mut())?,
-    })
-}
-
-fn level(name: &str) -> PyResult<SimdLevel> {
-    if name == "auto" {
-        return Ok(SimdLevel::best());
-    }
-    let available = SimdLevel::available();
-    let names: Vec<&str> = available.iter().map(|l| l.name()).collect();
-    available.iter().copied().find(|l| l.name() == name).ok_or_else(|| {
-        PyValueError::new_err(format!(
-            "simd {name:?} is not available here, expected auto or one of {}",
-            names.join(", ")
-        ))
     })
 }
 

@@ -1,10 +1,8 @@
 //! Which nodes move a Gaussian, and how much (spec 13.2): exact integers, so that encoder and decoder agree.
 
+pub use crate::node_search::NEIGHBORS_MAX;
 use crate::node_search::NodeSearch;
 use rayon::prelude::*;
-
-/// Neighbours a Gaussian may have (spec 4).
-pub const NEIGHBORS_MAX: usize = 8;
 
 /// Nodes and weights of all Gaussians: `per` entries each, nearest first.
 #[derive(Debug, Clone, Default)]

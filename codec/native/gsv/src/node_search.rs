@@ -5,7 +5,8 @@
 //! Gaussians around its centre) that is all nodes for all points, which the level caps (spec 5).
 //! Coordinates are below 2^21: sums of squares of their differences are exact in f64, which vectorizes.
 
-use crate::blend::NEIGHBORS_MAX;
+/// Nodes that may move a Gaussian (spec 4).
+pub const NEIGHBORS_MAX: usize = 8;
 
 pub type Neighbor = (u64, u32); // squared distance, index of the node
 const FAR: Neighbor = (u64::MAX, u32::MAX);

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::scene::{RasterError, check_length};
+use crate::error::{RasterError, check_length};
 use crate::simd::{SimdLevel, Vector, c, dispatch};
 
 /// Values of one task.

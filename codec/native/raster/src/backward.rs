@@ -6,9 +6,9 @@
 
 use std::sync::atomic::AtomicU32;
 
+use crate::adjoint::{Adjoint, Pixels};
 use crate::constants::{ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_STOP};
-use crate::framebuffer::Pixels;
-use crate::project::Projected;
+use crate::projected::Projected;
 use crate::scene::Background;
 use crate::simd::{Vector, c, dispatch};
 use crate::tile::{BATCH, BLOCK, BLOCKS, Batch, Hits, Local, PIXEL_X, PIXEL_Y, Plane, opacities};
@@ -23,15 +23,6 @@ pub struct Sums(pub [f32; 12]);
 
 impl Sums {
     pub const ZERO: Sums = Sums([0.0; 12]);
-}
-
-/// State of the pixels of a tile.
-pub struct Adjoint {
-    /// Starts at 1 (0 outside of the image).
-    pub transmittance: Plane,
-    pub remainder: Plane,
-    /// Gradient by the blended colours.
-    pub rgb: [Plane; 3],
 }
 
 /// Visits (a Gaussian on a block) that are prepared together, and the most that one Gaussian adds to them.

@@ -1,7 +1,7 @@
 //! Ellipses of a picture -> those of each of k bands of rows, for workers that share no memory: each draws its band with
 //! `Rasterizer::draw`. Bands start at multiples of TILE rows, so that the picture is the same as in one piece.
 
-use crate::project::{MANY, Projected, TILE};
+use crate::projected::{MANY, Projected, TILE};
 
 /// Rows of the picture and what is to be seen in them; y and tiles are relative to the first row.
 #[derive(Default)]

@@ -4,7 +4,7 @@
 use std::sync::atomic::AtomicU32;
 
 use crate::constants::{ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_STOP};
-use crate::project::{Projected, TILE};
+use crate::projected::{Projected, TILE};
 use crate::simd::{Vector, c, dispatch};
 use crate::tile::{BATCH, BLOCK, BLOCKS, Batch, Hits, PIXEL_X, PIXEL_Y, Plane, opacities, swizzle};
 

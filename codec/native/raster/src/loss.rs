@@ -9,10 +9,12 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
+use crate::error::{RasterError, check_length};
+use crate::image_pair::Pair;
 use crate::parallel::parallel_for;
-use crate::scene::{RasterError, check_length};
 use crate::simd::{SimdLevel, Vector, c, dispatch};
-use crate::ssim::{ROWS, derivative_rows, gradient_rows};
+use crate::ssim::{derivative_rows, gradient_rows};
+use crate::ssim_window::ROWS;
 
 /// Means over the (weighted) pixels and channels.
 #[derive(Clone, Copy, Default, Debug, PartialEq)]
@@ -30,25 +32,6 @@ pub struct ImageLoss {
     partial: Vec<[f64; 3]>,
     /// Values of each row from the first to the last that differ.
     spans: Vec<Range<usize>>,
-}
-
-/// Two images [H, W, 3] and their weights.
-#[derive(Clone, Copy)]
-pub struct Pair<'a> {
-    pub image: &'a [f32],
-    pub target: &'a [f32],
-    pub width: usize,
-    /// [H, W]
-    pub weight: Option<&'a [f32]>,
-}
-
-impl Pair<'_> {
-    pub fn row_values(&self) -> usize {
-        3 * self.width
-    }
-    pub fn rows(&self) -> usize {
-        self.image.len() / self.row_values().max(1)
-    }
 }
 
 impl ImageLoss {

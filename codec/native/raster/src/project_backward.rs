@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use crate::backward::Sums;
-use crate::project::{Ewa, Lens, WHITEN, colour, direction, dot3, ewa};
+use crate::ewa::{Ewa, Lens, WHITEN, colour, direction, dot3, ewa};
 use crate::scene::{Gradients, Splats};
 use crate::sh;
 use crate::simd::{Vector, c, dispatch, prefetch};
@@ -226,7 +226,7 @@ fn chunk<V: Vector>(soa: &Soa, lens: &Lens, k: usize, sums: &[Row; 12], out: &mu
         colour_backward::<V>(soa, lens, k, sums, at, out);
         // d ln(sigmoid(x)) / dx = 1 - sigmoid(x)
         let logit = V::load(&soa.logits[0][at..]).max(c(-55.0));
-        let up = crate::project::exp(-logit);
+        let up = crate::ewa::exp(-logit);
         (V::load(&sums[0][at..]) * up / (c::<V>(1.0) + up)).store(&mut out.logits[0][at..]);
         let gx = s.mean2d[0] * c(0.5 * lens.full[0]);
         let gy = s.mean2d[1] * c(0.5 * lens.full[1]);

@@ -3,23 +3,27 @@
 //! All buffers are kept from picture to picture. Work is divided in ways that depend on the input only (16 pixel rows, 256
 //! Gaussians), every piece owns what it writes, and sums over pairs have a fixed order: results do not depend on the threads.
 
+mod backward_pass;
+
 use std::mem::take;
-use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::backward::{Sums, backward};
+use crate::backward::Sums;
 use crate::clock::Clock;
-use crate::forward::{Canvas, forward};
-use crate::framebuffer::{Pixels, Surface, finish, finish_empty};
-use crate::parallel::parallel_for;
-use crate::project::{Lens, Projected, TILE, project};
-use crate::project_backward::project_backward;
-use crate::scene::{Background, Gradients, MAX_PAIRS, RasterError, Region, Splats, View, check_length, check_size};
+use crate::error::RasterError;
+use crate::ewa::Lens;
+use crate::framebuffer::Surface;
+use crate::project::project;
+use crate::projected::Projected;
+use crate::region::Region;
+use crate::scene::{Background, MAX_PAIRS, Splats, View, check_size};
 use crate::simd::SimdLevel;
 use crate::sort::DepthSort;
 use crate::tile::{BLOCKS, Hits};
-use crate::tile_binning::{TileBins, Tiles};
+use crate::tile_binning::TileBins;
+use crate::tile_passes::blend_tiles;
+use crate::tile_rect::TileRect;
 
 /// Gaussians of one task.
 const SHARE: usize = 256;
@@ -228,7 +232,7 @@ impl Rasterizer {
         let start = Clock::start();
         self.sort.sort(&self.projected);
         (self.timings.bin, self.timings.blend) = (start.ms(), 0.0);
-        self.draw_tiles(&mut surface, Tiles::of(region), region, background, training)
+        self.draw_tiles(&mut surface, TileRect::of(region), region, background, training)
     }
 
     /// TileBins and blends a rectangle of tiles; in halves if that would take too much memory, but for training, which needs all
@@ -236,7 +240,7 @@ impl Rasterizer {
     fn draw_tiles(
         &mut self,
         surface: &mut Surface,
-        tiles: Tiles,
+        tiles: TileRect,
         region: Region,
         background: Background,
         training: bool,
@@ -261,142 +265,10 @@ impl Rasterizer {
         let start = Clock::start();
         let batches = self.bins.batches(self.bins.tiles.len());
         self.seen.resize(if training { batches } else { 0 }, [0; BLOCKS]);
-        self.blend(surface, region, background);
+        let (level, projected, seen) = (self.level, &self.projected, &mut self.seen);
+        blend_tiles(level, projected, &self.bins, region, background, surface, seen);
         self.timings.blend += start.ms();
         Ok(())
-    }
-
-    fn blend(&mut self, surface: &mut Surface, region: Region, background: Background) {
-        let (level, bins, projected, width) = (self.level, &self.bins, &self.projected[..], region.width);
-        let (top, left) = (bins.tiles.rows.start, bins.tiles.columns.start);
-        let pixels = top * TILE * width..(bins.tiles.rows.end * TILE).min(region.height) * width;
-        let work = (surface.part(pixels), &mut self.seen[..]);
-        let (rows, columns) = (bins.tiles.rows.len(), bins.tiles.columns.len());
-        parallel_for(
-            0..rows,
-            1,
-            work,
-            &|(band, seen), rows, middle| {
-                let (band, band_rest) = band.split_at((middle - rows.start) * TILE * width);
-                let (seen, seen_rest) = bins.cut(seen, rows.start, middle, TileBins::batches);
-                ((band, seen), (band_rest, seen_rest))
-            },
-            &|row, (mut band, mut seen)| {
-                let mut empty = left * TILE; // where the tiles without Gaussians begin that end here
-                for column in 0..columns {
-                    let t = row.start * columns + column;
-                    let range = bins.tile(t);
-                    let (own, rest) = bins.cut_tile(seen, t, TileBins::batches);
-                    seen = rest;
-                    let x = (left + column) * TILE;
-                    if range.is_empty() {
-                        continue;
-                    }
-                    finish_empty(background, empty..x, width, &mut band);
-                    empty = x + TILE;
-                    let mut canvas = Canvas::new(width - x, band.pixels() / width);
-                    let origin = [x as f32, ((top + row.start) * TILE) as f32];
-                    forward(
-                        level,
-                        projected,
-                        &bins.pairs[range.start..],
-                        range.len(),
-                        origin,
-                        &mut canvas,
-                        own,
-                    );
-                    finish(&canvas, background, x, width, &mut band);
-                }
-                finish_empty(
-                    background,
-                    empty..((left + columns) * TILE).min(width),
-                    width,
-                    &mut band,
-                );
-            },
-        );
-    }
-
-    /// Gradients of the last training picture. `grad_image` [H, W, 3], `grad_alpha` [H, W] of the region.
-    ///
-    /// # Errors
-    /// Wrong lengths, or no forward pass with `training` before.
-    pub fn backward(
-        &mut self,
-        splats: &Splats,
-        grad_image: &[f32],
-        grad_alpha: &[f32],
-        out: &mut Gradients,
-    ) -> Result<(), RasterError> {
-        splats.check()?;
-        self.run(|s| s.backward_here(splats, grad_image, grad_alpha, out))
-    }
-
-    pub(crate) fn backward_here(
-        &mut self,
-        splats: &Splats,
-        grad_image: &[f32],
-        grad_alpha: &[f32],
-        out: &mut Gradients,
-    ) -> Result<(), RasterError> {
-        out.check(splats)?;
-        let Some((lens, region, background)) = self.drawn.take() else {
-            return Err(RasterError::NothingRendered);
-        };
-        check_length(
-            "gradient of the Gaussians rendered last",
-            splats.len(),
-            self.projected.len(),
-        )?;
-        check_length("gradient of the image", grad_image.len(), 3 * region.pixels())?;
-        check_length("gradient of alpha", grad_alpha.len(), region.pixels())?;
-        let start = Clock::start();
-        self.sums.resize(self.bins.pairs.len(), Sums::ZERO);
-        self.backward_tiles(region.width, background, grad_image, grad_alpha);
-        self.timings.backward_tiles = start.ms();
-        let start = Clock::start();
-        self.backward_gaussians(splats, &lens, out);
-        self.timings.backward_project = start.ms();
-        self.drawn = Some((lens, region, background));
-        Ok(())
-    }
-
-    fn backward_tiles(&mut self, width: usize, background: Background, grad_image: &[f32], grad_alpha: &[f32]) {
-        let (level, bins, projected, seen) = (self.level, &self.bins, &self.projected[..], &self.seen[..]);
-        let pixels = Pixels {
-            image: &self.image,
-            alpha: &self.alpha,
-            grad_image,
-            grad_alpha,
-            width,
-        };
-        let cut = |sums, rows: &Range<usize>, middle| bins.cut(sums, rows.start, middle, TileBins::first);
-        let (rows, columns) = (bins.tiles.rows.len(), bins.tiles.columns.len());
-        parallel_for(0..rows, 1, &mut self.sums[..], &cut, &|row, mut sums: &mut [Sums]| {
-            for column in 0..columns {
-                let t = row.start * columns + column;
-                let (own, rest) = bins.cut_tile(sums, t, TileBins::first);
-                sums = rest;
-                if own.is_empty() {
-                    continue;
-                }
-                let (x, y) = (column * TILE, row.start * TILE);
-                let (pairs, hits) = (&bins.pairs[bins.first(t)..], &seen[bins.batches(t)..]);
-                backward(level, projected, pairs, &pixels, [x, y], background, hits, own);
-            }
-        });
-    }
-
-    fn backward_gaussians(&self, splats: &Splats, lens: &Lens, out: &mut Gradients) {
-        let n = splats.len();
-        let out = out.reborrow();
-        parallel_for(
-            0..n,
-            SHARE,
-            out,
-            &|g, range, middle| g.split_at(middle - range.start, splats.sh_k),
-            &|range, mut out| project_backward(self.level, splats, lens, &self.bins, &self.sums, range, &mut out),
-        );
     }
 }
 

@@ -1,6 +1,7 @@
 //! What goes in and out of the rasterizer: Gaussians, a view, gradients; flat slices in the layout of the Python arrays.
 
-use std::fmt;
+use crate::error::{RasterError, check_length};
+use crate::region::Region;
 
 /// N Gaussians, parameters before activation (exp, sigmoid and normalisation happen inside).
 #[derive(Clone, Copy)]
@@ -137,21 +138,6 @@ impl<'a> Gradients<'a> {
     }
 }
 
-/// A pixel rectangle of the view; what is rendered.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Region {
-    pub x: usize,
-    pub y: usize,
-    pub width: usize,
-    pub height: usize,
-}
-
-impl Region {
-    pub fn pixels(&self) -> usize {
-        self.width * self.height
-    }
-}
-
 /// A pinhole camera (OpenCV axes, pixel centres at half-integers) and the part of its image that is wanted.
 #[derive(Clone, Copy, Debug)]
 pub struct View {
@@ -198,48 +184,6 @@ pub const MAX_GAUSSIANS: usize = 1 << 26;
 /// Gaussian-tile pairs of one image; 2^28 of them take 16 GB in training.
 pub const MAX_PAIRS: usize = 1 << 28;
 
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum RasterError {
-    Shape {
-        name: &'static str,
-        expected: usize,
-        got: usize,
-    },
-    Region {
-        region: Region,
-        width: usize,
-        height: usize,
-    },
-    TooMany {
-        what: &'static str,
-        limit: usize,
-    },
-    NothingRendered,
-}
-
-impl fmt::Display for RasterError {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        match self {
-            RasterError::Shape { name, expected, got } => write!(f, "{name} has {got} values, expected {expected}"),
-            RasterError::Region {
-                region: r,
-                width,
-                height,
-            } => write!(
-                f,
-                "region {}x{} at ({}, {}) is empty or not inside of the {width}x{height} image",
-                r.width, r.height, r.x, r.y
-            ),
-            RasterError::TooMany { what, limit } => write!(f, "more than {limit} {what}"),
-            RasterError::NothingRendered => {
-                write!(f, "backward without a forward pass of these Gaussians and this view")
-            }
-        }
-    }
-}
-
-impl std::error::Error for RasterError {}
-
 /// See `View::check`.
 pub(crate) fn check_size(r: Region, width: usize, height: usize) -> Result<(), RasterError> {
     let inside = r.x.saturating_add(r.width) <= width && r.y.saturating_add(r.height) <= height;
@@ -257,12 +201,4 @@ pub(crate) fn check_size(r: Region, width: usize, height: usize) -> Result<(), R
         });
     }
     Ok(())
-}
-
-pub(crate) fn check_length(name: &'static str, got: usize, expected: usize) -> Result<(), RasterError> {
-    if got == expected {
-        Ok(())
-    } else {
-        Err(RasterError::Shape { name, expected, got })
-    }
 }

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
-use crate::project::Projected;
+use crate::projected::Projected;
 
 const DIGIT: u32 = 11;
 const BUCKETS: usize = 1 << DIGIT;

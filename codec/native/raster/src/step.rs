@@ -6,9 +6,11 @@
 use rayon::prelude::*;
 
 use crate::clock::Clock;
-use crate::loss::{ImageLoss, LossValue, Pair};
+use crate::error::{RasterError, check_length};
+use crate::image_pair::Pair;
+use crate::loss::{ImageLoss, LossValue};
 use crate::rasterizer::Rasterizer;
-use crate::scene::{Background, Gradients, RasterError, Splats, View, check_length};
+use crate::scene::{Background, Gradients, Splats, View};
 
 /// What the picture of a view should be: [H, W, 3], [H, W] and [H, W] of the whole image, not of the region.
 #[derive(Clone, Copy)]

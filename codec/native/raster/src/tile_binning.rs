@@ -4,15 +4,15 @@
 //! (tile, chunk) its place, and the chunks fill in parallel; the places do not depend on the threads. In the chunk's list the
 //! places then replace the tiles: from them the backward pass gathers the gradients of a Gaussian in a fixed order.
 
-use std::ops::Range;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
-use crate::project::{MANY, Projected, SLACK, TILE};
-use crate::scene::{RasterError, Region};
+use crate::error::RasterError;
+use crate::projected::{MANY, Projected};
 use crate::simd::prefetch;
-use crate::tile::{BATCH, Ellipse, reach};
+use crate::tile::BATCH;
+use crate::tile_rect::{TileRect, for_tiles};
 
 /// Chunks of the sorted order; bounds the parallelism of binning. Few Gaussians have fewer, but not fewer than the least:
 /// each chunk has a counter a tile.
@@ -29,59 +29,9 @@ const HIDDEN: u32 = u32::MAX;
 /// Items between a prefetch and its use.
 const AHEAD: usize = 12;
 
-/// A rectangle of tiles.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Tiles {
-    pub columns: Range<usize>,
-    pub rows: Range<usize>,
-}
-
-impl Tiles {
-    /// Those that cover a region.
-    pub fn of(region: Region) -> Tiles {
-        Tiles {
-            columns: 0..region.width.div_ceil(TILE),
-            rows: 0..region.height.div_ceil(TILE),
-        }
-    }
-
-    pub fn len(&self) -> usize {
-        self.columns.len() * self.rows.len()
-    }
-
-    /// Two halves, none of a single tile.
-    pub fn halves(&self) -> Option<[Tiles; 2]> {
-        let half = |r: &Range<usize>| (r.start..r.start + r.len() / 2, r.start + r.len() / 2..r.end);
-        let (columns, rows) = (self.columns.clone(), self.rows.clone());
-        if rows.len() > 1 {
-            let (top, bottom) = half(&rows);
-            let left = columns.clone();
-            Some([
-                Tiles {
-                    columns: left,
-                    rows: top,
-                },
-                Tiles { columns, rows: bottom },
-            ])
-        } else if columns.len() > 1 {
-            let (left, right) = half(&columns);
-            let all = rows.clone();
-            Some([
-                Tiles {
-                    columns: left,
-                    rows: all,
-                },
-                Tiles { columns: right, rows },
-            ])
-        } else {
-            None
-        }
-    }
-}
-
 #[derive(Default)]
 pub struct TileBins {
-    pub tiles: Tiles,
+    pub tiles: TileRect,
     /// [tiles + 1] first pair of each tile
     pub starts: Vec<u32>,
     /// Gaussian of each pair
@@ -91,45 +41,6 @@ pub struct TileBins {
     /// of each chunk: for each Gaussian the positions of its pairs in `pairs`, << 1, with 1 added to the last; or NOWHERE
     lists: Vec<Vec<u32>>,
     cursors: Vec<u32>, // [chunks, tiles]
-}
-
-/// Calls `visit(tile)` for those of the tiles that the ellipse of `p` meets at pixel centres.
-#[inline(always)]
-fn for_tiles(p: &Projected, tiles: &Tiles, mut visit: impl FnMut(usize)) {
-    let [x0, x1, y0, y1] = p.tiles.map(usize::from);
-    let (x0, y0) = (x0.max(tiles.columns.start), y0.max(tiles.rows.start));
-    let (x1, y1) = (x1.min(tiles.columns.end - 1), y1.min(tiles.rows.end - 1));
-    let start = |row: usize| (row - tiles.rows.start) * tiles.columns.len();
-    if p.met != MANY {
-        let first = [usize::from(p.tiles[0]), usize::from(p.tiles[2])];
-        for row in y0..=y1 {
-            for column in x0..=x1 {
-                if p.met >> (2 * (row - first[1]) + column - first[0]) & 1 == 1 {
-                    visit(start(row) + column - tiles.columns.start);
-                }
-            }
-        }
-        return;
-    }
-    let ellipse = Ellipse {
-        l11: p.l11,
-        l21: p.l21,
-        l22: p.l22,
-        reach: reach(p.log2_opacity),
-    };
-    let peak = ellipse.peak();
-    let tile = |v: f32| v.max(0.0) as usize / TILE;
-    for row in y0..=y1 {
-        let top = (row * TILE) as f32 + 0.5 - p.y;
-        let (met, left, right) = ellipse.span(peak, top, top + (TILE - 1) as f32);
-        if met {
-            let first = tile(p.x + left / p.l11 - SLACK + 0.5);
-            let last = tile(p.x + right / p.l11 + SLACK - 0.5);
-            for column in first.max(x0)..=last.min(x1) {
-                visit(start(row) + column - tiles.columns.start);
-            }
-        }
-    }
 }
 
 /// Makes room for `more` entries; by a quarter, since twice as much would be felt in the memory of a picture.
@@ -143,7 +54,7 @@ fn grow(list: &mut Vec<u32>, more: usize) {
 /// A Gaussian's entries of a chunk's list, tile << 1 | last, from `used` on; counts them. Returns their end. There is room for
 /// FEW, and no branch for those that are met: which ones cannot be foretold.
 #[inline(always)]
-fn append(p: &Projected, tiles: &Tiles, count: &mut [u32], list: &mut Vec<u32>, used: usize) -> usize {
+fn append(p: &Projected, tiles: &TileRect, count: &mut [u32], list: &mut Vec<u32>, used: usize) -> usize {
     let [x0, x1, y0, y1] = p.tiles.map(usize::from);
     let inside = x0 >= tiles.columns.start && x1 < tiles.columns.end && y0 >= tiles.rows.start && y1 < tiles.rows.end;
     let mut end = used;
@@ -266,7 +177,7 @@ impl TileBins {
         &mut self,
         projected: &[Projected],
         sorted: &[AtomicU64],
-        rectangle: Tiles,
+        rectangle: TileRect,
         limit: usize,
     ) -> Result<(), RasterError> {
         let tiles = rectangle.len();

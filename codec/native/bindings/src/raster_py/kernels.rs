@@ -4,7 +4,7 @@ use numpy::{PyArray1, prelude::*};
 use pyo3::prelude::*;
 use raster::{Adam, ImageLoss, Pair, SimdLevel};
 
-use super::{In, InOut, contiguous, level, usage};
+use super::arrays::{In, InOut, contiguous, level, usage};
 
 /// (loss, l1, mse, ssim, gradient [H * W * 3]) of an image [H, W, 3].
 #[pyfunction]

@@ -1,7 +1,8 @@
 //! What the host wants to know, as JSON.
 
 use gsv::container::config::{COLOR_SPACES, Camera, Config, SH_FRAMES, UP_AXES};
-use gsv::container::demux::{Demuxer, Entry};
+use gsv::container::demux::Demuxer;
+use gsv::container::entry::Entry;
 use gsv::header::Header;
 use std::fmt::Write;
 

@@ -4,22 +4,12 @@
 //! can seek asks `skippable` and leaves it out. Waiting for more bytes is a state, not an error.
 
 use super::config::Config;
+use super::entry::{Entry, name};
 use super::isobmff::{self, Track};
 use crate::error::{Error, Result};
 
 /// Largest box that is read as a whole.
 const HEADER_BOX_MAX: u64 = 16 << 20;
-
-/// A group in the file.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Entry {
-    /// Of the sample's first byte, from the start of the file.
-    pub offset: u64,
-    pub size: u64,
-    pub start_frame: u64,
-    pub frames: u32,
-    pub sync: bool,
-}
 
 enum State {
     /// Collecting the header of a box.
@@ -303,9 +293,4 @@ impl Demuxer {
         self.pending = isobmff::moof(body, track, start)?;
         Ok(())
     }
-}
-
-/// For messages.
-pub fn name(kind: &[u8; 4]) -> String {
-    format!("{} box", kind.escape_ascii())
 }

@@ -1,7 +1,7 @@
 //! What is inside ftyp, moov, moof and sidx (spec 2.1 to 2.5): the parts that a reader needs, other boxes are skipped.
 
 use super::config::Config;
-use super::demux::{Entry, name};
+use super::entry::{Entry, name};
 use super::write::BRAND;
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader};

@@ -4,6 +4,7 @@
 
 pub mod config;
 pub mod demux;
+pub mod entry;
 mod isobmff;
 pub mod whole;
 pub mod write;

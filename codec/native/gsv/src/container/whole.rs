@@ -3,7 +3,8 @@
 //! Where the boxes of a fragment are damaged, the walk from box to box ends; with an index (spec 2.5) that agrees so far it
 //! goes on at the next fragment.
 
-use super::demux::{Demuxer, Entry};
+use super::demux::Demuxer;
+use super::entry::Entry;
 use crate::error::{Error, Result};
 
 /// Groups that are taken from the index: a file with more damage is no file of ours, and each costs a walk.

@@ -1,6 +1,7 @@
 //! The rasterizer as a whole: its levels against each other, and its memory.
 
 use super::*;
+use crate::scene::Gradients;
 
 /// `n` round splats of the given scale on a line that winds through the view, and a camera of size x size pixels.
 fn draw(n: usize, log_scale: f32, size: usize, training: bool) -> Rasterizer {

@@ -6,7 +6,7 @@
 use std::array::from_fn;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
 
-use super::{MAGIC, Vector, exp2_poly, exp2_polys};
+use super::vector::{MAGIC, Vector, exp2_poly, exp2_polys};
 
 const LANES: usize = 4;
 
