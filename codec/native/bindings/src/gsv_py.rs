@@ -89,13 +89,13 @@ fn code_turns<'py>(
             p.len()
         ));
     }
-    let turns = gsv::rotation_residuals::RotationResiduals {
+    let residuals = gsv::rotation_residuals::RotationResiduals {
         quats: quats.as_chunks().0,
         steps: steps.as_chunks().0,
-        worth: worth.as_chunks().0,
+        error_bits: worth.as_chunks().0,
         lengths,
     };
-    let coded = py.detach(|| turns.code(&gsv::neighbors::nearest(&p)));
+    let coded = py.detach(|| residuals.quantize(&gsv::neighbors::nearest(&p)));
     let integers: Vec<i32> = coded.iter().flat_map(|c| c.integers).collect();
     let forms: Vec<u8> = coded.iter().map(|c| c.form).collect();
     Ok((

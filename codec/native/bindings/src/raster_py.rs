@@ -1,5 +1,7 @@
-//! `_native.Rasterizer`: numpy arrays in, numpy arrays out. Parameters come as the tuple (means, quats, log_scales,
-//! logit_opacities, sh0, shN), f32 and contiguous; gradients as those and (grad2d, max_weight, sum_weight), written in place.
+//! `_native.Rasterizer`: numpy arrays in, numpy arrays out.
+//!
+//! Parameters are the tuple (means, quats, log_scales, logit_opacities, sh0, shN), f32 and contiguous. Gradients are a tuple
+//! of the same shapes and (grad2d, max_weight, sum_weight), written in place.
 
 mod arrays;
 mod kernels;
@@ -151,9 +153,9 @@ impl Rasterizer {
             .map_err(usage)
     }
 
-    /// One step on a batch of crops: of each (loss, l1, mse, ssim, mask, gradient of the gain), and [N] the largest radii. The
-    /// gradients are those of the sum of the losses. A crop is (view, (background, gain or None), (rgb, alpha or None, weight
-    /// or None)).
+    /// One training step on a batch of crops. Returns for each crop (loss, l1, mse, ssim, mask, gradient of the gain), and
+    /// [N] the largest radii. The gradients are those of the sum of the losses. A crop is (view, (background, gain or None),
+    /// (rgb, alpha or None, weight or None)).
     fn step<'py>(
         &mut self,
         py: Python<'py>,
@@ -196,7 +198,7 @@ impl Rasterizer {
         Ok((values, PyArray1::from_vec(py, radii)))
     }
 
-    /// Draws and returns the picture as 8 bits, flat.
+    /// Renders to 8-bit colour, flat.
     fn draw<'py>(
         &mut self,
         py: Python<'py>,
@@ -213,7 +215,7 @@ impl Rasterizer {
         Ok(PyArray1::from_vec(py, out.into_flattened()))
     }
 
-    /// The picture of the last pass.
+    /// (image, alpha) of the last pass, flat.
     fn picture<'py>(&self, py: Python<'py>) -> Picture<'py> {
         (
             PyArray1::from_slice(py, self.inner.image()),
@@ -221,7 +223,7 @@ impl Rasterizer {
         )
     }
 
-    /// [N] larger half side of each ellipse's box in pixels, 0 for the invisible, and [N] depths.
+    /// [N] larger half side of the box of each Gaussian in pixels, 0 if invisible, and [N] depths.
     fn radii<'py>(&self, py: Python<'py>) -> Picture<'py> {
         let projected = self.inner.projected();
         (

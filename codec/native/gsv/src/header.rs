@@ -1,7 +1,7 @@
-//! Group header (spec 4): what a group holds and how to dequantize it, and the caps it must keep (spec 5).
+//! Group header (spec 4): what a group holds and how to dequantize it, and the caps that it must keep (spec 5).
 //!
-//! A predicted group has the grid, the attributes and the layers of the group that it refers to, so its header is read and
-//! written with that group's header at hand.
+//! A predicted group shares grid, attributes and layers with its reference, so its header is read and written with the
+//! header of the reference.
 
 mod syntax;
 
@@ -10,13 +10,13 @@ use crate::companding::Companding;
 use crate::error::Result;
 use crate::levels::Level;
 
-/// Channels with a curve: those of log_scales, and logit_opacities.
+/// Channels that may be companded: those of log_scales, and logit_opacities.
 pub const COMPANDED_CHANNELS: usize = 4;
-/// Levers of the header are in units of 1 / SCALE_EXPONENT_UNIT.
+/// Scale exponents are integers in units of 1 / SCALE_EXPONENT_UNIT.
 pub const SCALE_EXPONENT_UNIT: f32 = 32.0;
-/// Low bits that a layer may leave out.
+/// Most low bits that a layer may leave out.
 pub const SHIFT_MAX: u8 = 15;
-/// Layers of a group.
+/// Most layers of a group.
 pub const LAYERS_MAX: usize = 16;
 
 /// Dequantization of the channels of one attribute: value = offset + step * integer.
@@ -34,7 +34,7 @@ pub struct TrajectoryHeader {
     pub step: f32,
 }
 
-/// Coarse motion of the group.
+/// Header of the nodes, which carry the coarse motion of the group.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct NodeHeader {
     pub count: u32,
@@ -48,7 +48,7 @@ pub struct NodeHeader {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct LayerHeader {
     pub count: u32,
-    /// Those that the group codes itself, behind the survivors of the reference; all of an independent group.
+    /// Gaussians that are not in the reference; in an independent group all.
     pub births: u32,
 }
 
@@ -61,7 +61,7 @@ impl LayerHeader {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Header {
     pub frames: u16,
-    /// How many groups back the one is whose canonical integers this one takes; 0: independent.
+    /// The reference is this many groups back; 0: independent.
     pub reference: u16,
     pub origin: [f32; 3],
     pub grid_step: f32,
@@ -70,11 +70,13 @@ pub struct Header {
     pub layers: Vec<LayerHeader>,
     /// In the order of `Attribute::canonical(sh_degree)`.
     pub scales: Vec<Scale>,
-    /// Of each channel of quats: how its step falls with each of the log_scales, in octaves, times `SCALE_EXPONENT_UNIT`.
+    /// [channel of quats][channel of log_scales]: the step of the channel is divided by 2^(scale_exponent /
+    /// SCALE_EXPONENT_UNIT * log_scale).
     pub scale_exponents: [[i8; 3]; 3],
-    /// Of each layer: how many low bits of positions, then of each attribute's integers, are 0 and not coded. Empty: none.
+    /// Of each layer: number of low bits of positions, then of the integers of each attribute, that are 0 and not coded.
+    /// Empty: 0.
     pub shifts: Vec<[u8; 6]>,
-    /// Of the channels of log_scales, then of logit_opacities. None: their values are as they are coded.
+    /// Of the channels of log_scales, then of logit_opacities. None: no companding.
     pub companding: Option<[Companding; COMPANDED_CHANNELS]>,
     pub trajectories: Vec<TrajectoryHeader>,
     /// `count` 0: none.
@@ -91,13 +93,13 @@ impl Header {
         self.layers.iter().map(|l| u64::from(l.count)).sum()
     }
 
-    /// Low bits that layer `k` leaves out of an attribute's integers, `Means`: of positions.
+    /// Low bits that layer `k` leaves out of the integers of an attribute; `Means`: of positions.
     pub fn shift(&self, k: usize, attribute: Attribute) -> u32 {
         let own = self.shifts.get(k).and_then(|s| s.get(attribute as usize - 1));
         own.map_or(0, |s| u32::from(*s))
     }
 
-    /// Of the channels of an attribute; empty if they have none.
+    /// Companding of the channels of an attribute; empty: none.
     pub fn companding_of(&self, attribute: Attribute) -> &[Companding] {
         let all = self.companding.as_ref().map_or(&[][..], |c| &c[..]);
         match attribute {
@@ -107,7 +109,7 @@ impl Header {
         }
     }
 
-    /// Symbols known from the header (spec 5), after all caps were found to be kept.
+    /// Checks the caps; returns the symbols that the header announces (spec 5).
     pub fn check(&self, level: &Level, reference: Option<&Header>) -> Result<u64> {
         let unit = "group header";
         let (count, nodes) = (self.count(), u64::from(self.nodes.count));
@@ -126,7 +128,7 @@ impl Header {
         Ok(symbols)
     }
 
-    /// Gaussians of the reference that the deaths unit of layer `k` speaks about; 0: there is no such unit.
+    /// Gaussians of the reference that the deaths unit of layer `k` codes; 0: there is no such unit.
     pub fn candidates(&self, k: usize, reference: Option<&Header>) -> u64 {
         let before = reference.filter(|_| self.reference > 0).and_then(|r| r.layers.get(k));
         match (self.layers.get(k), before) {

@@ -1,22 +1,23 @@
-//! The nodes nearest to points (spec 13.2), exactly: a run of points shares the few nodes that can be near any of them.
+//! Nearest nodes of points (spec 13.2), exact: a run of points shares the few nodes that can be nearest to any of them.
 //!
-//! Gaussians come in Morton order, so runs are compact. A node is of interest to a run if it is no farther from the box around
-//! it than enough nodes are from every point of the box; the same again for the short runs of which it consists. Where a hostile file makes boxes useless (all nodes on a sphere, all
-//! Gaussians around its centre) that is all nodes for all points, which the level caps (spec 5).
-//! Coordinates are below 2^21: sums of squares of their differences are exact in f64, which vectorizes.
+//! Gaussians come in Morton order, so runs are compact. A node is a candidate of a run if its distance to the bounding box
+//! is at most the distance within which every point of the box has enough nodes; the same test is repeated for short runs.
+//! In the worst case (a hostile file with all nodes on a sphere and all Gaussians around its centre) every node stays a
+//! candidate of every point; the level caps that cost (spec 5). Coordinates are below 2^21, so sums of squared differences
+//! are exact in f64, which vectorizes.
 
 /// Nodes that may move a Gaussian (spec 4).
 pub const NEIGHBORS_MAX: usize = 8;
 
-pub type Neighbor = (u64, u32); // squared distance, index of the node
+pub type Neighbor = (u64, u32); // (squared distance, index of the node)
 const FAR: Neighbor = (u64::MAX, u32::MAX);
-/// Most neighbours that are asked for: one more than there are weights.
+/// Most nodes that a search returns: one more than there are weights.
 const NEAREST_MAX: usize = NEIGHBORS_MAX + 1;
 
 /// Points of a short run.
 const SHORT: usize = 16;
 
-/// Coordinates of nodes, axis by axis, and their numbers.
+/// Coordinates of nodes, axis by axis, and their indices.
 #[derive(Default)]
 struct NodeTable {
     axes: [Vec<f64>; 3],
@@ -29,7 +30,7 @@ impl NodeTable {
         self.index.push(index);
     }
 
-    /// Sums over the axes of the squares of `f` into `out`.
+    /// `out`: the sum over the axes of f(axis, coordinate)^2, for each node.
     #[inline]
     fn sums(&self, out: &mut Vec<f64>, f: impl Fn(usize, f64) -> f64) {
         out.clear();
@@ -42,7 +43,7 @@ impl NodeTable {
         }
     }
 
-    /// Into `few` those among which the `count` nearest to each of `points` are. `d`: space for distances.
+    /// `few`: the candidates, among which are the `count` nearest nodes of each of `points`. `d`: scratch space.
     fn near(&self, points: &[[u32; 3]], count: usize, d: &mut Vec<f64>, few: &mut NodeTable) {
         let bounds = |a: usize| {
             points
@@ -73,7 +74,7 @@ pub struct NodeSearch {
 }
 
 impl NodeSearch {
-    /// For the `count` nearest, 1 to `NEIGHBORS_MAX + 1`.
+    /// A search for the `count` nearest nodes, 1 to `NEIGHBORS_MAX + 1`.
     pub fn new(nodes: &[[u32; 3]], count: usize) -> Self {
         let mut all = NodeTable::default();
         nodes.iter().zip(0..).for_each(|(n, i)| all.push(n.map(f64::from), i));
@@ -83,8 +84,8 @@ impl NodeSearch {
         }
     }
 
-    /// Calls `found` with the nearest nodes of each point by (squared distance, index); places beyond the number of nodes hold
-    /// the maximum.
+    /// Calls `found` for each point with its nearest nodes, sorted by (squared distance, index); places beyond the number of
+    /// nodes hold `FAR`.
     pub fn run(&self, points: &[[u32; 3]], mut found: impl FnMut(&[Neighbor])) {
         let (mut d, mut some, mut few) = (Vec::new(), NodeTable::default(), NodeTable::default());
         self.nodes.near(points, self.count, &mut d, &mut some);
@@ -105,7 +106,7 @@ impl NodeSearch {
     }
 }
 
-/// Into a sorted list, whose last item goes.
+/// Inserts into a sorted list; the last item is dropped.
 #[inline]
 fn insert<T: PartialOrd>(list: &mut [T], mut new: T) {
     for item in list {

@@ -1,9 +1,9 @@
 //! Positions (spec 8): a sorted multiset of grid points <-> bins.
 //!
-//! An octree, breadth first, whose nodes know how many points they hold: emptiness, single points and duplicates are all
-//! one question, how many are in the lower half. Contexts ask where the face neighbours have their points. A point
-//! with few neighbours leaves the tree, since next to nothing is known about its remaining bits. Many points are two
-//! trees, so that two threads decode them.
+//! An octree, breadth first, whose nodes know how many points they hold. One question, how many points are in the lower
+//! half, codes emptiness, single points and duplicates; its contexts are the points of the face neighbours. A point with few
+//! neighbours leaves the tree and its remaining bits are coded plainly, since they can hardly be predicted. Many points are
+//! coded as two trees, so that two threads decode them.
 
 mod octree;
 mod split;
@@ -12,10 +12,10 @@ use crate::range_coder::{Bins, Decoder, Encoder};
 use octree::{Children, Node, link};
 use split::{Coder, Seen, Split, seen};
 
-const LONELY: usize = 2; // face neighbours of a point that leaves the tree, at most
-const SPLIT_FROM: u32 = 1 << 14; // points that are two trees
+const LONELY: usize = 2; // most face neighbours of a point that leaves the tree
+const SPLIT_FROM: u32 = 1 << 14; // from this many points on there are two trees
 
-/// The payload of points of `bits` bits an axis, given by their sorted Morton codes.
+/// Encodes points of `bits` bits per axis, given as sorted Morton codes.
 pub fn encode(points: &[u64], bits: u32) -> Vec<u8> {
     let tree = |points: &[u64]| {
         let mut c = Encoder::default();
@@ -30,7 +30,7 @@ pub fn encode(points: &[u64], bits: u32) -> Vec<u8> {
     [&(first.len() as u32).to_be_bytes()[..], &first, &second].concat()
 }
 
-/// Sorted Morton codes of the `count` points of a payload, or what is wrong with it.
+/// Decodes `count` points; returns their sorted Morton codes, or what was expected of the payload.
 pub fn decode(payload: &[u8], count: u32, bits: u32) -> Result<Vec<u64>, &'static str> {
     let tree = |payload: &[u8], count: u32| {
         let mut c = Decoder::new(payload);
@@ -51,12 +51,13 @@ pub fn decode(payload: &[u8], count: u32, bits: u32) -> Result<Vec<u64>, &'stati
     Ok(points)
 }
 
-/// Points of the first of two trees; None: there is one.
+/// Number of points in the first of two trees; None: one tree.
 fn halves_of(count: u32) -> Option<u32> {
     (count >= SPLIT_FROM).then_some(count / 2)
 }
 
-/// Codes `count` points of `bits` bits an axis as one tree. `points`: their sorted Morton codes (encoder). Returns these.
+/// Codes `count` points of `bits` bits per axis as one tree. `points`: their sorted Morton codes, in the decoder empty.
+/// Returns the codes.
 fn code<C: Bins>(c: &mut C, points: &[u64], count: u32, bits: u32) -> Vec<u64> {
     let mut out = Vec::with_capacity(count as usize);
     let mut coder = Coder::new(c);
@@ -76,7 +77,7 @@ fn code<C: Bins>(c: &mut C, points: &[u64], count: u32, bits: u32) -> Vec<u64> {
 }
 
 impl<C: Bins> Coder<'_, C> {
-    /// Splits the nodes of one level, of which `rest` bits an axis are unknown; the next level.
+    /// Splits the nodes of one level, of which `rest` bits per axis are unknown; returns the next level.
     fn level(&mut self, level: &[Node], points: &[u64], rest: u32, out: &mut Vec<u64>) -> Vec<Node> {
         let mut known: Vec<Seen> = Vec::with_capacity(level.len());
         let mut children: Vec<Children> = Vec::with_capacity(level.len());

@@ -1,20 +1,20 @@
 //! Trajectories (spec 11, 12): DCT-II coefficients of Gaussians or nodes <-> bins.
 //!
-//! Most Gaussians have none, so storage is sparse: coding, keeping and evaluating cost what is there.
+//! Most Gaussians have no coefficients, so storage is sparse: time and memory are proportional to the coefficients present.
 
 use crate::model::Model;
 use crate::neighbors::{NEAR, Near};
 use crate::range_coder::Bins;
 use crate::values::ValueModel;
 
-const LENGTHS: usize = 32; // lengths with a model of their own
-const BLOCK: usize = 16; // indices that one bin says to have no coefficients at all
+const LENGTHS: usize = 32; // lengths with contexts of their own
+const BLOCK: usize = 16; // indices that share a bin: 0 if none of them has coefficients
 
 /// Coefficients of N Gaussians or nodes, `channels` values each, lowest frequency first.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Trajectories {
     pub channels: usize,
-    /// N + 1 places, in coefficients: those of i are `start[i]..start[i + 1]`.
+    /// N + 1 offsets, in coefficients: those of i are `start[i]..start[i + 1]`.
     start: Vec<u32>,
     /// `channels` values per coefficient.
     values: Vec<i32>,
@@ -38,7 +38,7 @@ impl Trajectories {
         }
     }
 
-    /// Appends one Gaussian: `coefficients` holds its values, `channels` per coefficient; zeros at the end are left out.
+    /// Appends one Gaussian. `coefficients`: `channels` values per coefficient; trailing zeros are dropped.
     pub fn push(&mut self, coefficients: &[i32]) {
         let used = coefficients
             .iter()
@@ -48,7 +48,7 @@ impl Trajectories {
         self.start.push((self.values.len() / self.channels.max(1)) as u32);
     }
 
-    /// Those of `count` Gaussians from `first` on.
+    /// The trajectories of `count` Gaussians from `first` on.
     pub fn part(&self, first: usize, count: usize) -> Trajectories {
         let mut out = Trajectories::new(self.channels);
         (first..first + count).for_each(|i| out.push(self.get(i)));
@@ -79,7 +79,7 @@ impl Trajectories {
         self.values.len()
     }
 
-    /// The values of `i`, `channels` per coefficient; none if there is no `i`.
+    /// The values of `i`, `channels` per coefficient; empty if there is no `i`.
     #[inline]
     pub fn get(&self, i: usize) -> &[i32] {
         let place = |i: usize| self.start.get(i).map(|s| *s as usize * self.channels);
@@ -89,13 +89,13 @@ impl Trajectories {
         }
     }
 
-    /// Number of coefficients of the longest.
+    /// The largest number of coefficients.
     pub fn max_length(&self) -> usize {
         self.start.windows(2).map(|w| (w[1] - w[0]) as usize).max().unwrap_or(0)
     }
 }
 
-/// How values are told apart.
+/// Chooses the contexts of the values.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     Gaussians,
@@ -114,13 +114,14 @@ impl Kind {
 /// Why decoding stopped.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Stop {
-    /// A forbidden value, or the payload is over.
+    /// A forbidden value was read, or the payload is over.
     Broken,
-    /// More symbols than allowed.
+    /// More symbols than the budget.
     Symbols,
 }
 
-/// Codes trajectories of up to `k_max` coefficients. Decoding takes at most `budget` values; `source` is the encoder's input.
+/// Codes trajectories of at most `k_max` coefficients. `source`: the trajectories to encode, in the decoder empty; `budget`:
+/// most values to decode.
 pub fn code<C: Bins>(
     c: &mut C,
     kind: Kind,
@@ -136,7 +137,7 @@ pub fn code<C: Bins>(
         values: ValueModel::new(if kind == Kind::Node { 24 } else { 12 }),
     };
     let mut out = Trajectories::new(channels);
-    let mut before = [false; 2]; // whether blocks have any, the last one first
+    let mut before = [false; 2]; // whether the two blocks before have coefficients, the last one first
     for (block, near) in near.chunks(BLOCK).enumerate() {
         let own = block * BLOCK..block * BLOCK + near.len();
         let any = coder.any(c, own.clone().any(|i| !source.get(i).is_empty()), before);
@@ -169,7 +170,7 @@ struct Coder {
 }
 
 impl Coder {
-    /// Whether any of a block has coefficients.
+    /// Codes whether any Gaussian of a block has coefficients.
     fn any<C: Bins>(&mut self, c: &mut C, want: bool, before: [bool; 2]) -> bool {
         let [last, other] = before.map(usize::from);
         let first = 16 * LENGTHS; // contexts of its own

@@ -8,7 +8,7 @@ use crate::simd::{SimdLevel, Vector, c, dispatch};
 /// Values of one task.
 const SHARE: usize = 1 << 14;
 
-/// What all values of an attribute share in a step.
+/// Parameters of one step, the same for all values of an attribute.
 #[derive(Clone, Copy, Debug)]
 pub struct Adam {
     pub betas: [f32; 2],

@@ -4,16 +4,16 @@ use crate::projected::TILE;
 use crate::scene::Background;
 use crate::tile::{Plane, swizzle};
 
-/// State of the pixels of a tile.
+/// Per-pixel state of the backward pass over one tile.
 pub struct Adjoint {
     /// Starts at 1 (0 outside of the image).
     pub transmittance: Plane,
     pub remainder: Plane,
-    /// Gradient by the blended colours.
+    /// Gradient with respect to the blended colours.
     pub rgb: [Plane; 3],
 }
 
-/// A rendered region and the gradient of the loss by it.
+/// A rendered region and the gradient of the loss with respect to it.
 pub struct Pixels<'a> {
     pub image: &'a [f32],
     pub alpha: &'a [f32],

@@ -1,9 +1,9 @@
-//! Ellipses of a picture -> those of each of k bands of rows, for workers that share no memory: each draws its band with
-//! `Rasterizer::draw`. Bands start at multiples of TILE rows, so that the picture is the same as in one piece.
+//! Splits the projected Gaussians of an image into k bands of rows, for workers that share no memory: each worker draws its
+//! band with `Rasterizer::draw`. Bands start at multiples of TILE rows, so the pixels are the same as without bands.
 
 use crate::projected::{MANY, Projected, TILE};
 
-/// Rows of the picture and what is to be seen in them; y and tiles are relative to the first row.
+/// Rows of the image and the Gaussians that meet them; y and tiles count from the first row of the band.
 #[derive(Default)]
 pub struct Band {
     pub first: usize,
@@ -11,14 +11,14 @@ pub struct Band {
     pub splats: Vec<Projected>,
 }
 
-/// Buffers are kept from picture to picture.
+/// Splits images into bands; keeps its buffers from image to image.
 #[derive(Default)]
 pub struct Bands {
     pub bands: Vec<Band>,
     load: Vec<f32>, // of each row of tiles
 }
 
-/// What a tile costs besides its Gaussians, in Gaussians.
+/// Cost of an empty tile, in Gaussians.
 const TILE_COST: f32 = 8.0;
 
 impl Bands {

@@ -13,7 +13,7 @@ use crate::soa::{Soa, load_rows};
 /// u^2 = log2(e)/2 * (whitened distance)^2
 pub const WHITEN: f32 = 0.5 * std::f32::consts::LOG2_E;
 
-/// The view with what all Gaussians need of it.
+/// The view, and constants derived from it that all Gaussians need.
 pub struct Lens {
     pub rotation: [[f32; 3]; 3],
     pub translation: [f32; 3],
@@ -45,7 +45,7 @@ impl Lens {
     }
 }
 
-/// Everything between the parameters and the 2-D covariance; the backward pass computes it again.
+/// Everything between the parameters and the 2-D covariance.
 pub struct Ewa<V: Vector> {
     pub p: [V; 3], // camera space
     pub inv_z: V,

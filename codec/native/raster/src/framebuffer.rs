@@ -1,4 +1,4 @@
-//! Between tiles, whose pixels lie block by block, and images, whose pixels lie row by row.
+//! Finished tiles, stored block by block -> rows of an image, as floats or as 8-bit colour.
 
 use std::ops::Range;
 
@@ -8,7 +8,7 @@ use crate::projected::TILE;
 use crate::region::Region;
 use crate::scene::Background;
 
-/// What is drawn on: rows of pixels of the region, as floats or, for viewers, as bytes without a float image in between.
+/// The pixels of the rendered region, in rows. Viewers draw straight to bytes, without a float image in between.
 pub enum Surface<'a> {
     /// [H, W, 3] and [H, W]
     Floats {
@@ -78,7 +78,7 @@ impl<'a> Surface<'a> {
         }
     }
 
-    /// Writes as many pixels from `at` on as `columns` says.
+    /// Writes `columns` pixels from index `at` on.
     #[inline(always)]
     fn put(&mut self, at: usize, columns: usize, rgb: &[[f32; 3]; TILE], opacity: &[f32; TILE]) {
         let (rgb, opacity) = (&rgb[..columns], &opacity[..columns]);
@@ -101,14 +101,14 @@ impl<'a> Surface<'a> {
     }
 }
 
-/// 0 to 1 -> 0 to 255, rounded. The sum with 2^23 leaves the integer in the low bits, which WebAssembly engines do faster than
-/// to convert.
+/// 0 to 1 -> 0 to 255, rounded. Adding 2^23 leaves the integer in the low bits, which is faster than a conversion in
+/// WebAssembly engines.
 #[inline(always)]
 fn byte(v: f32) -> u8 {
     (v.clamp(0.0, 1.0) * 255.0 + 8_388_608.0).to_bits() as u8
 }
 
-/// Writes a finished tile to the rows of its band.
+/// Writes a finished tile at column `x` to its rows of pixels.
 pub fn finish(canvas: &Canvas, background: Background, x: usize, width: usize, band: &mut Surface) {
     let (gain, back) = (background.gain.unwrap_or([1.0; 3]), background.rgb);
     let columns = TILE.min(width - x);
@@ -134,7 +134,7 @@ pub fn finish(canvas: &Canvas, background: Background, x: usize, width: usize, b
     }
 }
 
-/// Columns without Gaussians: whole stretches of rows, which memory likes better than tile after tile.
+/// Fills columns that no Gaussian meets with the background: whole stretches of rows, which is faster than tile after tile.
 pub fn finish_empty(background: Background, columns: Range<usize>, width: usize, band: &mut Surface) {
     if columns.is_empty() {
         return;

@@ -1,7 +1,7 @@
 //! Multi-resolution hash grid (Instant-NGP, Mueller et al. 2022): [N, 3] in [0, 1] -> [N, L * F], trilinear at each level.
 //!
 //! A level whose vertices fit the table is dense, the others are hashed. A level is one task that walks all points in order:
-//! its part of the table stays in the cache, and gradients need no atomics and do not depend on the threads.
+//! its part of the table stays in the cache, gradients need no atomics, and results do not depend on the threads.
 
 mod cell;
 
@@ -11,7 +11,7 @@ use crate::error::{RasterError, check_length};
 use crate::parallel::parallel_for;
 use cell::GridLevel;
 
-/// Points of one task where levels are put together.
+/// Points of one task when the outputs of the levels are interleaved.
 const POINTS: usize = 256;
 
 /// Shape of a grid; the table is [entries, F], level after level.
@@ -23,10 +23,10 @@ pub struct HashGrid {
 }
 
 impl HashGrid {
-    /// `cells` on a side of each level; `table` entries at most a level, a power of two.
+    /// `cells`: number of cells along a side of each level; `table`: most entries of a level, a power of two.
     ///
     /// # Errors
-    /// A number of features that is none of 1, 2, 4, 8; no cells; a table that is no power of two.
+    /// `features` is not 1, 2, 4 or 8; a level has no cells; `table` is not a power of two.
     pub fn new(features: usize, cells: &[u32], table: usize) -> Result<HashGrid, RasterError> {
         if !matches!(features, 1 | 2 | 4 | 8) {
             return Err(RasterError::Shape {
@@ -75,7 +75,7 @@ impl HashGrid {
         self.entries
     }
 
-    /// Values a point: L * F.
+    /// Values per point: L * F.
     pub fn outputs(&self) -> usize {
         self.levels.len() * self.features
     }

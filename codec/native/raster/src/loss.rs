@@ -30,7 +30,7 @@ pub struct LossValue {
 pub struct ImageLoss {
     maps: [Vec<f32>; 3],
     partial: Vec<[f64; 3]>,
-    /// Values of each row from the first to the last that differ.
+    /// Of each row the range of values from the first to the last that differs.
     spans: Vec<Range<usize>>,
 }
 
@@ -72,7 +72,7 @@ impl ImageLoss {
         Ok(LossValue { loss, l1, mse, ssim })
     }
 
-    /// Pass 1: the maps times `scale` and the weight; returns sums of |x - y|, (x - y)^2 and SSIM.
+    /// Pass 1: derivative maps, times `scale` and the weight. Returns the sums of |x - y|, (x - y)^2 and SSIM.
     fn derivatives(&mut self, level: SimdLevel, pair: Pair, scale: f64) -> [f64; 3] {
         let (values, rows) = (pair.row_values(), pair.rows());
         self.partial.clear();
@@ -129,11 +129,12 @@ impl ImageLoss {
     }
 }
 
-/// The columns that matter to a band: those of all rows nearer than `reach`, widened by `margin` values and to whole vectors.
+/// The columns that a band of rows needs: those with differences in the rows nearer than `reach`, widened by `margin` values
+/// and to whole vectors.
 ///
-/// A gradient is nonzero within 10 pixels of a difference and uses maps 5 pixels further. Pass 2 takes 10 rows and, rounded up
-/// to vectors, at most 45 values; what it reads, 60 values and 5 rows away, is inside of what pass 1 takes for any band of
-/// such a row.
+/// A gradient is nonzero within 10 pixels of a difference, and reads maps 5 pixels further. Pass 2 takes 10 rows and,
+/// rounded up to vectors, at most 45 values; it reads 60 values and 5 rows further, which pass 1 has computed for any band
+/// of such a row.
 fn columns(spans: &[Range<usize>], band: &Range<usize>, reach: usize, margin: usize, values: usize) -> Range<usize> {
     let rows = band.start.saturating_sub(reach)..(band.end + reach).min(spans.len());
     let used = spans[rows].iter().filter(|s| !s.is_empty());
@@ -149,7 +150,7 @@ fn differ<V: Vector>(x: &[f32], y: &[f32], at: usize) -> bool {
     V::any(!c::<V>(0.0).ge((V::load(&x[at..]) - V::load(&y[at..])).abs())) // NaN differs from everything
 }
 
-/// From the first to the last value that differs, give or take a vector.
+/// From the first to the last value that differs, to within a vector.
 #[inline(always)]
 fn differing_kernel<V: Vector>(x: &[f32], y: &[f32]) -> Range<usize> {
     let n = x.len().min(y.len());

@@ -12,7 +12,8 @@ use crate::scene::Splats;
 use crate::simd::{MAGIC, Vector, c, dispatch};
 use crate::soa::{CHUNK, Row, Soa, load_rows};
 
-/// The fields of `Projected` of 16 Gaussians, as rows; MAGIC is added to the last five, so that they are in the low bits.
+/// The fields of `Projected` of 16 Gaussians, as rows. The last five hold integers: MAGIC is added, so that they are in the
+/// low bits.
 struct Out([Row; 17]);
 
 #[inline(always)]
@@ -56,19 +57,7 @@ fn project_lanes<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize, out: &m
     }
     rx.select(seen, c(-1.0)).store(&mut out.0[10][at..]);
     ry.store(&mut out.0[11][at..]);
-    let (wide, high) = (rx + c(SLACK), ry + c(SLACK));
-    // the first pixel centre at or after an edge, the last one at or before it; a tile too many is found out by `meet`
-    let tile = |edge: V, axis: usize| {
-        let pixel = edge.max(c(0.0)).min(c(lens.size[axis] - 1.0));
-        pixel.mul_add(c(1.0 / TILE as f32), c(-0.5)) + c(MAGIC)
-    };
-    let half_on = c::<V>(0.25); // so that the last pixel of a picture is not rounded down
-    let tiles = [
-        tile(x - wide + half, 0),
-        tile(x + wide - half + half_on, 0),
-        tile(y - high + half, 1),
-        tile(y + high - half + half_on, 1),
-    ];
+    let tiles = tile_range(lens, [x, y], [rx + c(SLACK), ry + c(SLACK)]);
     for (i, tile) in tiles.into_iter().enumerate() {
         tile.store(&mut out.0[12 + i][at..]);
     }
@@ -81,7 +70,25 @@ fn project_lanes<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize, out: &m
     meet(&ellipse, [x, y], tiles.map(|tile| tile - c(MAGIC))).store(&mut out.0[16][at..]);
 }
 
-/// `met` of the ellipse around the point, + MAGIC, by a test at the pixel centres of 2 x 2 tiles.
+/// First and last column, first and last row of the tiles that the box around (x, y) meets, + MAGIC: the tile of the first
+/// pixel centre at or after an edge, and of the last one at or before it. A tile too many is found out by `meet`.
+#[inline(always)]
+fn tile_range<V: Vector>(lens: &Lens, [x, y]: [V; 2], [wide, high]: [V; 2]) -> [V; 4] {
+    let half = c::<V>(0.5);
+    let tile = |edge: V, axis: usize| {
+        let pixel = edge.max(c(0.0)).min(c(lens.size[axis] - 1.0));
+        pixel.mul_add(c(1.0 / TILE as f32), c(-0.5)) + c(MAGIC)
+    };
+    let half_on = c::<V>(0.25); // so that the last pixel of an image is not rounded down
+    [
+        tile(x - wide + half, 0),
+        tile(x + wide - half + half_on, 0),
+        tile(y - high + half, 1),
+        tile(y + high - half + half_on, 1),
+    ]
+}
+
+/// `Projected::met` of the ellipse around the point, + MAGIC, by a test at the pixel centres of 2 x 2 tiles.
 #[inline(always)]
 fn meet<V: Vector>(ellipse: &Ellipse<V>, [x, y]: [V; 2], [x0, x1, y0, y1]: [V; 4]) -> V {
     let side = TILE as f32;

@@ -1,4 +1,7 @@
-//! Sums over the pixels of a Gaussian -> gradients of its parameters; the mirror of project.rs, 16 Gaussians at a time.
+//! Backward pass of the projection: sums over the pixels of each Gaussian -> gradients of its parameters, 16 Gaussians at a
+//! time.
+//!
+//! The mirror of project.rs.
 
 use std::ops::Range;
 
@@ -35,7 +38,7 @@ impl GradientRows {
         }
     }
 
-    /// To the `n` Gaussians `at ..` of `out`; 0 for those without a bit in `seen`.
+    /// Writes the gradients of `n` Gaussians from `at` on to `out`; 0 for those without a bit in `seen`.
     #[inline(always)]
     fn write(&self, n: usize, seen: u16, sums: &[Row; 12], at: usize, k: usize, out: &mut Gradients) {
         let (to, add) = (at + n, out.add);
@@ -73,7 +76,7 @@ impl GradientRows {
     }
 }
 
-/// Gaussians between a prefetch of their pairs and its use; their places are fetched twice as early.
+/// Prefetch distance in Gaussians: sums are fetched this far ahead, their places twice as far.
 const AHEAD: usize = 24;
 
 /// Adds up the pairs of `n` Gaussians, in the order of their tiles. Bit i of the mask is set if Gaussian first + i has any.

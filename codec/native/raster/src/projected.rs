@@ -1,8 +1,8 @@
-//! What the projection leaves of a Gaussian, and the tile grid that it refers to: read by binning, blending and gradients.
+//! A Gaussian after projection, and the tile grid that it refers to. Binning, blending and gradients read it.
 
 /// Side of a tile in pixels.
 pub const TILE: usize = 16;
-/// Widens the box and the ellipse a little, so that rounding never loses a pixel that the blending would have drawn.
+/// Relative and absolute margin of the box and the ellipse, so that rounding never loses a pixel that blending would draw.
 pub const SLACK: f32 = 1e-3;
 
 /// A Gaussian on the image; x and y in pixels of the region.
@@ -24,11 +24,12 @@ pub struct Projected {
     pub ry: f32,
     /// Tiles that the box meets: first and last column, first and last row.
     pub tiles: [u16; 4],
-    /// Which of them the ellipse meets if they are at most 2 x 2: bit 2 row + column, from the first ones. Else `MANY`.
+    /// Which of these tiles the ellipse meets, if they are at most 2 x 2: bit 2 row + column, from the first ones. Else
+    /// `MANY`.
     pub met: u16,
 }
 
-/// `met` of a box of more tiles than that.
+/// `met` where the box covers more than 2 x 2 tiles.
 pub const MANY: u16 = 1 << 4;
 
 impl Projected {
@@ -36,7 +37,7 @@ impl Projected {
         self.rx >= 0.0
     }
 
-    /// Larger half side of the box in pixels, 0 for the invisible.
+    /// Larger half side of the box in pixels, 0 if invisible.
     pub fn radius(&self) -> f32 {
         if self.visible() { self.rx.max(self.ry) } else { 0.0 }
     }

@@ -1,7 +1,8 @@
-//! The rasterizer's workspace and the order of its passes: project, sort, bin, blend; backward: tiles, then Gaussians.
+//! The rasterizer: its buffers and the order of the passes. Forward: project, sort, bin, blend; backward: tiles, then
+//! Gaussians.
 //!
-//! All buffers are kept from picture to picture. Work is divided in ways that depend on the input only (16 pixel rows, 256
-//! Gaussians), every piece owns what it writes, and sums over pairs have a fixed order: results do not depend on the threads.
+//! All buffers are kept from image to image. Work is divided by the input only (16 pixel rows, 256 Gaussians), every task
+//! owns the memory it writes, and sums over pairs have a fixed order: results do not depend on the threads.
 
 mod backward_pass;
 
@@ -28,8 +29,8 @@ use crate::tile_rect::TileRect;
 /// Gaussians of one task.
 const SHARE: usize = 256;
 
-/// Gaussian-tile pairs that a picture may take at a time, a Gaussian or in all; 8 bytes each. A tile alone needs at most two
-/// entries a Gaussian, so that dividing the tiles always ends.
+/// Gaussian-tile pairs that rendering may hold at a time, per Gaussian or in all; 8 bytes each. One tile needs at most two
+/// entries per Gaussian, so halving the tiles always ends.
 const PAIRS_EACH: usize = 8;
 const PAIRS_FREE: usize = 1 << 20;
 
@@ -44,6 +45,7 @@ pub struct Timings {
     pub loss: f64,
 }
 
+/// Renders and differentiates; one image at a time.
 pub struct Rasterizer {
     level: SimdLevel,
     pool: Option<rayon::ThreadPool>,
@@ -59,7 +61,7 @@ pub struct Rasterizer {
 }
 
 impl Rasterizer {
-    /// `threads` 0: the threads of the process-wide pool.
+    /// `threads` = 0: uses the threads of the process-wide pool.
     pub fn new(level: SimdLevel, threads: usize) -> Rasterizer {
         let pool = if threads == 0 {
             None
@@ -85,11 +87,12 @@ impl Rasterizer {
         self.level
     }
 
-    /// Of the last forward pass: [H, W, 3] and [H, W] of the region, and the ellipses.
+    /// [H, W, 3] of the region, by the last forward pass.
     pub fn image(&self) -> &[f32] {
         &self.image
     }
 
+    /// [H, W] of the region, by the last forward pass.
     pub fn alpha(&self) -> &[f32] {
         &self.alpha
     }
@@ -101,11 +104,12 @@ impl Rasterizer {
         gaussians + self.bins.memory() + pairs + 4 * (self.image.capacity() + self.alpha.capacity())
     }
 
+    /// [N] the Gaussians after projection.
     pub fn projected(&self) -> &[Projected] {
         &self.projected
     }
 
-    /// The first half of `forward` alone: the ellipses of `view`, to be drawn elsewhere (see `Bands`).
+    /// The first half of `forward` alone: projects the Gaussians of `view`, to be drawn elsewhere (see `Bands`).
     ///
     /// # Errors
     /// As `forward`.
@@ -118,8 +122,8 @@ impl Rasterizer {
         Ok(&self.projected)
     }
 
-    /// The second half of `forward` alone: `fill` gets those of the last call and sets the ellipses to draw on a picture of
-    /// width x height, which must be what `project` made for one of that size.
+    /// The second half of `forward` alone: draws projected Gaussians on an image of width x height. `fill` gets the
+    /// Gaussians of the last call and replaces them; they must come from `project` for an image of that size.
     ///
     /// # Errors
     /// As `paint`.
@@ -143,10 +147,10 @@ impl Rasterizer {
         self.run(|s| s.draw_on(surface, region, background, false))
     }
 
-    /// Draws the view on a surface of the caller's; `image` and `alpha` stay what they are.
+    /// Renders the view onto a surface of the caller; `image` and `alpha` keep their values.
     ///
     /// # Errors
-    /// As `forward`, or a surface of another size.
+    /// As `forward`; a surface of another size.
     pub fn paint(
         &mut self,
         surface: Surface,
@@ -159,7 +163,7 @@ impl Rasterizer {
         self.run(|s| s.draw_on(surface, view.region, background, false))
     }
 
-    /// Runs `f` with this workspace in its own threads.
+    /// Runs `f` in the thread pool of this rasterizer.
     pub(crate) fn run<R: Send>(&mut self, f: impl FnOnce(&mut Self) -> R + Send) -> R {
         match self.pool.take() {
             None => f(self),
@@ -171,7 +175,7 @@ impl Rasterizer {
         }
     }
 
-    /// Draws the view. `training` keeps what `backward` needs.
+    /// Renders the view. `training` keeps what `backward` needs.
     ///
     /// # Errors
     /// Wrong lengths, an empty or too large view, too many Gaussian-tile pairs.
@@ -235,8 +239,8 @@ impl Rasterizer {
         self.draw_tiles(&mut surface, TileRect::of(region), region, background, training)
     }
 
-    /// TileBins and blends a rectangle of tiles; in halves if that would take too much memory, but for training, which needs all
-    /// pairs afterwards.
+    /// Bins and blends a rectangle of tiles. If its pairs exceed the memory limit, both halves one after the other; not in
+    /// training, where the backward pass needs all pairs.
     fn draw_tiles(
         &mut self,
         surface: &mut Surface,

@@ -1,6 +1,6 @@
 //! The part of an image that is rendered.
 
-/// A pixel rectangle of the view; what is rendered.
+/// A rectangle of pixels of the view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Region {
     pub x: usize,

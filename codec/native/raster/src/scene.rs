@@ -1,4 +1,5 @@
-//! What goes in and out of the rasterizer: Gaussians, a view, gradients; flat slices in the layout of the Python arrays.
+//! Inputs and outputs of the rasterizer: Gaussians, a view, the background, gradients; flat slices in the layout of the
+//! Python arrays.
 
 use crate::error::{RasterError, check_length};
 use crate::region::Region;
@@ -25,7 +26,7 @@ impl Splats<'_> {
     }
 
     /// # Errors
-    /// A length that does not belong to N Gaussians, or a K that is no SH degree.
+    /// A length that does not belong to N Gaussians; a K that is no SH degree.
     pub fn check(&self) -> Result<(), RasterError> {
         let n = self.len();
         let k = self.sh_k;
@@ -52,7 +53,7 @@ impl Splats<'_> {
 
 /// Gradients, same shapes as `Splats`.
 pub struct Gradients<'a> {
-    /// Add to what is there (of `max_weight` keep the larger); else overwrite it.
+    /// If true, gradients are added to the present values (of `max_weight` the larger is kept); else they overwrite them.
     pub add: bool,
     pub means: &'a mut [f32],
     pub quats: &'a mut [f32],
@@ -83,7 +84,7 @@ impl<'a> Gradients<'a> {
         }
     }
 
-    /// The first `n` Gaussians, and the others.
+    /// Splits after the first `n` Gaussians.
     pub fn split_at(self, n: usize, sh_k: usize) -> (Gradients<'a>, Gradients<'a>) {
         let (means, means2) = self.means.split_at_mut(3 * n);
         let (quats, quats2) = self.quats.split_at_mut(4 * n);
@@ -138,7 +139,7 @@ impl<'a> Gradients<'a> {
     }
 }
 
-/// A pinhole camera (OpenCV axes, pixel centres at half-integers) and the part of its image that is wanted.
+/// A pinhole camera (OpenCV axes, pixel centres at half-integers) and the region of its image to render.
 #[derive(Clone, Copy, Debug)]
 pub struct View {
     pub width: usize,
@@ -152,7 +153,7 @@ pub struct View {
 
 impl View {
     /// # Errors
-    /// An empty or too large image, or a region that is not inside of it.
+    /// An empty or too large image; a region that is not inside the image.
     pub fn check(&self) -> Result<(), RasterError> {
         check_size(self.region, self.width, self.height)
     }

@@ -11,7 +11,7 @@ use crate::ssim_window::{Narrow, STRIP, Strip, Wide, horizontal, moments, tap_ro
 const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
 
-/// SSIM of the local means, and its derivatives by E[x], E[x^2] and E[xy].
+/// SSIM of the local means, and its derivatives with respect to E[x], E[x^2] and E[xy].
 #[inline(always)]
 fn ssim<V: Vector>([x, y, squares, xy]: [V; 4]) -> (V, [V; 3]) {
     let two = c::<V>(2.0);
@@ -26,7 +26,7 @@ fn ssim<V: Vector>([x, y, squares, xy]: [V; 4]) -> (V, [V; 3]) {
     (s, [d_x, d_xx, d_xy])
 }
 
-/// The weights of the strip's values; 0 past its end.
+/// The weights of the values of a strip; 0 past its end.
 fn weights(pair: Pair, row: usize, strip: &Strip, out: &mut Narrow) {
     match pair.weight {
         None => out.0[..strip.n].fill(1.0),

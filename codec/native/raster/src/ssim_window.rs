@@ -16,7 +16,7 @@ pub const WINDOW: [f32; TAPS] = [
     0.213_005_54, 0.109_360_69, 0.036_000_773, 0.007_598_758, 0.001_028_38,
 ];
 
-/// Values of a strip, and with room for the taps on both sides (16, so that 3 * RADIUS fits and vectors align).
+/// Values of a strip, and its width with room for the taps on both sides (16, so that 3 * RADIUS fits and vectors align).
 pub const STRIP: usize = 384;
 pub const MARGIN: usize = 16;
 pub const WIDE: usize = STRIP + 2 * MARGIN;
@@ -42,7 +42,7 @@ impl Narrow {
     }
 }
 
-/// Where a strip lies: `n` values from `start`, with those of its margin that exist `reach`.
+/// A strip: `n` values from `start`; `reach`: the columns of the image that its taps read.
 pub struct Strip {
     pub start: usize,
     pub n: usize,
@@ -65,7 +65,7 @@ impl Strip {
     }
 }
 
-/// Rows that the taps of `row` touch, `reach` of each; `k` says which taps are inside of the image.
+/// Rows that the taps of `row` read, the columns `reach` of each; `k`: the taps that are inside the image.
 pub fn tap_rows<'a>(
     image: &'a [f32],
     values: usize,
@@ -81,7 +81,7 @@ pub fn tap_rows<'a>(
     out
 }
 
-/// Taps of `row` that are inside of the image.
+/// The taps of `row` that are inside the image.
 pub fn taps(row: usize, rows: usize) -> Range<usize> {
     RADIUS.saturating_sub(row)..TAPS.min(rows + RADIUS - row)
 }

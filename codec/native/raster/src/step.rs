@@ -1,7 +1,7 @@
-//! The image side of a training step in one call: draw, photometric_loss with an 8-bit target, differentiate.
+//! The image side of a training step in one call: render, compare with an 8-bit target image, differentiate.
 //!
 //! Target: unassociated 8-bit colour and optional alpha, composited on the same background as the Gaussians. Loss: the image
-//! loss plus mask_lambda * mean |alpha - target alpha|. Nothing a pixel large ever passes through the caller.
+//! loss plus mask_lambda * mean |alpha - target alpha|. No buffer with a value per pixel passes through the caller.
 
 use rayon::prelude::*;
 
@@ -12,7 +12,7 @@ use crate::loss::{ImageLoss, LossValue};
 use crate::rasterizer::Rasterizer;
 use crate::scene::{Background, Gradients, Splats, View};
 
-/// What the picture of a view should be: [H, W, 3], [H, W] and [H, W] of the whole image, not of the region.
+/// The target of a view: [H, W, 3], [H, W] and [H, W] of the whole image, not of the region.
 #[derive(Clone, Copy)]
 pub struct TargetImage<'a> {
     pub rgb: &'a [u8],
@@ -31,7 +31,7 @@ pub struct StepValue {
     pub image: LossValue,
     pub mask: f64,
     pub loss: f64,
-    /// Gradient by the gain of `Background`.
+    /// Gradient with respect to the gain of `Background`.
     pub gain: [f64; 3],
 }
 
@@ -127,7 +127,7 @@ impl Step {
         })
     }
 
-    /// Fills `target` and `grad_alpha`, and the mask sums.
+    /// Composites the target, and writes the gradient and the sums of the mask loss.
     fn composite(
         &mut self,
         r: &Rasterizer,

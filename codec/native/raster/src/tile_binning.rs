@@ -1,8 +1,10 @@
-//! Depth-sorted Gaussians -> for each 16 x 16 tile the list of those whose ellipse (alpha >= ALPHA_MIN) meets it, in depth order.
+//! Tile binning: depth-sorted Gaussians -> for each 16 x 16 tile the Gaussians whose ellipse (alpha >= ALPHA_MIN) meets it,
+//! in depth order.
 //!
-//! A counting sort. Fixed chunks of the sorted order list and count their tiles in parallel, a prefix sum gives each
-//! (tile, chunk) its place, and the chunks fill in parallel; the places do not depend on the threads. In the chunk's list the
-//! places then replace the tiles: from them the backward pass gathers the gradients of a Gaussian in a fixed order.
+//! A counting sort. Fixed chunks of the sorted order list and count their tiles in parallel, a prefix sum gives each (tile,
+//! chunk) its first place, and the chunks write their pairs in parallel; the places do not depend on the threads. The
+//! chunk's list then keeps the places instead of the tiles: the backward pass gathers the gradients of a Gaussian from them
+//! in a fixed order.
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
@@ -14,19 +16,19 @@ use crate::simd::prefetch;
 use crate::tile::BATCH;
 use crate::tile_rect::{TileRect, for_tiles};
 
-/// Chunks of the sorted order; bounds the parallelism of binning. Few Gaussians have fewer, but not fewer than the least:
-/// each chunk has a counter a tile.
+/// Chunks of the sorted order, which bound the parallelism of binning. Each chunk has a counter per tile, so few Gaussians
+/// are fewer chunks, down to the minimum.
 const CHUNKS: usize = 16;
 const CHUNKS_MIN: usize = 4;
 const CHUNK_SIZE: usize = 4096;
 /// Entry of a Gaussian whose ellipse meets no tile.
 const NOWHERE: u32 = u32::MAX;
-/// The most that `append` adds for a Gaussian whose tiles are known.
+/// Most entries that `append` adds for a Gaussian whose tiles are known (2 x 2).
 const FEW: usize = 4;
 /// An entry of `owned` is chunk << OFFSET_BITS | offset in the chunk's list.
 const OFFSET_BITS: u32 = 28;
 const HIDDEN: u32 = u32::MAX;
-/// Items between a prefetch and its use.
+/// Prefetch distance in items.
 const AHEAD: usize = 12;
 
 #[derive(Default)]
@@ -36,14 +38,15 @@ pub struct TileBins {
     pub starts: Vec<u32>,
     /// Gaussian of each pair
     pub pairs: Vec<AtomicU32>,
-    /// [N] where a Gaussian's entry in the lists begins; HIDDEN for the invisible
+    /// [N] where the entries of a Gaussian begin; HIDDEN if it is invisible
     owned: Vec<AtomicU32>,
-    /// of each chunk: for each Gaussian the positions of its pairs in `pairs`, << 1, with 1 added to the last; or NOWHERE
+    /// of each chunk: for each Gaussian the places of its pairs in `pairs`, << 1, with 1 added to the last one; NOWHERE if
+    /// it has none
     lists: Vec<Vec<u32>>,
     cursors: Vec<u32>, // [chunks, tiles]
 }
 
-/// Makes room for `more` entries; by a quarter, since twice as much would be felt in the memory of a picture.
+/// Reserves `more` entries and a quarter; doubling would cost noticeable memory.
 #[inline(always)]
 fn grow(list: &mut Vec<u32>, more: usize) {
     if list.capacity() - list.len() < more {
@@ -51,8 +54,8 @@ fn grow(list: &mut Vec<u32>, more: usize) {
     }
 }
 
-/// A Gaussian's entries of a chunk's list, tile << 1 | last, from `used` on; counts them. Returns their end. There is room for
-/// FEW, and no branch for those that are met: which ones cannot be foretold.
+/// Writes the entries of a Gaussian, tile << 1 | last, to the list from `used` on, and counts them per tile. Returns the new
+/// end. At most FEW entries are written without branches, since branch prediction would fail on which tiles are met.
 #[inline(always)]
 fn append(p: &Projected, tiles: &TileRect, count: &mut [u32], list: &mut Vec<u32>, used: usize) -> usize {
     let [x0, x1, y0, y1] = p.tiles.map(usize::from);
@@ -110,12 +113,13 @@ impl TileBins {
         self.starts[t] as usize
     }
 
-    /// Where the batches of tile `t` begin, if each tile has as many as its pairs need (a few places stay unused).
+    /// First batch of tile `t`, if every tile has as many batches as its pairs need (a few places stay unused).
     pub fn batches(&self, t: usize) -> usize {
         self.first(t) / BATCH + t
     }
 
-    /// Cuts what belongs to rows `first ..` of tiles, placed by `start`, at row `middle`; nothing of nothing.
+    /// Splits `items` of the rows of tiles from `first` on at row `middle`; `start` gives the place of a tile. Empty stays
+    /// empty.
     pub fn cut<'a, T>(
         &self,
         items: &'a mut [T],
@@ -128,7 +132,7 @@ impl TileBins {
         items.split_at_mut(length.min(items.len()))
     }
 
-    /// Cuts what belongs to tile `t` off what belongs to the tiles `t ..`.
+    /// Splits the items of tile `t` off those of the tiles from `t` on.
     pub fn cut_tile<'a, T>(
         &self,
         items: &'a mut [T],
@@ -139,7 +143,7 @@ impl TileBins {
         items.split_at_mut(length.min(items.len()))
     }
 
-    /// The list from the entries of a visible Gaussian on.
+    /// The chunk list from the entries of a Gaussian on; empty if it is invisible.
     #[inline(always)]
     fn entries(&self, gaussian: usize) -> &[u32] {
         let Some(owned) = self.owned.get(gaussian) else {
@@ -151,13 +155,13 @@ impl TileBins {
             .unwrap_or(&[])
     }
 
-    /// Fetches what `places` will read.
+    /// Prefetches the entries that `places` reads.
     #[inline(always)]
     pub fn prefetch_places(&self, gaussian: usize) {
         prefetch(self.entries(gaussian), 0);
     }
 
-    /// Calls `visit` with each position in `pairs` of a Gaussian; none if it is invisible.
+    /// Calls `visit` with each place in `pairs` of a Gaussian; never if it is invisible.
     #[inline(always)]
     pub fn places(&self, gaussian: usize, mut visit: impl FnMut(usize)) {
         for &entry in self.entries(gaussian) {
@@ -172,7 +176,7 @@ impl TileBins {
     }
 
     /// # Errors
-    /// More than `limit` pairs, visible Gaussians included, or more than its share of them in one chunk.
+    /// More than `limit` pairs in all, visible Gaussians included, or more than its share in one chunk.
     pub fn build(
         &mut self,
         projected: &[Projected],
@@ -228,7 +232,7 @@ impl TileBins {
         Ok(())
     }
 
-    /// Turns the counts into first places and sets `starts` and the size of `pairs`.
+    /// Prefix sum: counts -> first places; sets `starts` and the size of `pairs`.
     fn prefix(&mut self, tiles: usize) {
         self.starts.clear();
         let mut sum = 0;
@@ -242,7 +246,7 @@ impl TileBins {
         self.pairs.resize_with(sum as usize, AtomicU32::default);
     }
 
-    /// Writes the pairs; the tiles in the lists become places.
+    /// Writes the pairs, and replaces the tiles in the lists by places.
     fn fill(&mut self, tiles: usize, sorted: &[AtomicU64], share: usize) {
         let pairs = &self.pairs;
         let work = self

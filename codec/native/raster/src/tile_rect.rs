@@ -14,7 +14,7 @@ pub struct TileRect {
 }
 
 impl TileRect {
-    /// Those that cover a region.
+    /// The tiles that cover a region.
     pub fn of(region: Region) -> TileRect {
         TileRect {
             columns: 0..region.width.div_ceil(TILE),
@@ -26,7 +26,7 @@ impl TileRect {
         self.columns.len() * self.rows.len()
     }
 
-    /// Two halves, none of a single tile.
+    /// Two halves; None for a single tile.
     pub fn halves(&self) -> Option<[TileRect; 2]> {
         let half = |r: &Range<usize>| (r.start..r.start + r.len() / 2, r.start + r.len() / 2..r.end);
         let (columns, rows) = (self.columns.clone(), self.rows.clone());
@@ -56,7 +56,7 @@ impl TileRect {
     }
 }
 
-/// Calls `visit(tile)` for those of the tiles that the ellipse of `p` meets at pixel centres.
+/// Calls `visit(tile)` for each of the tiles in which the ellipse of `p` meets a pixel centre.
 #[inline(always)]
 pub fn for_tiles(p: &Projected, tiles: &TileRect, mut visit: impl FnMut(usize)) {
     let [x0, x1, y0, y1] = p.tiles.map(usize::from);

@@ -1,4 +1,4 @@
-//! What an instance holds, and what its exports do.
+//! The state of an instance, and the bodies of its exports.
 
 use super::{pack, text};
 use gsv::attributes::sh_coefficients;
@@ -9,9 +9,9 @@ use gsv::levels::Level;
 use raster::{Background, Band, Bands, Projected, Rasterizer, Region, SimdLevel, Splats, Surface, View};
 use std::fmt::Display;
 
-/// 4096 x 4096. A larger picture is refused; an allocation that fails would end the instance.
+/// Most pixels of an image, 4096 x 4096: a failed allocation would end the instance.
 const MAX_PIXELS: usize = 1 << 24;
-/// Groups that an instance can hold.
+/// Slots for decoded groups.
 const SLOTS: usize = 8;
 
 pub struct Player {
@@ -45,7 +45,7 @@ impl Default for Player {
 }
 
 impl Player {
-    /// True, or false with the message in `output`.
+    /// Returns true, or false with the message in `output`.
     fn done<T>(&mut self, result: Result<T, impl Display>) -> bool {
         if let Err(e) = &result {
             self.output = e.to_string().into_bytes();
@@ -62,7 +62,7 @@ impl Player {
         self.output = text::describe(&self.demuxer, first).into_bytes();
     }
 
-    /// The reference of a predicted group is in its slot.
+    /// Decodes the input to `slot`. The reference of a predicted group is in the slot `reference`.
     pub fn decode(&mut self, slot: usize, level: u8, reference: usize, layers: usize) -> bool {
         let decoded = Level::get(level).and_then(|caps| {
             let how = Decoding {
@@ -91,7 +91,7 @@ impl Player {
         }
     }
 
-    /// How many groups back the group of the input refers; -1 with the message in `output` if that cannot be told.
+    /// How many groups back the group in the input refers; -1 with the message in `output` if that is unknown.
     pub fn reference(&mut self) -> i32 {
         let result = reference_of(&self.input);
         let back = result.as_ref().map_or(-1, |back| i32::from(*back));
@@ -215,7 +215,7 @@ fn floats(values: &[f32]) -> Vec<u8> {
     values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }
 
-/// 18 f32; what is missing is 0, which the rasterizer refuses.
+/// A view from 18 f32; missing ones are 0, which the rasterizer refuses.
 fn view(bytes: &[u8]) -> View {
     let mut v = [0.0f32; 18];
     for (v, b) in v.iter_mut().zip(bytes.as_chunks::<4>().0) {

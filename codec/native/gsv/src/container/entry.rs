@@ -1,4 +1,4 @@
-//! Where a group lies in the file, as the fragments or an index tell.
+//! The place of a group in the file, as given by its fragment or by an index.
 
 /// The place and the time of a group.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]

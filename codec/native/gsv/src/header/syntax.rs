@@ -13,7 +13,7 @@ const FLAG_UNIT_SIZES: u8 = 4;
 const FLAG_LAYER_SHIFTS: u8 = 8;
 
 impl Header {
-    /// `reference`: the header of the group that a predicted one refers to.
+    /// Parses the payload of unit 0. `reference`: the header of the group that a predicted one refers to.
     pub fn read(payload: &[u8], reference: Option<&Header>) -> Result<Header> {
         let mut h = Header::default();
         let mut r = Reader::new(payload);
@@ -25,14 +25,15 @@ impl Header {
         Ok(h)
     }
 
-    /// What a header opens with: how many groups back it refers, 0 for an independent one, and sizes of the units behind it.
+    /// The first fields of a header: the reference (groups back, 0: independent), and the sizes of the units behind the
+    /// header.
     pub fn open(payload: &[u8]) -> Result<(u16, Vec<u32>)> {
         let (mut h, mut sizes) = (Header::default(), Vec::new());
         h.opening(&mut Reader::new(payload), &mut sizes)?;
         Ok((h.reference, sizes))
     }
 
-    /// Reads or writes all fields, and checks them. `sizes`: of the units behind the header, none if they are not told.
+    /// Reads or writes all fields, and checks them. `sizes`: sizes of the units behind the header; empty: not in the header.
     pub fn fields<F: Fields>(&mut self, f: &mut F, sizes: &mut Vec<u32>, reference: Option<&Header>) -> Result<()> {
         self.opening(f, sizes)?;
         if self.reference > 0 {
@@ -174,7 +175,7 @@ impl Header {
         Ok(())
     }
 
-    /// One set for each layer, where the opening has announced them.
+    /// layer_shifts, if the opening announces them.
     fn shifts<F: Fields>(&mut self, f: &mut F) -> Result<()> {
         if self.shifts.is_empty() {
             return Ok(());

@@ -28,7 +28,7 @@ impl Node {
     }
 }
 
-/// Where the children of a node are in the next level.
+/// The children of a node: index of the first one in the next level, and which of the eight exist.
 #[derive(Clone, Copy, Default)]
 pub struct Children {
     pub first: u32,
@@ -42,7 +42,7 @@ impl Children {
     }
 }
 
-/// Face neighbours of the children, from those of their parents.
+/// Sets the face neighbours of the children from those of their parents.
 pub fn link(level: &[Node], children: &[Children], next: &mut [Node]) {
     for (parent, mine) in level.iter().zip(children) {
         for k in 0..8u8 {

@@ -9,7 +9,7 @@ const BUCKETS: usize = 16; // of the number of points to split
 const TREE: usize = 32; // adaptive bins of one split; later ones are bypass bins
 const EVIDENCE: usize = 144; // contexts made of the face neighbours
 
-/// Points per child (bit 2: half along x, bit 1: y, bit 0: z), at most 255, as contexts see them: byte k is child k.
+/// Points per child (bit 2: half along x, bit 1: y, bit 0: z), clamped to 255 for the contexts: byte k is child k.
 pub type Seen = u64;
 
 /// `count` points of child `k`.
@@ -29,7 +29,7 @@ impl<'a, C: Bins> Coder<'a, C> {
     }
 }
 
-/// What the contexts of one node's seven splits are made of.
+/// The inputs of the contexts of the seven splits of a node.
 pub struct Split {
     want: [u32; 8],   // encoder: points per child
     lower: [Seen; 3], // children of the face neighbours at the side of 0
@@ -60,7 +60,7 @@ impl Split {
         }
     }
 
-    /// Points per child: along x, then y, then z.
+    /// Codes the number of points per child: splits along x, then y, then z.
     pub fn children<C: Bins>(mut self, coder: &mut Coder<C>) -> [u32; 8] {
         let mut counts = [0; 8];
         let [lx, ly, lz] = self.lower;
@@ -95,7 +95,8 @@ impl Split {
         counts
     }
 
-    /// What `children` does for a single point, which most nodes have: where it is, without branches on what cannot be foreseen.
+    /// Codes the child of a single point. Equal to `children`, which most nodes do not need, but without branches that
+    /// cannot be predicted.
     pub fn child<C: Bins>(self, coder: &mut Coder<C>) -> usize {
         let [lx, ly, lz] = self.lower;
         let c = context(halves(ly, 4, 0), halves(lz, 4, 0), sum(lx, 4, 4), self.upper[0]);
@@ -110,13 +111,13 @@ impl Split {
         k | self.upper_half(coder, 7, k, c, 2)
     }
 
-    /// 0 or 1: in which half the only point is.
+    /// Codes in which half the only point is: 0 or 1.
     #[inline(always)]
     fn upper_half<C: Bins>(&self, coder: &mut Coder<C>, mask: usize, half: usize, c: usize, axis: usize) -> usize {
         1 - self.split(coder, mask, half, 1, c, axis) as usize
     }
 
-    /// Of `n` points, how many lie in the lower half: the children k with k & mask = half.
+    /// Codes how many of `n` points lie in the lower half: in the children k with k & mask = half.
     #[inline(always)]
     fn split<C: Bins>(&self, coder: &mut Coder<C>, mask: usize, half: usize, n: u32, c: usize, axis: usize) -> u32 {
         let want = if C::DECODES {
@@ -146,7 +147,7 @@ impl Split {
     }
 }
 
-/// Bytes of the children k with k & mask = half, at mask * 8 + half.
+/// Mask of the bytes of the children k with k & mask = half, at index mask * 8 + half.
 const CHILDREN: [u64; 64] = {
     let mut table = [0; 64];
     let mut at = 0;
@@ -172,8 +173,8 @@ fn sum(seen: Seen, mask: usize, half: usize) -> u32 {
     (pairs.wrapping_mul(0x0001_0001_0001_0001) >> 48) as u32
 }
 
-/// On which side of the axis `bit` a neighbour has more points, of the part of it given by the bits above `bit`:
-/// 0: it has none, 1: on the low side, 2: on the high side, 3: as many.
+/// Compares the halves of a neighbour along the axis `bit`, within the part given by the bits above `bit`. 0: no points, 1:
+/// more on the low side, 2: more on the high side, 3: equal.
 #[inline]
 fn halves(seen: Seen, bit: usize, part: usize) -> usize {
     let mask = [7, 7, 6, 6, 4][bit]; // the axis and those split before it

@@ -4,7 +4,7 @@ const PRIMES: [u32; 3] = [1, 2_654_435_761, 805_459_861]; // x is not multiplied
 
 #[derive(Clone, Copy)]
 pub struct GridLevel {
-    pub cells: u32, // on a side
+    pub cells: u32, // along a side
     pub first: usize,
     pub entries: usize,
     pub dense: bool,

@@ -12,10 +12,10 @@ use crate::scene::{Gradients, Splats};
 use crate::tile_passes::backward_tiles;
 
 impl Rasterizer {
-    /// Gradients of the last training picture. `grad_image` [H, W, 3], `grad_alpha` [H, W] of the region.
+    /// Gradients of the last image rendered with `training`. `grad_image` [H, W, 3] and `grad_alpha` [H, W] of the region.
     ///
     /// # Errors
-    /// Wrong lengths, or no forward pass with `training` before.
+    /// Wrong lengths; no forward pass with `training` before.
     pub fn backward(
         &mut self,
         splats: &Splats,

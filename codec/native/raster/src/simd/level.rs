@@ -1,6 +1,6 @@
 //! Instruction sets: which ones this build and this machine have.
 
-/// An instruction set that this machine has been found to have. There is no other way to make one, so kernels may rely on it.
+/// An instruction set that was detected on this machine. It cannot be made otherwise, so kernels may rely on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SimdLevel(Isa);
 

@@ -1,4 +1,4 @@
-//! The plain reference instance: one lane, the standard library's functions.
+//! The scalar reference instance: one lane, functions of the standard library.
 
 use super::vector::Vector;
 

@@ -1,4 +1,4 @@
-//! The vector interface that the kernels are generic over, and what its instances share.
+//! The vector interface that the kernels are generic over, and the functions that its instances share.
 
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
 
@@ -18,7 +18,7 @@ pub trait Vector:
     type Mask: Copy + BitAnd<Output = Self::Mask> + BitOr<Output = Self::Mask> + Not<Output = Self::Mask>;
 
     fn splat(x: f32) -> Self;
-    /// The first LANES values of `s`, which must have as many.
+    /// Loads the first LANES values of `s`, which must have as many.
     fn load(s: &[f32]) -> Self;
     fn store(self, d: &mut [f32]);
     /// self * b + c
@@ -89,7 +89,7 @@ pub(crate) fn c<V: Vector>(x: f32) -> V {
     V::splat(x)
 }
 
-/// Asks for `items[index]` to be in the cache soon.
+/// Prefetches `items[index]` into the cache.
 #[inline(always)]
 pub(crate) fn prefetch<T>(items: &[T], index: usize) {
     #[cfg(target_arch = "x86_64")]
@@ -102,7 +102,7 @@ pub(crate) fn prefetch<T>(items: &[T], index: usize) {
     let _ = (items, index);
 }
 
-/// 1.5 * 2^23: adding it rounds to whole numbers, which then stand in the low bits.
+/// 1.5 * 2^23: adding it rounds to an integer, which is then in the low bits.
 pub(crate) const MAGIC: f32 = 12_582_912.0;
 
 /// Minimax polynomial of 2^f on [-0.5, 0.5], degree 4, relative error 2.6e-6.
@@ -114,7 +114,7 @@ pub(crate) fn exp2_poly<V: Vector>(f: V) -> V {
     f.mul_add(p, c(9.999_992e-1))
 }
 
-/// x + magic, and 2^(x rounded down or up to a whole number - x); step by step for all of them, which hides the latency.
+/// x + magic, and 2^(x - x rounded); the N vectors are interleaved, which hides the latency.
 #[inline(always)]
 pub(crate) fn exp2_polys<V: Vector, const N: usize>(x: [V; N], magic: V) -> ([V; N], [V; N]) {
     let up = x.map(|x| x + magic);
