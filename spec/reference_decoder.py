@@ -229,8 +229,8 @@ def blend_nodes(group, x0, t):
     return x, np.where(length < 1e-12, q[j[:, 0]], total / np.maximum(length, 1e-12))
 
 
-def bent(v, low, width, slopes):
-    """Clause 13.1: [N] along the curve of its channel."""
+def expand(v, low, width, slopes):
+    """Clause 13.1: [N] coded values of a companded channel -> values."""
     rise = 2.0 ** (np.array(slopes) / 16)
     before = np.concatenate([[0], rise.cumsum()])
     j = np.clip(np.floor((v - low) / width), 0, 7).astype(int)
@@ -241,27 +241,29 @@ def canonical(header, attribute, integers):
     """Clause 13.1: integers [C, N] -> a0 [N, C], without the correction."""
     steps, offsets = header.channels[attribute]
     values = np.array(offsets) + np.array(steps) * integers.T
-    if attribute in header.curves:
-        values = np.stack([bent(v, *curve) for v, curve in zip(values.T, header.curves[attribute], strict=True)], 1)
+    if attribute in header.companding:
+        values = np.stack(
+            [expand(v, *table) for v, table in zip(values.T, header.companding[attribute], strict=True)], 1
+        )
     return values
 
 
 def rotations(header, channels, near):
     """Clause 13.1: quats0 [N, 4] of what a layer codes itself; `near`: the neighbours of each."""
     steps, offsets = (np.array(v) for v in header.channels[QUATS])
-    octaves = -canonical(header, LOG_SCALES, channels[LOG_SCALES]) @ np.array(header.levers).T
-    widths = np.minimum(1, steps * 2.0 ** np.clip(octaves, -64, 64))
-    v = np.clip(offsets + widths * channels[QUATS].T, -1, 1)
-    turns = None
+    octaves = -canonical(header, LOG_SCALES, channels[LOG_SCALES]) @ np.array(header.scale_exponents).T
+    own_steps = np.minimum(1, steps * 2.0 ** np.clip(octaves, -64, 64))
+    v = np.clip(offsets + own_steps * channels[QUATS].T, -1, 1)
+    residuals = None
     for c in (2, 1, 0):
         one = np.zeros((len(v), 4))
         one[:, 0], one[:, 1 + c] = np.sqrt(1 - v[:, c] ** 2), v[:, c]
-        turns = one if turns is None else quaternion_product(turns, one)
+        residuals = one if residuals is None else quaternion_product(residuals, one)
     quats0 = np.zeros((len(v), 4))
     for i in range(len(v)):
         known = near[i] and near[i][0] >= 512 * (i // 512)
         before = quats0[near[i][0]] if known else np.array([1.0, 0, 0, 0])
-        quats0[i] = quaternion_product(before, turns[i])
+        quats0[i] = quaternion_product(before, residuals[i])
     return quats0
 
 

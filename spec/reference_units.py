@@ -119,9 +119,9 @@ class Header:
     layers: list
     channels: dict  # attribute -> (steps, offsets)
     trajectories: dict  # attribute -> (K_a, step)
-    levers: list  # of each channel of quats, by each of log_scales
+    scale_exponents: list  # [3][3]: channel of quats, channel of log_scales
     shifts: list  # of each layer, attribute -> low bits that are not coded; MEANS: of positions
-    curves: dict  # attribute -> (low, width, slopes) of each channel; without curves empty
+    companding: dict  # attribute -> (low, width, slopes) of each channel; empty without companding
     node_count: int = 0
     neighbors: int = 0
     node_coefficients: int = 0
@@ -193,8 +193,8 @@ def read_channels(r, sh_degree):
     return channels
 
 
-def read_levers(r):
-    """Clause 4: [3][3], octaves."""
+def read_scale_exponents(r):
+    """Clause 4: [3][3]."""
     return [[(byte - 256 if byte > 127 else byte) / 32 for byte in r.take(3)] for _ in range(3)]
 
 
@@ -208,10 +208,13 @@ def read_shifts(r, layer_count, grid_bits, attributes):
     return shifts
 
 
-def read_curves(r):
+def read_companding(r):
     """Clause 4: attribute -> (low, width, slopes) of each channel."""
-    curve = lambda: (r.f32("low of a curve"), r.f32("width of a curve", positive=True), list(r.take(8)))  # noqa: E731
-    return {LOG_SCALES: [curve() for _ in range(3)], LOGIT_OPACITIES: [curve()]}
+
+    def channel():
+        return r.f32("companding low"), r.f32("companding width", positive=True), list(r.take(8))
+
+    return {LOG_SCALES: [channel() for _ in range(3)], LOGIT_OPACITIES: [channel()]}
 
 
 def expected_map_width_log2(count):
@@ -227,15 +230,15 @@ def read_group_header(payload, reference=None):
         require(reference is not None and not reference.reference, "group_header: no independent group to refer to")
         layers, channels = read_layers(r, reference), reference.channels
         grid = reference.origin, reference.grid_step, reference.grid_bits, reference.sh_degree
-        levers, shifts, curves = reference.levers, reference.shifts, reference.curves
+        scale_exponents, shifts, companding = reference.scale_exponents, reference.shifts, reference.companding
     else:
         grid = read_grid(r)
         layers = read_layers(r, None)
         channels = read_channels(r, grid[3])
-        levers = read_levers(r)
+        scale_exponents = read_scale_exponents(r)
         unshifted = [dict.fromkeys((MEANS, *channels), 0)] * len(layers)
         shifts = read_shifts(r, len(layers), grid[2], channels) if flags & 8 else unshifted
-        curves = read_curves(r) if flags & 2 else {}
+        companding = read_companding(r) if flags & 2 else {}
     sh_degree = grid[3]
     trajectories, last = {}, 0
     for _ in range(r.u8()):
@@ -245,7 +248,7 @@ def read_group_header(payload, reference=None):
         require(1 <= coefficients <= frames, f"group_header: {coefficients} coefficients, expected 1 to {frames}")
         trajectories[attribute] = coefficients, r.f32("trajectory step", positive=True)
         last = attribute
-    header = Header(frames, back, *grid, layers, channels, trajectories, levers, shifts, curves, r.u32())
+    header = Header(frames, back, *grid, layers, channels, trajectories, scale_exponents, shifts, companding, r.u32())
     if header.node_count:
         header.neighbors, header.node_coefficients = r.u8(), r.u16()
         require(1 <= header.neighbors <= 8, f"group_header: neighbors is {header.neighbors}, expected 1 to 8")

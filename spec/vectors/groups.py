@@ -155,8 +155,8 @@ def coarser(group, shifts):
     return group | {"positions": positions, "channels": channels, "shifts": shifts.tolist()}
 
 
-def curved(group):
-    """A group dict whose channels of log_scales and logit_opacities have curves: gentle, steep, flat, around 0."""
+def companded(group):
+    """A group dict whose channels of log_scales and logit_opacities are companded: gentle, steep, flat, around 0."""
     rows = [[-0.3, 0.02, *range(0, 40, 5)], [0.0, 1e-3, *range(255, 15, -32)], [-1.0, 0.5, *[0] * 8]]
     curves = {"log_scales": rows, "logit_opacities": [[-0.4, 0.125, 48, 16, 0, 0, 3, 0, 16, 64]]}
     channels = {name: c | {"curves": curves.get(name)} for name, c in group["channels"].items()}

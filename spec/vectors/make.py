@@ -34,7 +34,7 @@ from files import (  # noqa: E402
 )
 from groups import (  # noqa: E402
     coarser,
-    curved,
+    companded,
     duplicates,
     encode,
     extremes,
@@ -79,7 +79,9 @@ REFERENCE = make_group(120, 4, nodes=5, trajectories={"means": 2, "sh0": 2}, lif
 FULL = make_group(160, 6, seed=4, nodes=8, trajectories={"means": 3, "quats": 6, "sh0": 1}, lifetimes=True)
 UNCHANGED = predicted(REFERENCE, FULL, deaths=lambda i: False, births=0)
 SHIFTS = [[0, 0, 0, 0, 0], [1, 2, 3, 0, 4], [3, 15, 1, 2, 3]]
-CURVED = curved(coarser(layered(make_group(90, 3, spread=40, trajectories={"log_scales": 2}), [[0], [1], [2]]), SHIFTS))
+COMPANDED = companded(
+    coarser(layered(make_group(90, 3, spread=40, trajectories={"log_scales": 2}), [[0], [1], [2]]), SHIFTS)
+)
 LAYERED = layered(make_group(100, 3, nodes=4, trajectories={"means": 2}), [[0], [1, 2], [3, 4, 5]])
 
 VALID = {  # name: (what it is about, bytes)
@@ -197,9 +199,9 @@ VALID = {  # name: (what it is about, bytes)
         "layers that leave out low bits",
         lambda: groups_file(coarser(layered(FULL, [[0, 2], [1], [3, 4]]), SHIFTS)),
     ),
-    "curves": (
-        "curves, with layers that leave out low bits and a trajectory on top, and a group predicted from it",
-        lambda: predicted_file(CURVED, predicted(CURVED, FULL, births=0)),
+    "companding": (
+        "companding, with layers that leave out low bits and a trajectory on top, and a group predicted from it",
+        lambda: predicted_file(COMPANDED, predicted(COMPANDED, FULL, births=0)),
     ),
     "no_groups": ("a stream without groups yet", lambda: groups_file(finish=False)),
 }
@@ -319,10 +321,14 @@ INVALID = {  # name: (error, part of the package's message, bytes)
         lambda: layers_file(lambda units: find_unit(units, 2, 3, 1).update(dependencies=[1])),
     ),
     "layer_unannounced": (B, "announces", lambda: layers_file(lambda u: u.append(unit_dict(1, layer=3)))),
-    "header_curve_width": (B, "width", header(flags=2, curves=[(0.0, 0.1), (0.0, 0.0), (0.0, 0.1), (0.0, 0.1)])),
-    "header_curve_low": (B, "low", header(flags=2, curves=[(0.0, 0.1), (0.0, 0.1), (0.0, 0.1), (INF, 0.1)])),
-    "header_curve_cut": (B, "", header(flags=2)),
-    "predicted_curves": (B, "flags", change_predicted(lambda h: h[:2] + bytes([h[2] | 2]) + h[3:])),
+    "header_companding_width": (
+        B,
+        "width",
+        header(flags=2, companding=[(0.0, 0.1), (0.0, 0.0), (0.0, 0.1), (0.0, 0.1)]),
+    ),
+    "header_companding_low": (B, "low", header(flags=2, companding=[(0.0, 0.1), (0.0, 0.1), (0.0, 0.1), (INF, 0.1)])),
+    "header_companding_cut": (B, "", header(flags=2)),
+    "predicted_companding": (B, "flags", change_predicted(lambda h: h[:2] + bytes([h[2] | 2]) + h[3:])),
     "header_flags": (B, "flags", header(flags=16)),
     "header_shift": (B, "shift", header(flags=8, shifts=[0, 16, 0, 0, 0])),
     "header_shift_positions": (B, "shift", header(flags=8, shifts=[HEADER["grid_bits"], 0, 0, 0, 0])),

@@ -181,8 +181,8 @@ def pack_header(**changes):
     data += b"".join(struct.pack(">IB", *layer) for layer in h["layer_counts"]) + bytes([len(h["channels"])])
     for attribute, pairs in h["channels"]:
         data += bytes([attribute]) + b"".join(struct.pack(">ff", *pair) for pair in pairs)
-    data += bytes(9) + bytes(h.get("shifts", b""))  # no levers
-    data += b"".join(struct.pack(">ff8x", *curve) for curve in h.get("curves", ()))
+    data += bytes(9) + bytes(h.get("shifts", b""))  # scale_exponents of 0
+    data += b"".join(struct.pack(">ff8x", *channel) for channel in h.get("companding", ()))
     data += bytes([len(h["trajectories"])]) + b"".join(struct.pack(">BHf", *t) for t in h["trajectories"])
     data += struct.pack(">I", h["node_count"])
     if h["node_count"]:

@@ -84,7 +84,10 @@ fn context_neighbors<'py>(py: Python<'py>, positions: PyReadonlyArray2<'py, u32>
         near.iter().map(known).collect::<Vec<_>>()
     });
     let flat: Vec<i64> = own.collect();
-    Ok(flat.into_pyarray(py).reshape([p.len(), gsv::neighbors::NEAR])?.into_any())
+    Ok(flat
+        .into_pyarray(py)
+        .reshape([p.len(), gsv::neighbors::NEAR])?
+        .into_any())
 }
 
 /// Quaternions [N, 4] f32 of what a layer codes itself -> integers [N, 3] i32 of quats, and the form [N] u8 of each: 1, i, j or
@@ -110,13 +113,13 @@ fn code_turns<'py>(
             p.len()
         ));
     }
-    let turns = gsv::turns::Turns {
+    let residuals = gsv::rotation_residuals::RotationResiduals {
         quats: quats.as_chunks().0,
         steps: steps.as_chunks().0,
-        worth: worth.as_chunks().0,
+        error_bits: worth.as_chunks().0,
         lengths,
     };
-    let coded = py.detach(|| turns.code(&gsv::neighbors::nearest(&p)));
+    let coded = py.detach(|| residuals.quantize(&gsv::neighbors::nearest(&p)));
     let integers: Vec<i32> = coded.iter().flat_map(|c| c.integers).collect();
     let forms: Vec<u8> = coded.iter().map(|c| c.form).collect();
     Ok((
@@ -200,7 +203,10 @@ fn attributes<'py>(py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
         d.set_item("name", a.name())?;
         d.set_item("number", a as u8)?;
         d.set_item("channels", a.channels(1) / if a == Attribute::ShN { 3 } else { 1 })?;
-        d.set_item("companded", [Attribute::LogScales, Attribute::LogitOpacities].contains(&a))?;
+        d.set_item(
+            "companded",
+            [Attribute::LogScales, Attribute::LogitOpacities].contains(&a),
+        )?;
         list.append(d)?;
     }
     Ok(list)

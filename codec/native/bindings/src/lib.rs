@@ -1,4 +1,6 @@
-//! The one door between Rust and its hosts: `python` builds `gscodec._native`, `wasm` the decoder of the web player. Arrays in, arrays out, no algorithms.
+//! Bindings of the Rust core: feature `python` builds `gscodec._native`, feature `wasm` the decoder of the web player.
+//!
+//! Arrays in, arrays out, no algorithms.
 #[cfg(feature = "python")]
 mod gsv_py;
 #[cfg(feature = "python")]

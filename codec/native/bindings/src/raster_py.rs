@@ -1,15 +1,16 @@
-//! `_native.Rasterizer`: numpy arrays in, numpy arrays out. Parameters come as the tuple (means, quats, log_scales,
-//! logit_opacities, sh0, shN), f32 and contiguous; gradients as those and (grad2d, max_weight, sum_weight), written in place.
+//! `_native.Rasterizer`: numpy arrays in, numpy arrays out.
+//!
+//! Parameters are the tuple (means, quats, log_scales, logit_opacities, sh0, shN), f32 and contiguous. Gradients are a tuple
+//! of the same shapes and (grad2d, max_weight, sum_weight), written in place.
 
+mod arrays;
 mod kernels;
 
-use numpy::{PyArray1, PyReadonlyArrayDyn, PyReadwriteArrayDyn, prelude::*};
-use pyo3::exceptions::{PyOverflowError, PyValueError};
+use arrays::{In, InOut, contiguous, level, usage};
+use numpy::{PyArray1, PyReadonlyArrayDyn, prelude::*};
 use pyo3::prelude::*;
-use raster::{Gradients, Lambdas, Level, Projected, RasterError, Region, Shade, Splats, Step, Surface, Target, View};
+use raster::{Background, Gradients, Lambdas, Projected, Region, SimdLevel, Splats, Step, Surface, TargetImage, View};
 
-type In<'py> = PyReadonlyArrayDyn<'py, f32>;
-type InOut<'py> = PyReadwriteArrayDyn<'py, f32>;
 type Bytes<'py> = PyReadonlyArrayDyn<'py, u8>;
 type Params<'py> = (In<'py>, In<'py>, In<'py>, In<'py>, In<'py>, In<'py>);
 type Grads<'py> = (
@@ -24,18 +25,6 @@ type Crop<'py> = (
 type Value = (f64, f64, f64, f64, f64, [f64; 3]);
 /// (image, alpha), flat
 type Picture<'py> = (Bound<'py, PyArray1<f32>>, Bound<'py, PyArray1<f32>>);
-
-/// ValueError for wrong arguments, OverflowError for what is too large.
-fn usage(e: RasterError) -> PyErr {
-    match e {
-        RasterError::TooMany { .. } => PyOverflowError::new_err(e.to_string()),
-        _ => PyValueError::new_err(e.to_string()),
-    }
-}
-
-fn contiguous<T>(r: Result<T, impl std::fmt::Display>) -> PyResult<T> {
-    r.map_err(|e| PyValueError::new_err(e.to_string()))
-}
 
 fn splats<'a>(p: &'a Params) -> PyResult<Splats<'a>> {
     Ok(Splats {
@@ -62,20 +51,6 @@ fn gradients<'a>(g: &'a mut Grads) -> PyResult<Gradients<'a>> {
         grad2d: contiguous(stats.0.as_slice_mut())?,
         max_weight: contiguous(stats.1.as_slice_mut())?,
         sum_weight: contiguous(stats.2.as_slice_mut())?,
-    })
-}
-
-fn level(name: &str) -> PyResult<Level> {
-    if name == "auto" {
-        return Ok(Level::best());
-    }
-    let available = Level::available();
-    let names: Vec<&str> = available.iter().map(|l| l.name()).collect();
-    available.iter().copied().find(|l| l.name() == name).ok_or_else(|| {
-        PyValueError::new_err(format!(
-            "simd {name:?} is not available here, expected auto or one of {}",
-            names.join(", ")
-        ))
     })
 }
 
@@ -159,8 +134,11 @@ impl Rasterizer {
         training: bool,
     ) -> PyResult<Picture<'py>> {
         let (splats, view) = (splats(&params)?, view.view());
-        py.detach(|| self.inner.forward(&splats, &view, Shade::over(background), training))
-            .map_err(usage)?;
+        py.detach(|| {
+            self.inner
+                .forward(&splats, &view, Background::new(background), training)
+        })
+        .map_err(usage)?;
         Ok((
             PyArray1::from_slice(py, self.inner.image()),
             PyArray1::from_slice(py, self.inner.alpha()),
@@ -175,9 +153,9 @@ impl Rasterizer {
             .map_err(usage)
     }
 
-    /// One step on a batch of crops: of each (loss, l1, mse, ssim, mask, gradient of the gain), and [N] the largest radii. The
-    /// gradients are those of the sum of the losses. A crop is (view, (background, gain or None), (rgb, alpha or None, weight
-    /// or None)).
+    /// One training step on a batch of crops. Returns for each crop (loss, l1, mse, ssim, mask, gradient of the gain), and
+    /// [N] the largest radii. The gradients are those of the sum of the losses. A crop is (view, (background, gain or None),
+    /// (rgb, alpha or None, weight or None)).
     fn step<'py>(
         &mut self,
         py: Python<'py>,
@@ -195,20 +173,20 @@ impl Rasterizer {
         let (step, inner) = (&mut self.step, &mut self.inner);
         let (mut values, mut radii) = (Vec::new(), vec![0.0f32; splats.len()]);
         for (view, (background, gain), (rgb, alpha, weight)) in &crops {
-            let target = Target {
+            let target = TargetImage {
                 rgb: contiguous(rgb.as_slice())?,
                 alpha: alpha.as_ref().map(|a| contiguous(a.as_slice())).transpose()?,
                 weight: weight.as_ref().map(|w| contiguous(w.as_slice())).transpose()?,
             };
-            let (view, shade) = (
+            let (view, background) = (
                 view.view(),
-                Shade {
-                    background: *background,
+                Background {
+                    rgb: *background,
                     gain: *gain,
                 },
             );
             let v = py
-                .detach(|| step.run(inner, &splats, &view, shade, target, lambdas, &mut out))
+                .detach(|| step.run(inner, &splats, &view, background, target, lambdas, &mut out))
                 .map_err(usage)?;
             values.push((v.loss, v.image.l1, v.image.mse, v.image.ssim, v.mask, v.gain));
             radii
@@ -220,7 +198,7 @@ impl Rasterizer {
         Ok((values, PyArray1::from_vec(py, radii)))
     }
 
-    /// Draws and returns the picture as 8 bits, flat.
+    /// Renders to 8-bit colour, flat.
     fn draw<'py>(
         &mut self,
         py: Python<'py>,
@@ -232,12 +210,12 @@ impl Rasterizer {
         view.check().map_err(usage)?; // before its size is allocated
         let mut out = vec![[0; 3]; view.region.pixels()];
         let surface = Surface::Rgb(&mut out);
-        py.detach(|| self.inner.paint(surface, &splats, &view, Shade::over(background)))
+        py.detach(|| self.inner.paint(surface, &splats, &view, Background::new(background)))
             .map_err(usage)?;
         Ok(PyArray1::from_vec(py, out.into_flattened()))
     }
 
-    /// The picture of the last pass.
+    /// (image, alpha) of the last pass, flat.
     fn picture<'py>(&self, py: Python<'py>) -> Picture<'py> {
         (
             PyArray1::from_slice(py, self.inner.image()),
@@ -245,7 +223,7 @@ impl Rasterizer {
         )
     }
 
-    /// [N] larger half side of each ellipse's box in pixels, 0 for the invisible, and [N] depths.
+    /// [N] larger half side of the box of each Gaussian in pixels, 0 if invisible, and [N] depths.
     fn radii<'py>(&self, py: Python<'py>) -> Picture<'py> {
         let projected = self.inner.projected();
         (
@@ -258,7 +236,7 @@ impl Rasterizer {
 /// Names of the instruction sets that this machine can use, fastest first.
 #[pyfunction]
 fn simd_levels() -> Vec<&'static str> {
-    Level::available().iter().map(|l| l.name()).collect()
+    SimdLevel::available().iter().map(|l| l.name()).collect()
 }
 
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {

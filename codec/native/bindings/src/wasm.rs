@@ -1,9 +1,9 @@
-//! The decoder and rasterizer for the web player: plain exports over numbers, no glue generator.
+//! The decoder and rasterizer for the web player: plain exports over numbers, without a glue generator.
 //!
-//! An instance is one worker's: it has one demuxer, a few decoded groups, one rasterizer, and three buffers through which
-//! bytes pass (`input`, `splats`, `output`). The host writes where `input` or `splats` tell it to, calls, and reads `output`,
-//! `pixels` or a band; any call may move the memory, so addresses hold until the next one. Calls that can fail return
-//! false and leave a message in `output`. Nothing here is unsafe: the host touches memory only from outside.
+//! Each worker has one instance: a demuxer, a few decoded groups, a rasterizer, and the buffers `input`, `splats` and
+//! `output`. The host writes to the address that `input` or `splats` returns, calls an export, and reads `output`, `pixels`
+//! or a band. Any call may move the memory, so an address is valid until the next call. Exports that can fail return false
+//! and leave a message in `output`. Nothing here is unsafe: only the host accesses the memory.
 
 mod pack;
 mod player;
@@ -20,7 +20,7 @@ fn with<R>(f: impl FnOnce(&mut Player) -> R) -> R {
     PLAYER.with_borrow_mut(f)
 }
 
-/// Room for `length` bytes of input.
+/// Allocates room for `length` bytes of input.
 #[unsafe(no_mangle)]
 pub extern "C" fn input(length: usize) -> *mut u8 {
     with(|p| {
@@ -46,13 +46,13 @@ pub extern "C" fn push() -> bool {
     with(Player::push)
 }
 
-/// Where the next byte that is pushed is taken to come from.
+/// File offset of the next byte to push.
 #[unsafe(no_mangle)]
 pub extern "C" fn position() -> f64 {
     with(|p| p.demuxer.position() as f64)
 }
 
-/// Bytes from there that need not be pushed.
+/// Number of bytes from that offset on that need not be pushed.
 #[unsafe(no_mangle)]
 pub extern "C" fn skippable() -> f64 {
     with(|p| p.demuxer.skippable() as f64)
@@ -74,14 +74,14 @@ pub extern "C" fn describe(first: usize) {
     with(|p| p.describe(first));
 }
 
-/// Input: a group's payload, or what precedes its layers behind the first `layers`. It goes to `slot`; the group that it
-/// refers to, if it is a predicted one, is in the slot `reference`. Output: its header as JSON.
+/// Input: the payload of a group, or its start up to the end of the first `layers` layers. The group goes to `slot`; the
+/// reference of a predicted group is in the slot `reference`. Output: its header as JSON.
 #[unsafe(no_mangle)]
 pub extern "C" fn decode(slot: usize, level: u8, reference: usize, layers: usize) -> bool {
     with(|p| p.decode(slot, level, reference, layers))
 }
 
-/// Input: a group's payload, or the start of one. How many groups back it refers, 0: it is independent; -1: it is damaged.
+/// Input: the payload of a group, or its start. Returns how many groups back it refers; 0: independent; -1: damaged.
 #[unsafe(no_mangle)]
 pub extern "C" fn reference() -> i32 {
     with(Player::reference)
@@ -137,7 +137,8 @@ pub extern "C" fn band_rows(i: usize) -> usize {
     with(|p| p.band(i).map_or(0, |b| b.rows))
 }
 
-/// Input: as for `project`. Output: what it shows of the evaluated frame as Spark takes it, relative to an origin.
+/// Input: as for `project`. Output: the visible Gaussians of the evaluated frame in the format of Spark, relative to an
+/// origin.
 #[unsafe(no_mangle)]
 pub extern "C" fn pack(x: f32, y: f32, z: f32) -> bool {
     with(|p| p.pack([x, y, z]))
@@ -149,25 +150,25 @@ pub extern "C" fn splat_size() -> usize {
     size_of::<raster::Projected>()
 }
 
-/// Room for a band of another instance.
+/// Allocates room for a band of another instance.
 #[unsafe(no_mangle)]
 pub extern "C" fn splats(count: usize) -> *mut u8 {
     with(|p| p.splats(count))
 }
 
-/// Draws those over a background.
+/// Draws the Gaussians in `splats` over a background.
 #[unsafe(no_mangle)]
 pub extern "C" fn draw(width: usize, height: usize, red: f32, green: f32, blue: f32) -> bool {
     with(|p| p.draw([width, height], [red, green, blue]))
 }
 
-/// [height, width, 4] u8: what was drawn.
+/// [height, width, 4] u8: the drawn image.
 #[unsafe(no_mangle)]
 pub extern "C" fn pixels() -> *const u8 {
     with(|p| p.pixels.as_ptr().cast())
 }
 
-/// Chooses the instruction set by its place among `raster::Level::available`; for tests and measurements.
+/// Chooses the instruction set by its index in `raster::SimdLevel::available`; for tests and measurements.
 #[unsafe(no_mangle)]
 pub extern "C" fn use_level(i: usize) -> bool {
     with(|p| p.use_level(i))

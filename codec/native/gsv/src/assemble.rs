@@ -1,4 +1,4 @@
-//! What the units of each layer decode to -> a group: survivors before births, layer after layer.
+//! Decoded units of each layer -> one group: the layers in order, and in each the survivors before the births.
 
 use crate::attributes::Attribute;
 use crate::dequantize;
@@ -7,7 +7,7 @@ use crate::header::{Header, LayerHeader};
 use crate::neighbors::{Contexts, Near};
 use crate::trajectories::Trajectories;
 
-/// What a unit decodes to, besides points.
+/// A decoded unit other than points.
 pub enum Part {
     Channels(Vec<i32>),
     Lifetimes(Vec<[u16; 2]>),
@@ -15,10 +15,10 @@ pub enum Part {
     Correction(f32),
 }
 
-/// Points of a layer, before anything else of it is decoded.
+/// The positions of a layer, decoded before its other units.
 pub struct LayerPoints {
     pub header: LayerHeader,
-    /// As many as the header tells: the layer, and that of the reference, are not damaged.
+    /// The numbers of Gaussians are those of the header: neither the layer nor that of the reference is damaged.
     pub whole: bool,
     /// Indices in the reference.
     pub survivors: Vec<u32>,
@@ -26,7 +26,7 @@ pub struct LayerPoints {
     pub contexts: Contexts,
 }
 
-/// What the other units of a layer hold.
+/// The other units of a layer.
 pub struct Slot {
     channels: Vec<Vec<i32>>, // of births
     trajectories: Vec<Option<Trajectories>>,
@@ -44,7 +44,7 @@ impl Slot {
         }
     }
 
-    /// Quaternions of births, whose neighbours are `near`.
+    /// Quaternions of the births; `near`: their context neighbours.
     fn rotations(&self, h: &Header, near: &[Near]) -> Vec<[f32; 4]> {
         let integers = |a| {
             let at = h.attributes().iter().position(|b| *b == a);
@@ -73,7 +73,7 @@ impl Slot {
     }
 }
 
-/// The layers one after the other; 0 and stillness stand in for what is damaged.
+/// Concatenates the layers; damaged units are replaced by 0, or by no motion.
 pub fn assemble(layers: Vec<LayerPoints>, slots: Vec<Slot>, reference: Option<&Group>, h: &Header) -> Group {
     let mut group = Group {
         channels: vec![Vec::new(); h.scales.len()],
@@ -123,7 +123,7 @@ pub fn assemble(layers: Vec<LayerPoints>, slots: Vec<Slot>, reference: Option<&G
     group
 }
 
-/// `extend` that takes over the first.
+/// Appends `b` to `a` without a copy where `a` is empty.
 pub fn append<T>(to: &mut Vec<T>, more: Vec<T>) {
     if to.is_empty() { *to = more } else { to.extend(more) }
 }

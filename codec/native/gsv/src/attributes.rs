@@ -32,7 +32,7 @@ impl Attribute {
         }
     }
 
-    /// Integers per Gaussian.
+    /// Number of channels: integers per Gaussian.
     pub fn channels(self, sh_degree: u8) -> usize {
         match self {
             LogitOpacities => 1,
@@ -48,7 +48,7 @@ impl Attribute {
     }
 }
 
-/// Coefficients of the higher bands per colour channel.
+/// SH coefficients above degree 0, per colour channel.
 pub fn sh_coefficients(sh_degree: u8) -> usize {
     (usize::from(sh_degree) + 1).pow(2) - 1
 }

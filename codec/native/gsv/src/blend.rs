@@ -1,12 +1,11 @@
-//! Which nodes move a Gaussian, and how much (spec 13.2): exact integers, so that encoder and decoder agree.
+//! Node weights (spec 13.2): which nodes move a Gaussian, and by how much. Exact integers, so that encoder and decoder
+//! agree.
 
+pub use crate::node_search::NEIGHBORS_MAX;
 use crate::node_search::NodeSearch;
 use rayon::prelude::*;
 
-/// Neighbours a Gaussian may have (spec 4).
-pub const NEIGHBORS_MAX: usize = 8;
-
-/// Nodes and weights of all Gaussians: `per` entries each, nearest first.
+/// Nodes and weights of all Gaussians: `per` entries each, nearest node first.
 #[derive(Debug, Clone, Default)]
 pub struct Blend {
     pub per: usize,
@@ -15,7 +14,8 @@ pub struct Blend {
 }
 
 impl Blend {
-    /// Both in Morton order, which makes runs compact; the result does not depend on it.
+    /// `positions` and `nodes` are in Morton order, which makes runs compact and the search fast; the result does not depend
+    /// on it.
     pub fn new(positions: &[[u32; 3]], nodes: &[[u32; 3]], neighbors: usize) -> Blend {
         let per = neighbors.min(nodes.len()).min(NEIGHBORS_MAX);
         if per == 0 {
@@ -44,7 +44,7 @@ impl Blend {
 /// Gaussians that share a search.
 const RUN: usize = 128;
 
-/// Weights of spec 13.2 from one more neighbour than there are weights.
+/// Weights of one Gaussian. `found` holds one more neighbour than there are weights.
 fn weights(found: &[(u64, u32)], nodes: usize, index: &mut [u32], weight: &mut [f32]) {
     let per = index.len();
     let scale = if nodes > per {

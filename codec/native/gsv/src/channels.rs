@@ -1,7 +1,7 @@
-//! Channels (spec 9): the canonical integers of one attribute <-> symbols, given what the neighbours hold.
+//! Channels (spec 9): the canonical integers of one attribute <-> symbols, in contexts made of the neighbours' integers.
 //!
-//! A value is coded around 0 while the neighbours' mean is small, so that contexts learn how far to trust it (most
-//! channels are noise around a mean of their own), and around the mean where that is large.
+//! A value is coded relative to 0 while the mean of the neighbours is small, so that the contexts learn how reliable the
+//! mean is (most channels are noise around a mean of their own); where the mean is large, relative to the mean.
 
 use crate::attributes::Attribute;
 use crate::neighbors::{NEAR, Near};
@@ -56,7 +56,8 @@ fn sh_class(channel: usize) -> usize {
     3 * band + channel % 3
 }
 
-/// Codes `x`; `near` are the neighbours' values, nearest first, `prev` two values of the same Gaussian. None: forbidden.
+/// Codes `x`; `near`: the neighbours' values, nearest first; `prev`: two values of the same Gaussian. None: a forbidden
+/// value.
 #[inline]
 fn value<C: Bins>(
     c: &mut C,
@@ -81,7 +82,7 @@ fn value<C: Bins>(
     (value.abs() <= MAX_VALUE).then_some(value)
 }
 
-/// 0 to 14: which of 15 ranges `v` is in, the wider the farther off.
+/// Maps `v` to one of 15 ranges, 0 to 14; ranges far from 0 are wider.
 #[inline]
 fn fold(v: i32) -> usize {
     const FAR: i32 = 25;
@@ -106,8 +107,8 @@ fn fold(v: i32) -> usize {
     usize::from(RANGES[(v.clamp(-FAR, FAR) + FAR) as usize])
 }
 
-/// Of each symbol: the value of least magnitude, and the bits behind it. 0, then each range of magnitudes with both signs; the
-/// last range is open, the last symbol forbidden.
+/// Of each symbol: the value of least magnitude, and the number of bits that follow. Symbol 0 is 0, then each range of
+/// magnitudes with both signs; the last range is open, the last symbol is forbidden.
 const VALUES: [(i32, u32); SYMBOLS] = {
     const RANGES: [(i32, u32); 15] = [
         (1, 0),

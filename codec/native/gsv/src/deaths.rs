@@ -1,10 +1,12 @@
-//! Deaths (spec 10.1): which Gaussians of the reference a predicted group no longer has <-> bins.
+//! Deaths (spec 10.1): which Gaussians of the reference are not in a predicted group <-> bins, in the context of the
+//! neighbours.
 
 use crate::model::Model;
 use crate::neighbors::Near;
 use crate::range_coder::Bins;
 
-/// Codes `dead`; `near` are the neighbours within the layer of the reference. False if the payload is over.
+/// Codes `dead`, one flag per Gaussian of the layer of the reference; `near`: their neighbours. False if the payload is
+/// over.
 pub fn code<C: Bins>(c: &mut C, near: &[Near], dead: &mut [bool]) -> bool {
     let mut model = Model::new(4, 5, 1);
     for (i, near) in near.iter().enumerate() {

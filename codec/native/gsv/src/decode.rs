@@ -1,18 +1,19 @@
-//! Payload -> group in integers (spec 3 to 12). The mirror of encode.rs.
+//! Payload -> group of integers (spec 3 to 12). The mirror of encode.rs.
 //!
-//! Points first, since all contexts come from them; then every other unit, in parallel, and the nodes beside them. Memory is taken only for what
-//! the header announces and the level allows, and trajectories grow against what is left of the level's symbols.
-//! Damage (spec 3) is an error, or what is not affected is decoded and the rest stands still or takes its offsets.
+//! Positions first, since all contexts come from them; then every other unit in parallel, and the nodes beside them. Memory
+//! is taken only for what the header announces and the level allows; trajectories grow against the symbols that the level
+//! has left. Damage (spec 3) is an error (strict), or the undamaged units are decoded and the damaged ones get the defaults
+//! of spec 3.
 
 use crate::assemble::{LayerPoints, Part, Slot, append, assemble};
 use crate::attributes::Attribute;
 use crate::channels;
+use crate::conformance::{self, Damage};
 use crate::deaths;
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader};
 use crate::group::Group;
 use crate::header::{Header, LayerHeader, NodeHeader};
-use crate::inventory::{self, Damage};
 use crate::levels::Level;
 use crate::lifetimes;
 use crate::morton;
@@ -25,18 +26,18 @@ use crate::values::MAX_VALUE;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// How a group is to be decoded.
+/// Options of decoding.
 #[derive(Clone, Copy)]
 pub struct Decoding<'a> {
     pub level: &'a Level,
     /// The group that a predicted one refers to.
     pub reference: Option<&'a Group>,
-    /// Only so many layers; the payload may end behind them.
+    /// Number of layers to decode; the payload may end behind them.
     pub layers: usize,
 }
 
 impl<'a> Decoding<'a> {
-    /// All of an independent group.
+    /// All layers of an independent group.
     pub fn at(level: &'a Level) -> Self {
         Decoding {
             level,
@@ -55,23 +56,22 @@ pub fn decode_group(payload: &[u8], how: &Decoding) -> Result<Group> {
     decode_units(&unit::split(payload, how.layers)?, how)
 }
 
-/// Decodes what is not damaged: damaged trajectories are none, damaged channels 0, damaged node units no nodes or no motion
-/// of theirs, damaged lifetimes leave all Gaussians shown, damaged deaths all alive, and damaged positions leave a layer without
-/// the Gaussians that it codes.
+/// Decodes the undamaged units. Defaults for damaged ones: no trajectories; channels 0; no nodes, or nodes without motion;
+/// all Gaussians shown in all frames; no deaths; no births in a layer with damaged positions.
 ///
 /// # Errors
-/// As `decode_group`, for damage only if it is in the header, or in an independent group in the positions of the first layer.
+/// As `decode_group`; damage only of the header, or of the positions of the first layer of an independent group.
 pub fn decode_damaged(payload: &[u8], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
     how.level.cap("group", "bytes", payload.len() as u64, how.level.bytes)?;
     decode(&unit::scan(payload, how.layers)?, how)
 }
 
-/// Decodes units whose checksums were verified, or are of no interest (fuzzing).
+/// Decodes units whose checksums were verified, or do not matter (fuzzing).
 pub fn decode_units(units: &[Unit], how: &Decoding) -> Result<Group> {
     Ok(decode(units, how)?.0)
 }
 
-/// How many groups back the group of a payload refers; 0: it is independent.
+/// How many groups back a payload refers; 0: it is independent.
 ///
 /// # Errors
 /// `Error::Bitstream`: the header is damaged.
@@ -88,7 +88,7 @@ fn decode(units: &[Unit], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
     let before = how.reference.map(|g| &g.header);
     let header = Header::read(first.payload, before).map_err(|e| e.at(first.payload_offset, &first.label(0)))?;
     let known = header.check(how.level, before)?;
-    let damage = inventory::check(units, &header, before, how.layers)?;
+    let damage = conformance::check(units, &header, before, how.layers)?;
     let decoder = GroupDecoder {
         reference: how.reference.filter(|_| header.reference > 0),
         header: &header,
@@ -135,9 +135,9 @@ struct GroupDecoder<'a> {
 }
 
 impl GroupDecoder<'_> {
-    /// Points of a unit; none if it is damaged or not there.
+    /// Decodes a unit of points; empty if it is damaged or missing.
     fn points(&self, kind: UnitType, layer: u8, count: u32) -> Result<Vec<[u32; 3]>> {
-        let Some(i) = inventory::find(self.units, (kind, layer, None)) else {
+        let Some(i) = conformance::find(self.units, (kind, layer, None)) else {
             return Ok(Vec::new());
         };
         let unit = &self.units[i];
@@ -153,7 +153,7 @@ impl GroupDecoder<'_> {
         Ok(points.map(|p| p.map(|v| v << shift)).collect())
     }
 
-    /// Survivors, then births. Where their positions are damaged there are no births, where deaths are nobody dies.
+    /// Positions of layer `k`: survivors, then births. Damaged positions: no births; damaged deaths: all survive.
     fn points_of_layer(&self, k: usize) -> Result<LayerPoints> {
         let told = self.header.layers.get(k).copied().unwrap_or_default();
         let births = self.points(UnitType::Positions, k as u8, told.births)?;
@@ -175,14 +175,14 @@ impl GroupDecoder<'_> {
         })
     }
 
-    /// Indices of those of layer `k` of the reference that live on.
+    /// Indices of the survivors of layer `k` in the reference.
     fn survivors(&self, k: usize) -> Result<Vec<u32>> {
         let Some(r) = self.reference else {
             return Ok(Vec::new());
         };
         let range = r.range(k..k + 1);
         let all = range.start as u32..range.end as u32;
-        let unit = inventory::find(self.units, (UnitType::Deaths, k as u8, None)).filter(|_| !range.is_empty());
+        let unit = conformance::find(self.units, (UnitType::Deaths, k as u8, None)).filter(|_| !range.is_empty());
         let Some((i, unit)) = unit.and_then(|i| Some((i, self.units.get(i)?))) else {
             return Ok(all.collect());
         };
@@ -199,11 +199,11 @@ impl GroupDecoder<'_> {
         Ok(survivors)
     }
 
-    /// Nodes and their motion, which need nothing of the Gaussians.
+    /// Nodes and their trajectories, which do not depend on the Gaussians.
     fn nodes(&self) -> Result<(Vec<[u32; 3]>, Trajectories)> {
         let h = &self.header.nodes;
         let positions = self.points(UnitType::NodePositions, 0, h.count)?;
-        let Some(i) = inventory::find(self.units, (UnitType::NodeTrajectories, 0, None)) else {
+        let Some(i) = conformance::find(self.units, (UnitType::NodeTrajectories, 0, None)) else {
             return Ok((positions, Trajectories::default()));
         };
         let (unit, near, k) = (
@@ -212,11 +212,12 @@ impl GroupDecoder<'_> {
             usize::from(h.coefficients),
         );
         let mut c = Decoder::new(unit.payload);
-        let t = trajectories::code(&mut c, Kind::Nodes, k, &near, &Trajectories::new(6), u64::MAX); // counted from the header
+        let t = trajectories::code(&mut c, Kind::Node, k, &near, &Trajectories::new(6), u64::MAX); // counted from the header
         finish(c, t.is_ok(), i, unit)?;
         Ok((positions, t.unwrap_or_default()))
     }
 
+    /// Decodes a unit other than points; None: nothing to decode, or its layer is damaged.
     fn part(&self, i: usize, unit: &Unit, layers: &[LayerPoints]) -> Result<Option<Part>> {
         let h = self.header;
         let Some(layer) = layers.get(usize::from(unit.layer)) else {
@@ -254,11 +255,12 @@ impl GroupDecoder<'_> {
         Ok(Some(part))
     }
 
-    /// Symbols that are left to a unit; several units may take them at the same time, `count` has the last word.
+    /// Symbols left for a unit. Several units may see the same number; `count` is what enforces the cap.
     fn budget(&self) -> u64 {
         self.level.symbols.saturating_sub(self.symbols.load(Ordering::Relaxed))
     }
 
+    /// Adds the symbols of decoded trajectories to the total and checks the cap.
     fn count(&self, t: std::result::Result<Trajectories, Stop>, i: usize, unit: &Unit) -> Result<(Part, bool)> {
         let symbols = match &t {
             Ok(t) => t.symbols() as u64,
@@ -274,7 +276,7 @@ impl GroupDecoder<'_> {
     }
 }
 
-/// Spec 10.2.
+/// Layer correction (spec 10.2).
 fn correction(i: usize, unit: &Unit) -> Result<Part> {
     let mut r = Reader::new(unit.payload);
     let mut value = 0.0;
@@ -285,6 +287,7 @@ fn correction(i: usize, unit: &Unit) -> Result<Part> {
     Ok(Part::Correction(value))
 }
 
+/// Checks that the payload is used up and that no forbidden value was read (`sound`).
 fn finish(c: Decoder, sound: bool, i: usize, unit: &Unit) -> Result<()> {
     let end = unit.payload_offset + unit.payload.len();
     match c.finish() {

@@ -1,29 +1,31 @@
-//! Integers of channels -> values (spec 13.1), and the integers of quats -> quaternions.
+//! Dequantization (spec 13.1): integers of channels -> values, and integers of quats -> quaternions.
 //!
-//! A rotation is told by turns from that of the nearest neighbour before it: axes lie alike where a surface is smooth. Steps
-//! follow from the sizes, since a turn moves what is long further than what is short.
+//! A rotation is coded as a residual relative to the rotation of the nearest neighbour before it, since neighbours on a
+//! smooth surface have similar axes. The steps of the residual depend on the scales: a rotation displaces a long Gaussian
+//! more than a short one.
 
 use crate::attributes::Attribute;
-use crate::curve::{Curve, Pieces};
-use crate::header::{Header, LEVER_UNIT};
+use crate::companding::{Companding, CompandingTable};
+use crate::header::{Header, SCALE_EXPONENT_UNIT};
 use crate::neighbors::Near;
 use rayon::prelude::*;
 
 pub type Quat = [f32; 4]; // wxyz
 pub const IDENTITY: Quat = [1.0, 0.0, 0.0, 0.0];
 const RUN: usize = 2048; // Gaussians of one task
-const BLOCK: usize = 512; // a turn is from a neighbour in the same block, so that f32 will do
+const BLOCK: usize = 512; // residuals refer to neighbours of the same block, so that f32 is precise enough
 
-/// offset + step * integer, along its curve if it has one, + shift: C per Gaussian; empty if the header lacks the attribute.
+/// offset + step * integer, expanded where the channel is companded, + shift: C per Gaussian. Empty if the header lacks the
+/// attribute.
 ///
-/// `shift` makes up for the layers behind that are not there (spec 10.2).
+/// `shift`: the correction for the layers that are not decoded (spec 10.2).
 pub fn values(h: &Header, a: Attribute, integers: &[i32], shift: f32) -> Vec<f32> {
     let at = h.attributes().iter().position(|b| *b == a);
     let Some(scale) = at.and_then(|k| h.scales.get(k)) else {
         return Vec::new();
     };
     let scales: Vec<(f32, f32)> = scale.steps.iter().copied().zip(scale.offsets.iter().copied()).collect();
-    let curves: Vec<Pieces> = h.curves_of(a).iter().map(Curve::pieces).collect();
+    let companding: Vec<CompandingTable> = h.companding_of(a).iter().map(Companding::table).collect();
     let mut out = vec![0.0; integers.len()];
     let channels = scales.len().max(1);
     let rows = RUN * channels;
@@ -34,29 +36,31 @@ pub fn values(h: &Header, a: Attribute, integers: &[i32], shift: f32) -> Vec<f32
                 for ((out, v), (step, offset)) in out.iter_mut().zip(row).zip(&scales) {
                     *out = offset + step * *v as f32;
                 }
-                out.iter_mut().zip(&curves).for_each(|(v, curve)| *v = curve.value(*v));
+                out.iter_mut()
+                    .zip(&companding)
+                    .for_each(|(v, table)| *v = table.expand(*v));
                 out.iter_mut().for_each(|v| *v += shift);
             }
         });
     out
 }
 
-/// Steps of the turns of a Gaussian by its decoded log_scales, none above 1.
+/// Steps of the rotation residual of a Gaussian, by its decoded log_scales; at most 1.
 #[inline]
-fn steps(h: &Header, own: &[f32], log_scales: [f32; 3]) -> [f32; 3] {
+fn rotation_steps(h: &Header, own: &[f32], log_scales: [f32; 3]) -> [f32; 3] {
     std::array::from_fn(|c| {
         let fall: f32 = (0..3)
-            .map(|j| f32::from(h.levers[c][j]) / LEVER_UNIT * log_scales[j])
+            .map(|j| f32::from(h.scale_exponents[c][j]) / SCALE_EXPONENT_UNIT * log_scales[j])
             .sum();
         (own.get(c).unwrap_or(&0.0) * (-fall).clamp(-64.0, 64.0).exp2()).min(1.0)
     })
 }
 
-/// Quaternions of the Gaussians that a layer codes itself, 3 integers each.
+/// Quaternions of the births of a layer, 3 integers each.
 ///
 /// # Arguments
-/// * `log_scales`: integers of that attribute, 3 a Gaussian.
-/// * `near`: neighbours of each, as contexts have them.
+/// * `log_scales`: integers of that attribute, 3 per Gaussian.
+/// * `near`: context neighbours of each Gaussian.
 pub fn rotations(h: &Header, integers: &[i32], log_scales: &[i32], near: &[Near]) -> Vec<Quat> {
     let sizes = values(h, Attribute::LogScales, log_scales, 0.0);
     let at = h.attributes().iter().position(|a| *a == Attribute::Quats);
@@ -66,14 +70,15 @@ pub fn rotations(h: &Header, integers: &[i32], log_scales: &[i32], near: &[Near]
     let (integers, sizes) = (integers.as_chunks::<3>().0, sizes.as_chunks::<3>().0);
     let mut out = Vec::with_capacity(near.len());
     for (i, ((k, sizes), near)) in integers.iter().zip(sizes).zip(near).enumerate() {
-        let step = steps(h, &scale.steps, *sizes);
+        let step = rotation_steps(h, &scale.steps, *sizes);
         let halves = std::array::from_fn(|c| scale.offsets.get(c).unwrap_or(&0.0) + step[c] * k[c] as f32);
-        out.push(multiply(before(&out, i, near), turn(halves)));
+        out.push(multiply(before(&out, i, near), rotation_residual(halves)));
     }
     out
 }
 
-/// From which the turn of Gaussian `i` is taken: its nearest neighbour, if that is in the same block. `done`: those before.
+/// The prediction of Gaussian `i`: the quaternion of its nearest neighbour, if that is in the same block, else the identity.
+/// `done`: the quaternions before `i`.
 #[inline]
 pub fn before(done: &[Quat], i: usize, near: &Near) -> Quat {
     let j = near[0] as usize;
@@ -81,9 +86,9 @@ pub fn before(done: &[Quat], i: usize, near: &Near) -> Quat {
     known.copied().unwrap_or(IDENTITY)
 }
 
-/// Turns about the third, then the second, then the first of the own axes, each by the sine of half its angle.
+/// Product of rotations about the third, then the second, then the first axis; `halves`: the sines of half their angles.
 #[inline]
-pub fn turn(halves: [f32; 3]) -> Quat {
+pub fn rotation_residual(halves: [f32; 3]) -> Quat {
     let [x, y, z] = halves.map(|v| v.clamp(-1.0, 1.0));
     let [a, b, c] = [x, y, z].map(|v| (1.0 - v * v).sqrt());
     // (c, 0, 0, z) (b, 0, y, 0) (a, x, 0, 0)

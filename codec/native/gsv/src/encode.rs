@@ -1,4 +1,7 @@
-//! Group in integers -> payload (spec 3 to 12). The mirror of decode.rs.
+//! Group of integers -> payload (spec 3 to 12): makes the units of all layers, entropy-codes them in parallel, writes them
+//! in order.
+//!
+//! The mirror of decode.rs.
 
 use crate::attributes::Attribute;
 use crate::channels;
@@ -15,7 +18,7 @@ use crate::trajectories::{self, Kind, Trajectories};
 use crate::unit::{self, UnitType};
 use rayon::prelude::*;
 
-/// Codes the payload of a unit.
+/// Entropy-codes the payload of a unit.
 type Code<'a> = Box<dyn Fn() -> Vec<u8> + Sync + 'a>;
 
 /// A unit to be written.
@@ -29,7 +32,7 @@ struct Pending<'a> {
 /// The payload of a group (one MP4 sample). `reference`: the group that a predicted one refers to.
 ///
 /// # Errors
-/// `Error::Input`: the group breaks an invariant; nothing was written.
+/// `Error::Input`: the group breaks an invariant; nothing is written.
 pub fn encode_group(group: &Group, reference: Option<&Group>) -> Result<Vec<u8>> {
     group.validate(reference)?;
     let h = &group.header;
@@ -73,7 +76,7 @@ pub fn encode_group(group: &Group, reference: Option<&Group>) -> Result<Vec<u8>>
     Ok(out)
 }
 
-/// Indices of the units that `u` needs; the header comes before all of them.
+/// Indices of the units that `u` depends on. Unit 0 is the header, so the first of `units` has index 1.
 fn dependencies(u: &Pending, units: &[Pending]) -> Vec<u8> {
     let needs = u.kind.needs(u.attribute);
     let needed = |d: &Pending| d.layer == u.layer && needs.contains(&(d.kind, d.attribute));
@@ -81,7 +84,7 @@ fn dependencies(u: &Pending, units: &[Pending]) -> Vec<u8> {
     found.map(|(_, i)| i).collect()
 }
 
-/// Appends the units of layer `k`, but for the nodes: points first, since the others depend on them.
+/// Appends the units of layer `k`, without nodes; positions come first, since the other units depend on them.
 fn layer<'a>(
     units: &mut Vec<Pending<'a>>,
     group: &'a Group,
@@ -112,12 +115,7 @@ fn layer<'a>(
         for (a, values) in h.attributes().iter().zip(&group.channels) {
             let c = a.channels(h.sh_degree);
             let own = &values[(range.end - births) * c..range.end * c];
-            let near = contexts.births();
-            let shift = h.shift(k, *a);
-            let code = coded(move |e| {
-                let mut coarse: Vec<i32> = own.iter().map(|v| v >> shift).collect();
-                channels::code(e, *a, c, near, &mut coarse);
-            });
+            let code = channels_of(*a, c, own, contexts.births(), h.shift(k, *a));
             push(UnitType::Channels, Some(*a), code);
         }
     }
@@ -145,10 +143,11 @@ fn layer<'a>(
     }
 }
 
+/// Appends the units of the nodes.
 fn nodes<'a>(units: &mut Vec<Pending<'a>>, group: &'a Group, near: &'a [Near]) {
     let h = &group.header;
     let k = usize::from(h.nodes.coefficients);
-    let motion = trajectory(Kind::Nodes, k, near, group.node_trajectories.clone());
+    let motion = trajectory(Kind::Node, k, near, group.node_trajectories.clone());
     let coded = [
         (
             UnitType::NodePositions,
@@ -164,12 +163,20 @@ fn nodes<'a>(units: &mut Vec<Pending<'a>>, group: &'a Group, near: &'a [Near]) {
     }));
 }
 
-/// A unit that one entropy coder makes.
+/// A unit whose payload is one range coder stream.
 fn coded<'a>(f: impl Fn(&mut Encoder) + Sync + 'a) -> Code<'a> {
     Box::new(move || {
         let mut c = Encoder::default();
         f(&mut c);
         c.finish()
+    })
+}
+
+/// The `c` channels of attribute `a` without their lowest `shift` bits.
+fn channels_of<'a>(a: Attribute, c: usize, values: &'a [i32], near: &'a [Near], shift: u32) -> Code<'a> {
+    coded(move |e| {
+        let mut coarse: Vec<i32> = values.iter().map(|v| v >> shift).collect();
+        channels::code(e, a, c, near, &mut coarse);
     })
 }
 

@@ -1,6 +1,6 @@
-//! Errors by blame: `Bitstream` and `Limit` speak about bytes, `Input` about what an encoder was given.
+//! Errors by blame: `Bitstream` and `Limit` blame the bytes, `Input` what was to be written.
 //!
-//! More-data-needed is never an error here; it is a result of the demuxer.
+//! The need for more data is never an error here; it is a result of the demuxer.
 
 use std::fmt;
 
@@ -14,7 +14,7 @@ pub enum Error {
     },
     /// The bytes are valid so far, but exceed the level (spec 5).
     Limit { unit: String, expected: String },
-    /// What was to be encoded is not a group.
+    /// The group or configuration to write is not valid.
     Input(String),
 }
 
@@ -36,7 +36,7 @@ impl Error {
         }
     }
 
-    /// The same error further into a larger whole.
+    /// The same error with the offset moved by `base`; `name`: the unit, if the error has none.
     pub fn at(self, base: usize, name: &str) -> Error {
         match self {
             Error::Bitstream { offset, unit, expected } => {

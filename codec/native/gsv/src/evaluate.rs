@@ -119,12 +119,27 @@ fn rotations_of(group: &Group, reference: Option<&Group>) -> Vec<Quat> {
     for (k, layer) in group.layers.iter().enumerate() {
         let range = group.range(k..k + 1);
         let born = range.start + layer.survivors() as usize;
-        let parents = group.parents.iter().flatten().skip(range.start).take(born - range.start);
+        let parents = group
+            .parents
+            .iter()
+            .flatten()
+            .skip(range.start)
+            .take(born - range.start);
         let known = reference.map_or(&[][..], |r| &r.rotations);
         out.extend(parents.filter_map(|p| known.get(*p as usize)));
-        let own = |a| group.channels_of(a).and_then(|v| v.get(3 * born..3 * range.end)).unwrap_or(&[]);
+        let own = |a| {
+            group
+                .channels_of(a)
+                .and_then(|v| v.get(3 * born..3 * range.end))
+                .unwrap_or(&[])
+        };
         let near = neighbors::nearest(group.positions.get(born..range.end).unwrap_or(&[]));
-        out.extend(dequantize::rotations(h, own(Attribute::Quats), own(Attribute::LogScales), &near));
+        out.extend(dequantize::rotations(
+            h,
+            own(Attribute::Quats),
+            own(Attribute::LogScales),
+            &near,
+        ));
     }
     out
 }

@@ -1,12 +1,13 @@
-//! Headers are declared once: a function over `Fields` reads them, writes them, and says where they break.
+//! Fields of headers. A header is declared once, as a function over `Fields`: with `Reader` it reads and checks, with
+//! `Writer` it writes.
 //!
-//! The writer takes each value from the place that the reader stores it to.
+//! The writer takes each value from the variable that the reader stores it to.
 
 use crate::error::{Error, Result};
 
 pub trait Fields {
     fn bytes(&mut self, v: &mut [u8]) -> Result<()>;
-    /// Reading only: the error that a field just passed broke a rule.
+    /// The error of a field that breaks a rule.
     fn fail<T>(&self, expected: String) -> Result<T>;
 
     fn u8(&mut self, v: &mut u8) -> Result<()> {

@@ -1,7 +1,7 @@
-//! A group in integers, and its invariants: what `encode` takes and `decode` gives.
+//! A group of integers and its invariants: the input of `encode`, the output of `decode`.
 //!
-//! Layer after layer, and in each the survivors of the reference before the births: a predicted group has all of its integers
-//! here, also those that its payload leaves out.
+//! Gaussians are stored layer after layer, in each layer the survivors of the reference before the births. A predicted group
+//! holds all of its integers, also those that its payload takes from the reference.
 
 use crate::attributes::Attribute;
 use crate::error::{Error, Result};
@@ -12,28 +12,28 @@ use crate::morton;
 use crate::trajectories::Trajectories;
 use crate::values::MAX_VALUE;
 
-/// Stands for "no such Gaussian in the reference".
+/// In `parents`: the Gaussian is a birth.
 pub const BIRTH: u32 = u32::MAX;
 
-/// N Gaussians over T frames. What a layer codes itself is in Morton order.
+/// N Gaussians over T frames. The births of a layer are in Morton order.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Group {
     pub header: Header,
-    /// Gaussians of each decoded layer: as the header says, where nothing is damaged.
+    /// Gaussians of each decoded layer: those of the header, unless units are damaged.
     pub layers: Vec<LayerHeader>,
-    /// Predicted: index in the reference of each Gaussian, or `BIRTH`.
+    /// In a predicted group: index in the reference of each Gaussian, or `BIRTH`.
     pub parents: Option<Vec<u32>>,
     pub positions: Vec<[u32; 3]>,
-    /// Per attribute of the header, C integers per Gaussian.
+    /// Per attribute of the header: C integers per Gaussian.
     pub channels: Vec<Vec<i32>>,
-    /// What quats and log_scales decode to, wxyz; none where there is nothing but integers, before encoding.
+    /// Decoded quaternions, wxyz; empty in a group to be encoded.
     pub rotations: Vec<[f32; 4]>,
     pub lifetimes: Option<Vec<[u16; 2]>>,
     pub node_positions: Vec<[u32; 3]>,
     pub node_trajectories: Trajectories,
     /// In the order of `header.trajectories`.
     pub trajectories: Vec<Trajectories>,
-    /// For the prefix that ends with each layer: what is added to its log_scales and logit_opacities.
+    /// Of each layer: what is added to log_scales and logit_opacities while it is the last decoded layer.
     pub corrections: Vec<[f32; 2]>,
 }
 
@@ -42,7 +42,7 @@ fn must(holds: bool, message: impl FnOnce() -> String) -> Result<()> {
 }
 
 impl Group {
-    /// Checks everything that the bitstream cannot express; the message says what was expected. `reference`: the group that
+    /// Checks everything that the bitstream cannot express; the message tells what was expected. `reference`: the group that
     /// a predicted one refers to.
     pub fn validate(&self, reference: Option<&Group>) -> Result<()> {
         let h = &self.header;
@@ -78,7 +78,7 @@ impl Group {
         self.validate_time()
     }
 
-    /// Survivors in the order of the reference and with its integers, then births in Morton order.
+    /// Checks that survivors have the order and the integers of the reference, and that births are in Morton order.
     fn validate_layers(&self, reference: Option<&Group>) -> Result<()> {
         let h = &self.header;
         must(self.parents.is_some() == (h.reference > 0), || {
@@ -116,7 +116,7 @@ impl Group {
         Ok(())
     }
 
-    /// Integers of layer `k`, whose Gaussians are at `range`, have the low bits 0 that it leaves out.
+    /// Checks that the integers of layer `k`, at `range`, are multiples of 2^shift of the layer.
     fn validate_shifts(&self, k: usize, range: &std::ops::Range<usize>) -> Result<()> {
         let h = &self.header;
         let holds = |shift: u32, v: i32| v & ((1 << shift) - 1) == 0;
@@ -134,7 +134,7 @@ impl Group {
         })
     }
 
-    /// Whether Gaussian `i` has the canonical integers of `j` of the reference.
+    /// True if Gaussian `i` has the canonical integers of Gaussian `j` of the reference.
     fn same(&self, i: usize, reference: &Group, j: usize) -> bool {
         let mut channels = self.channels.iter().zip(&reference.channels).zip(&self.header.scales);
         self.positions.get(i) == reference.positions.get(j)
@@ -144,13 +144,13 @@ impl Group {
             })
     }
 
-    /// Where the Gaussians of some layers are.
+    /// Index range of the Gaussians of some layers.
     pub fn range(&self, layers: std::ops::Range<usize>) -> std::ops::Range<usize> {
         let sum = |k: usize| self.layers.iter().take(k).map(|l| l.count as usize).sum();
         sum(layers.start)..sum(layers.end)
     }
 
-    /// What is added to log_scales and logit_opacities of all Gaussians while the layers behind are not there.
+    /// The correction of the last decoded layer, for log_scales and logit_opacities.
     pub fn correction(&self) -> [f32; 2] {
         self.corrections.last().copied().unwrap_or_default()
     }
@@ -191,7 +191,7 @@ impl Group {
         must(lifetimes == n, || format!("expected {n} lifetimes, got {lifetimes}"))
     }
 
-    /// The channels of `a`, if the group has any.
+    /// The channels of `a`; None if the group has none.
     pub fn channels_of(&self, a: Attribute) -> Option<&[i32]> {
         let at = self.header.attributes().iter().position(|b| *b == a)?;
         self.channels.get(at).map(Vec::as_slice)

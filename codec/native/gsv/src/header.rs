@@ -1,27 +1,22 @@
-//! Group header (spec 4): what a group holds and how to dequantize it, and the caps it must keep (spec 5).
+//! Group header (spec 4): what a group holds and how to dequantize it, and the caps that it must keep (spec 5).
 //!
-//! A predicted group has the grid, the attributes and the layers of the group that it refers to, so its header is read and
-//! written with that group's header at hand.
+//! A predicted group shares grid, attributes and layers with its reference, so its header is read and written with the
+//! header of the reference.
+
+mod syntax;
 
 use crate::attributes::Attribute;
-use crate::blend::NEIGHBORS_MAX;
-use crate::curve::Curve;
+use crate::companding::Companding;
 use crate::error::Result;
-use crate::fields::{Fields, Reader};
 use crate::levels::Level;
-use crate::map;
 
-const FLAG_PREDICTED: u8 = 1;
-const FLAG_CURVES: u8 = 2;
-const FLAG_UNIT_SIZES: u8 = 4;
-const FLAG_LAYER_SHIFTS: u8 = 8;
-/// Channels with a curve: those of log_scales, and logit_opacities.
-pub const CURVES: usize = 4;
-/// Levers of the header are in units of 1 / LEVER_UNIT.
-pub const LEVER_UNIT: f32 = 32.0;
-/// Low bits that a layer may leave out.
+/// Channels that may be companded: those of log_scales, and logit_opacities.
+pub const COMPANDED_CHANNELS: usize = 4;
+/// Scale exponents are integers in units of 1 / SCALE_EXPONENT_UNIT.
+pub const SCALE_EXPONENT_UNIT: f32 = 32.0;
+/// Most low bits that a layer may leave out.
 pub const SHIFT_MAX: u8 = 15;
-/// Layers of a group.
+/// Most layers of a group.
 pub const LAYERS_MAX: usize = 16;
 
 /// Dequantization of the channels of one attribute: value = offset + step * integer.
@@ -39,7 +34,7 @@ pub struct TrajectoryHeader {
     pub step: f32,
 }
 
-/// Coarse motion of the group.
+/// Header of the nodes, which carry the coarse motion of the group.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct NodeHeader {
     pub count: u32,
@@ -53,7 +48,7 @@ pub struct NodeHeader {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct LayerHeader {
     pub count: u32,
-    /// Those that the group codes itself, behind the survivors of the reference; all of an independent group.
+    /// Gaussians that are not in the reference; in an independent group all.
     pub births: u32,
 }
 
@@ -66,7 +61,7 @@ impl LayerHeader {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Header {
     pub frames: u16,
-    /// How many groups back the one is whose canonical integers this one takes; 0: independent.
+    /// The reference is this many groups back; 0: independent.
     pub reference: u16,
     pub origin: [f32; 3],
     pub grid_step: f32,
@@ -75,12 +70,14 @@ pub struct Header {
     pub layers: Vec<LayerHeader>,
     /// In the order of `Attribute::canonical(sh_degree)`.
     pub scales: Vec<Scale>,
-    /// Of each channel of quats: how its step falls with each of the log_scales, in octaves, times `LEVER_UNIT`.
-    pub levers: [[i8; 3]; 3],
-    /// Of each layer: how many low bits of positions, then of each attribute's integers, are 0 and not coded. Empty: none.
+    /// [channel of quats][channel of log_scales]: the step of the channel is divided by 2^(scale_exponent /
+    /// SCALE_EXPONENT_UNIT * log_scale).
+    pub scale_exponents: [[i8; 3]; 3],
+    /// Of each layer: number of low bits of positions, then of the integers of each attribute, that are 0 and not coded.
+    /// Empty: 0.
     pub shifts: Vec<[u8; 6]>,
-    /// Of the channels of log_scales, then of logit_opacities. None: their values are as they are coded.
-    pub curves: Option<[Curve; CURVES]>,
+    /// Of the channels of log_scales, then of logit_opacities. None: no companding.
+    pub companding: Option<[Companding; COMPANDED_CHANNELS]>,
     pub trajectories: Vec<TrajectoryHeader>,
     /// `count` 0: none.
     pub nodes: NodeHeader,
@@ -91,198 +88,20 @@ impl Header {
         Attribute::canonical(self.sh_degree)
     }
 
-    /// `reference`: the header of the group that a predicted one refers to.
-    pub fn read(payload: &[u8], reference: Option<&Header>) -> Result<Header> {
-        let mut h = Header::default();
-        let mut r = Reader::new(payload);
-        h.fields(&mut r, &mut Vec::new(), reference)?;
-        let rest = r.rest();
-        r.must(rest == 0, || {
-            format!("the end of the group header, found {rest} more bytes")
-        })?;
-        Ok(h)
-    }
-
-    /// What a header opens with: how many groups back it refers, 0 for an independent one, and sizes of the units behind it.
-    pub fn open(payload: &[u8]) -> Result<(u16, Vec<u32>)> {
-        let (mut h, mut sizes) = (Header::default(), Vec::new());
-        h.opening(&mut Reader::new(payload), &mut sizes)?;
-        Ok((h.reference, sizes))
-    }
-
     /// Gaussians in all layers.
     pub fn count(&self) -> u64 {
         self.layers.iter().map(|l| u64::from(l.count)).sum()
     }
 
-    /// Reads or writes all fields, and checks them. `sizes`: of the units behind the header, none if they are not told.
-    pub fn fields<F: Fields>(&mut self, f: &mut F, sizes: &mut Vec<u32>, reference: Option<&Header>) -> Result<()> {
-        self.opening(f, sizes)?;
-        if self.reference > 0 {
-            let Some(r) = reference.filter(|r| r.reference == 0) else {
-                return f.fail("the independent group that this predicted one refers to".into());
-            };
-            self.layers(f, Some(r))?;
-            *self = Header {
-                frames: self.frames,
-                reference: self.reference,
-                layers: std::mem::take(&mut self.layers),
-                trajectories: std::mem::take(&mut self.trajectories),
-                nodes: self.nodes,
-                ..r.clone()
-            };
-        } else {
-            self.grid(f)?;
-            self.layers(f, None)?;
-            self.scales(f)?;
-            for lever in self.levers.as_flattened_mut() {
-                let mut byte = lever.to_be_bytes();
-                f.bytes(&mut byte)?;
-                *lever = i8::from_be_bytes(byte);
-            }
-            self.shifts(f)?;
-            if let Some(curves) = &mut self.curves {
-                curves.iter_mut().try_for_each(|c| c.fields(f))?;
-            }
-        }
-        self.trajectories(f)?;
-        self.nodes(f)
-    }
-
-    fn opening<F: Fields>(&mut self, f: &mut F, sizes: &mut Vec<u32>) -> Result<()> {
-        f.u16(&mut self.frames)?;
-        f.must(self.frames > 0, || "frames >= 1, found 0".into())?;
-        let mut flags = if self.reference > 0 { FLAG_PREDICTED } else { 0 };
-        if !sizes.is_empty() {
-            flags |= FLAG_UNIT_SIZES;
-        }
-        if self.reference == 0 && !self.shifts.is_empty() {
-            flags |= FLAG_LAYER_SHIFTS;
-        }
-        if self.reference == 0 && self.curves.is_some() {
-            flags |= FLAG_CURVES;
-        }
-        f.u8(&mut flags)?;
-        let known = match flags & FLAG_PREDICTED {
-            0 => FLAG_UNIT_SIZES | FLAG_LAYER_SHIFTS | FLAG_CURVES,
-            _ => FLAG_UNIT_SIZES | FLAG_PREDICTED,
-        };
-        f.must(flags & !known == 0, || {
-            format!("reserved flags to be 0, found {flags:#04x}")
-        })?;
-        if flags & FLAG_LAYER_SHIFTS != 0 {
-            self.shifts.resize(self.layers.len().max(1), Default::default());
-        }
-        if flags & FLAG_CURVES != 0 {
-            self.curves.get_or_insert_default();
-        }
-        if flags & FLAG_PREDICTED != 0 {
-            f.u16(&mut self.reference)?;
-            f.must(self.reference > 0, || "a reference >= 1, found 0".into())?;
-        }
-        if flags & FLAG_UNIT_SIZES != 0 {
-            let mut count = sizes.len() as u8;
-            f.u8(&mut count)?;
-            sizes.resize(usize::from(count), 0);
-            sizes.iter_mut().try_for_each(|size| f.u32(size))?;
-        }
-        Ok(())
-    }
-
-    fn grid<F: Fields>(&mut self, f: &mut F) -> Result<()> {
-        for v in &mut self.origin {
-            f.f32(v, "origin")?;
-        }
-        f.step(&mut self.grid_step, "grid_step")?;
-        f.u8(&mut self.grid_bits)?;
-        f.must((1..=21).contains(&self.grid_bits), || "grid_bits of 1 to 21".into())?;
-        f.u8(&mut self.sh_degree)?;
-        f.must(self.sh_degree <= 3, || "sh_degree of 0 to 3".into())
-    }
-
-    fn layers<F: Fields>(&mut self, f: &mut F, reference: Option<&Header>) -> Result<()> {
-        let mut n = self.layers.len().min(255) as u8;
-        f.u8(&mut n)?;
-        f.must((1..=LAYERS_MAX).contains(&usize::from(n)), || {
-            format!("1 to {LAYERS_MAX} layers, found {n}")
-        })?;
-        if let Some(r) = reference {
-            f.must(usize::from(n) == r.layers.len(), || {
-                format!("the {} layers of the reference, found {n}", r.layers.len())
-            })?;
-        }
-        self.layers.resize(usize::from(n), LayerHeader::default());
-        for (k, layer) in self.layers.iter_mut().enumerate() {
-            f.u32(&mut layer.count)?;
-            let width = map::width_log2(layer.count as usize) as u8;
-            let mut found = width;
-            f.u8(&mut found)?;
-            f.must(found == width, || format!("map_width_log2 {width}, found {found}"))?;
-            let Some(before) = reference.and_then(|r| r.layers.get(k)) else {
-                layer.births = layer.count;
-                continue;
-            };
-            f.u32(&mut layer.births)?;
-            let LayerHeader { count, births } = *layer;
-            f.must(births <= count && count - births <= before.count, || {
-                format!(
-                    "at most {count} births, and at most {} survivors of the reference, found {births} births",
-                    before.count
-                )
-            })?;
-        }
-        Ok(())
-    }
-
-    fn scales<F: Fields>(&mut self, f: &mut F) -> Result<()> {
-        let attributes = self.attributes();
-        let mut n = attributes.len() as u8;
-        f.u8(&mut n)?;
-        f.must(usize::from(n) == attributes.len(), || {
-            format!("{} attributes, found {n}", attributes.len())
-        })?;
-        self.scales.resize(attributes.len(), Scale::default());
-        for (a, scale) in attributes.iter().zip(&mut self.scales) {
-            let mut number = *a as u8;
-            f.u8(&mut number)?;
-            f.must(number == *a as u8, || format!("attribute {}, found {number}", a.name()))?;
-            let channels = a.channels(self.sh_degree);
-            scale.steps.resize(channels, 0.0);
-            scale.offsets.resize(channels, 0.0);
-            for (step, offset) in scale.steps.iter_mut().zip(&mut scale.offsets) {
-                f.step(step, "step")?;
-                f.f32(offset, "offset")?;
-            }
-        }
-        Ok(())
-    }
-
-    /// One set for each layer, where the opening has announced them.
-    fn shifts<F: Fields>(&mut self, f: &mut F) -> Result<()> {
-        if self.shifts.is_empty() {
-            return Ok(());
-        }
-        let (kinds, bits) = (1 + self.attributes().len(), self.grid_bits);
-        self.shifts.resize(self.layers.len(), Default::default());
-        for own in &mut self.shifts {
-            for (i, shift) in own.iter_mut().take(kinds).enumerate() {
-                f.u8(shift)?;
-                let (found, most) = (*shift, if i == 0 { SHIFT_MAX.min(bits - 1) } else { SHIFT_MAX });
-                f.must(found <= most, || format!("a shift of 0 to {most}, found {found}"))?;
-            }
-        }
-        Ok(())
-    }
-
-    /// Low bits that layer `k` leaves out of an attribute's integers, `Means`: of positions.
+    /// Low bits that layer `k` leaves out of the integers of an attribute; `Means`: of positions.
     pub fn shift(&self, k: usize, attribute: Attribute) -> u32 {
         let own = self.shifts.get(k).and_then(|s| s.get(attribute as usize - 1));
         own.map_or(0, |s| u32::from(*s))
     }
 
-    /// Of the channels of an attribute; empty if they have none.
-    pub fn curves_of(&self, attribute: Attribute) -> &[Curve] {
-        let all = self.curves.as_ref().map_or(&[][..], |c| &c[..]);
+    /// Companding of the channels of an attribute; empty: none.
+    pub fn companding_of(&self, attribute: Attribute) -> &[Companding] {
+        let all = self.companding.as_ref().map_or(&[][..], |c| &c[..]);
         match attribute {
             Attribute::LogScales => all.get(..3).unwrap_or(&[]),
             Attribute::LogitOpacities => all.get(3..).unwrap_or(&[]),
@@ -290,51 +109,7 @@ impl Header {
         }
     }
 
-    fn trajectories<F: Fields>(&mut self, f: &mut F) -> Result<()> {
-        let mut n = self.trajectories.len() as u8;
-        f.u8(&mut n)?;
-        f.must(n <= 6, || format!("at most 6 attributes with trajectories, found {n}"))?;
-        let blank = TrajectoryHeader {
-            attribute: Attribute::Means,
-            coefficients: 0,
-            step: 0.0,
-        };
-        self.trajectories.resize(usize::from(n), blank);
-        let mut last = 0;
-        for t in &mut self.trajectories {
-            let mut number = t.attribute as u8;
-            f.u8(&mut number)?;
-            let known = Attribute::from_number(number).filter(|a| number > last && a.channels(self.sh_degree) > 0);
-            let Some(attribute) = known else {
-                return f.fail(format!(
-                    "attributes of trajectories in increasing order, found {number}"
-                ));
-            };
-            (t.attribute, last) = (attribute, number);
-            f.u16(&mut t.coefficients)?;
-            coefficients(f, t.coefficients, self.frames)?;
-            f.step(&mut t.step, "step of a trajectory")?;
-        }
-        Ok(())
-    }
-
-    fn nodes<F: Fields>(&mut self, f: &mut F) -> Result<()> {
-        let n = &mut self.nodes;
-        f.u32(&mut n.count)?;
-        if n.count == 0 {
-            return Ok(());
-        }
-        f.u8(&mut n.neighbors)?;
-        f.must((1..=NEIGHBORS_MAX as u8).contains(&n.neighbors), || {
-            "1 to 8 neighbors of a Gaussian".into()
-        })?;
-        f.u16(&mut n.coefficients)?;
-        coefficients(f, n.coefficients, self.frames)?;
-        f.step(&mut n.rotation_step, "rotation_step")?;
-        f.step(&mut n.translation_step, "translation_step")
-    }
-
-    /// Symbols known from the header (spec 5), after all caps were found to be kept.
+    /// Checks the caps; returns the symbols that the header announces (spec 5).
     pub fn check(&self, level: &Level, reference: Option<&Header>) -> Result<u64> {
         let unit = "group header";
         let (count, nodes) = (self.count(), u64::from(self.nodes.count));
@@ -353,7 +128,7 @@ impl Header {
         Ok(symbols)
     }
 
-    /// Gaussians of the reference that the deaths unit of layer `k` speaks about; 0: there is no such unit.
+    /// Gaussians of the reference that the deaths unit of layer `k` codes; 0: there is no such unit.
     pub fn candidates(&self, k: usize, reference: Option<&Header>) -> u64 {
         let before = reference.filter(|_| self.reference > 0).and_then(|r| r.layers.get(k));
         match (self.layers.get(k), before) {
@@ -361,10 +136,4 @@ impl Header {
             _ => 0,
         }
     }
-}
-
-fn coefficients<F: Fields>(f: &F, k: u16, frames: u16) -> Result<()> {
-    f.must((1..=frames).contains(&k), || {
-        format!("1 to {frames} coefficients, found {k}")
-    })
 }

@@ -1,4 +1,4 @@
-//! Levels (spec 5): caps that are checked before memory is taken.
+//! Levels (spec 5): caps on the size of a group, checked before memory is allocated.
 
 use crate::error::{Error, Result};
 
@@ -9,7 +9,7 @@ pub struct Level {
     pub gaussians: u32,
     pub frames: u16,
     pub nodes: u32,
-    /// Gaussians times nodes: what a search for neighbours may cost.
+    /// Gaussians times nodes, which bounds the cost of the node search.
     pub pairs: u64,
     pub symbols: u64,
     pub bytes: u64,
@@ -42,7 +42,7 @@ impl Level {
             .ok_or_else(|| Error::limit("level", format!("level {number} is not one of 1 to 4 of this version")))
     }
 
-    /// LimitError if `value` exceeds `cap`.
+    /// `Error::Limit` if `value` exceeds `cap`.
     pub fn cap(&self, unit: &str, what: &str, value: u64, cap: u64) -> Result<()> {
         if value <= cap {
             return Ok(());

@@ -1,4 +1,5 @@
-//! The bitstream core: bytes <-> integer maps (container, units, entropy coding), and integers -> attributes of a frame.
+//! The bitstream core: bytes <-> integers of a group (container, units, entropy coding), and integers -> attributes of a
+//! frame.
 //!
 //! No I/O, no unsafe, no panic on input. Clause numbers in comments are those of spec/gsv.md.
 #![forbid(unsafe_code)]
@@ -7,9 +8,10 @@ mod assemble;
 pub mod attributes;
 pub mod blend;
 pub mod channels;
+pub mod companding;
+pub mod conformance;
 pub mod container;
 mod crc;
-pub mod curve;
 mod deaths;
 pub mod decode;
 pub mod dequantize;
@@ -19,10 +21,9 @@ pub mod evaluate;
 pub mod fields;
 pub mod group;
 pub mod header;
-pub mod inventory;
+pub mod hilbert_layout;
 pub mod levels;
 pub mod lifetimes;
-pub mod map;
 mod model;
 pub mod morton;
 pub mod neighbors;
@@ -31,8 +32,8 @@ pub mod parametric;
 pub mod positions;
 pub mod range_coder;
 pub mod rigid_blend;
+pub mod rotation_residuals;
 pub mod symbols;
 pub mod trajectories;
-pub mod turns;
 pub mod unit;
 mod values;

@@ -1,14 +1,15 @@
-//! Lifetimes (spec 10): the frames [t0, t1) of each Gaussian <-> bins.
+//! Lifetimes (spec 10): the frames [t0, t1) in which each Gaussian is shown <-> bins, in the context of the neighbours'
+//! lifetimes.
 
 use crate::model::Model;
 use crate::neighbors::Near;
 use crate::range_coder::Bins;
 
-const POINT: usize = 16; // first context of the end points; those before are of the flag
+const POINT: usize = 16; // first context of the end points; the flag has those before
 const NODES: usize = 256;
 const BITS: usize = 8;
 
-/// Codes `lifetimes` in a group of `frames`. False if a forbidden one was read.
+/// Codes the lifetimes of a group of `frames` frames. False if a forbidden one was read.
 pub fn code<C: Bins>(c: &mut C, frames: u16, near: &[Near], lifetimes: &mut [[u16; 2]]) -> bool {
     let mut model = Model::new(POINT + 2 * NODES, POINT + 2 * BITS * 3, 1 + 2 * BITS);
     let bits = 16 - (frames - 1).leading_zeros();
@@ -32,7 +33,7 @@ pub fn code<C: Bins>(c: &mut C, frames: u16, near: &[Near], lifetimes: &mut [[u1
     true
 }
 
-/// One end point, most significant bit first, next to that of the nearest neighbour.
+/// Codes one end point, most significant bit first; `near`: that of the nearest neighbour.
 fn point<C: Bins>(c: &mut C, model: &mut Model, end: usize, bits: u32, want: u16, near: u16) -> u16 {
     let (mut v, mut node) = (0u16, 1);
     for j in 0..bits {

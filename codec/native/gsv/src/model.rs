@@ -1,7 +1,7 @@
-//! Probability models (spec 6.2 to 6.4): bins in context -> probabilities, in integers only.
+//! Adaptive binary models (spec 6.2 to 6.4): a bin in two contexts -> its probability, in integers only.
 //!
-//! A bin is predicted by two counters, each chosen by its own context, mixed in the logistic domain with weights that are
-//! learned as well (after Mahoney's PAQ). Two sparse views of the past beat one joint context, which would dilute.
+//! Two counters, each chosen by its own context, are mixed in the logistic domain with weights that adapt too (as in PAQ by
+//! Mahoney). Two separate contexts learn faster than one joint context, which would spread the same bins over more counters.
 
 use crate::range_coder::Bins;
 use std::sync::LazyLock;
@@ -30,7 +30,7 @@ fn curve(x: i32) -> i32 {
     if x < 0 { 65536 - p } else { p }
 }
 
-/// `curve` from -`STRETCH_MAX` on, clamped: what a mixed bin is coded with (squash of spec 6.3).
+/// The logistic curve from -`STRETCH_MAX` on, clamped: the probability that a mixed bin is coded with (squash of spec 6.3).
 static SQUASH: LazyLock<[u16; 2 * STRETCH_MAX as usize + 1]> =
     LazyLock::new(|| std::array::from_fn(|i| curve(i as i32 - STRETCH_MAX).clamp(P_MIN, 65536 - P_MIN) as u16));
 
@@ -45,7 +45,7 @@ static STRETCH: LazyLock<[i16; 4096]> = LazyLock::new(|| {
     })
 });
 
-/// What follows n bins seen: the step of the counter, 1 / (n + 1.5) in 1/65536, and its low bits after one more bin.
+/// Of a counter that has seen n bins: its step 1 / (n + 1.5) in 1/65536, and its low bits after one more bin.
 type Steps = [(u32, u32); 256];
 static STEPS: LazyLock<Steps> = LazyLock::new(|| {
     std::array::from_fn(|n| {
@@ -54,7 +54,7 @@ static STEPS: LazyLock<Steps> = LazyLock::new(|| {
     })
 });
 
-/// How much a counter that has seen `n` bins can be trusted, 0 to 3.
+/// Age of a counter that has seen `n` bins, 0 to 3; it selects the mixing weights.
 fn age(n: u32) -> u32 {
     match n {
         0..=3 => 0,
@@ -64,8 +64,8 @@ fn age(n: u32) -> u32 {
     }
 }
 
-/// A counter: probability of 1 (22 bits) above its age (2 bits) and the number of bins seen (8 bits). Tables hold it xor `NEW`, so
-/// that a new table is all zeros: untouched pages of it cost nothing.
+/// A counter: probability of 1 (22 bits), age (2 bits), number of bins seen (8 bits). Tables store it xor `NEW`, so that a
+/// new table is all zeros and its untouched pages take no memory.
 #[derive(Clone, Copy)]
 struct Counter(u32);
 
@@ -98,7 +98,7 @@ pub struct Model {
 }
 
 impl Model {
-    /// `a` and `b` contexts and `sets` weight sets.
+    /// A model with `a` and `b` contexts and `sets` weight sets.
     pub fn new(a: usize, b: usize, sets: usize) -> Self {
         Model {
             a: vec![0; a],
@@ -112,7 +112,7 @@ impl Model {
 
     /// Codes one bin in contexts `a` and `b`, mixed with weight set `w` (spec 6.4).
     ///
-    /// Contexts are made of what the caller counted, never of raw input, so they are in range by construction.
+    /// Contexts are computed from decoded counts, never from raw input, so they are in range by construction.
     #[inline]
     pub fn bin<C: Bins>(&mut self, c: &mut C, bin: bool, a: usize, b: usize, w: usize) -> bool {
         let (slot_a, slot_b) = (&mut self.a[a], &mut self.b[b]);

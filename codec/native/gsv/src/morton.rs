@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-/// Bits j of `v` to bits 3j.
+/// Moves bit j of `v` to bit 3j.
 #[inline]
 fn spread(v: u32) -> u64 {
     let mut x = u64::from(v & 0x1F_FFFF);
@@ -13,6 +13,7 @@ fn spread(v: u32) -> u64 {
     (x | x << 2) & 0x1249_2492_4924_9249
 }
 
+/// The inverse of `spread`.
 #[inline]
 fn gather(code: u64) -> u32 {
     let mut x = code & 0x1249_2492_4924_9249;

@@ -1,6 +1,7 @@
-//! Neighbours (spec 7.3): grid points in Morton order -> for each the nearest among those just before it.
+//! Context neighbours (spec 7.3): grid points in Morton order -> for each point the nearest among the points just before it.
 //!
-//! Contexts of all channels come from them. The search is brute force over a window: exact, cheap and easy to repeat.
+//! They give the contexts of all units of a layer. The search is brute force over a window: exact, cheap and easy to
+//! reproduce.
 
 use rayon::prelude::*;
 
@@ -18,7 +19,7 @@ pub fn distance(p: [u32; 3], q: [u32; 3]) -> u64 {
     d(0) * d(0) + d(1) * d(1) + d(2) * d(2)
 }
 
-/// For each point the four before it, within the window, that are nearest; ties go to the most recent.
+/// For each point the four nearest within the window before it; of equal distances the most recent.
 pub fn nearest(points: &[[u32; 3]]) -> Vec<Near> {
     (0..points.len())
         .into_par_iter()

@@ -1,34 +1,36 @@
-//! The nodes nearest to points (spec 13.2), exactly: a run of points shares the few nodes that can be near any of them.
+//! Nearest nodes of points (spec 13.2), exact: a run of points shares the few nodes that can be nearest to any of them.
 //!
-//! Gaussians come in Morton order, so runs are compact. A node is of interest to a run if it is no farther from the box around
-//! it than enough nodes are from every point of the box; the same again for the short runs of which it consists. Where a hostile file makes boxes useless (all nodes on a sphere, all
-//! Gaussians around its centre) that is all nodes for all points, which the level caps (spec 5).
-//! Coordinates are below 2^21: sums of squares of their differences are exact in f64, which vectorizes.
+//! Gaussians come in Morton order, so runs are compact. A node is a candidate of a run if its distance to the bounding box
+//! is at most the distance within which every point of the box has enough nodes; the same test is repeated for short runs.
+//! In the worst case (a hostile file with all nodes on a sphere and all Gaussians around its centre) every node stays a
+//! candidate of every point; the level caps that cost (spec 5). Coordinates are below 2^21, so sums of squared differences
+//! are exact in f64, which vectorizes.
 
-use crate::blend::NEIGHBORS_MAX;
+/// Nodes that may move a Gaussian (spec 4).
+pub const NEIGHBORS_MAX: usize = 8;
 
-pub type Key = (u64, u32); // squared distance, index of the node
-const FAR: Key = (u64::MAX, u32::MAX);
-/// Most neighbours that are asked for: one more than there are weights.
+pub type Neighbor = (u64, u32); // (squared distance, index of the node)
+const FAR: Neighbor = (u64::MAX, u32::MAX);
+/// Most nodes that a search returns: one more than there are weights.
 const NEAREST_MAX: usize = NEIGHBORS_MAX + 1;
 
 /// Points of a short run.
 const SHORT: usize = 16;
 
-/// Coordinates of nodes, axis by axis, and their numbers.
+/// Coordinates of nodes, axis by axis, and their indices.
 #[derive(Default)]
-struct Nodes {
+struct NodeTable {
     axes: [Vec<f64>; 3],
     index: Vec<u32>,
 }
 
-impl Nodes {
+impl NodeTable {
     fn push(&mut self, place: [f64; 3], index: u32) {
         self.axes.iter_mut().zip(place).for_each(|(axis, v)| axis.push(v));
         self.index.push(index);
     }
 
-    /// Sums over the axes of the squares of `f` into `out`.
+    /// `out`: the sum over the axes of f(axis, coordinate)^2, for each node.
     #[inline]
     fn sums(&self, out: &mut Vec<f64>, f: impl Fn(usize, f64) -> f64) {
         out.clear();
@@ -41,8 +43,8 @@ impl Nodes {
         }
     }
 
-    /// Into `few` those among which the `count` nearest to each of `points` are. `d`: space for distances.
-    fn near(&self, points: &[[u32; 3]], count: usize, d: &mut Vec<f64>, few: &mut Nodes) {
+    /// `few`: the candidates, among which are the `count` nearest nodes of each of `points`. `d`: scratch space.
+    fn near(&self, points: &[[u32; 3]], count: usize, d: &mut Vec<f64>, few: &mut NodeTable) {
         let bounds = |a: usize| {
             points
                 .iter()
@@ -67,14 +69,14 @@ impl Nodes {
 }
 
 pub struct NodeSearch {
-    nodes: Nodes,
+    nodes: NodeTable,
     count: usize,
 }
 
 impl NodeSearch {
-    /// For the `count` nearest, 1 to `NEIGHBORS_MAX + 1`.
+    /// A search for the `count` nearest nodes, 1 to `NEIGHBORS_MAX + 1`.
     pub fn new(nodes: &[[u32; 3]], count: usize) -> Self {
-        let mut all = Nodes::default();
+        let mut all = NodeTable::default();
         nodes.iter().zip(0..).for_each(|(n, i)| all.push(n.map(f64::from), i));
         NodeSearch {
             nodes: all,
@@ -82,10 +84,10 @@ impl NodeSearch {
         }
     }
 
-    /// Calls `found` with the nearest nodes of each point by (squared distance, index); places beyond the number of nodes hold
-    /// the maximum.
-    pub fn run(&self, points: &[[u32; 3]], mut found: impl FnMut(&[Key])) {
-        let (mut d, mut some, mut few) = (Vec::new(), Nodes::default(), Nodes::default());
+    /// Calls `found` for each point with its nearest nodes, sorted by (squared distance, index); places beyond the number of
+    /// nodes hold `FAR`.
+    pub fn run(&self, points: &[[u32; 3]], mut found: impl FnMut(&[Neighbor])) {
+        let (mut d, mut some, mut few) = (Vec::new(), NodeTable::default(), NodeTable::default());
         self.nodes.near(points, self.count, &mut d, &mut some);
         for points in points.chunks(SHORT) {
             some.near(points, self.count, &mut d, &mut few);
@@ -104,7 +106,7 @@ impl NodeSearch {
     }
 }
 
-/// Into a sorted list, whose last item goes.
+/// Inserts into a sorted list; the last item is dropped.
 #[inline]
 fn insert<T: PartialOrd>(list: &mut [T], mut new: T) {
     for item in list {
@@ -121,8 +123,8 @@ mod tests {
     use proptest::prelude::*;
 
     /// Spec 13.2 as written.
-    fn brute_force(p: [u32; 3], nodes: &[[u32; 3]], count: usize) -> Vec<Key> {
-        let mut all: Vec<Key> = nodes.iter().map(|n| distance(p, *n)).zip(0..).collect();
+    fn brute_force(p: [u32; 3], nodes: &[[u32; 3]], count: usize) -> Vec<Neighbor> {
+        let mut all: Vec<Neighbor> = nodes.iter().map(|n| distance(p, *n)).zip(0..).collect();
         all.sort_unstable();
         all.resize(all.len().max(count), FAR);
         all.truncate(count);

@@ -182,7 +182,10 @@ impl<V: Coefficient> Parametric<'_, V> {
         self.carry(basis, (means, quats), |i, q| multiply(q, own(i)));
         rayon::join(
             || self.motion(Attribute::Quats).map(|m| m.rotate(basis, quats)),
-            || self.motion(Attribute::Means).map(|m| m.add(basis, means.as_flattened_mut(), 3)),
+            || {
+                self.motion(Attribute::Means)
+                    .map(|m| m.add(basis, means.as_flattened_mut(), 3))
+            },
         );
     }
 
@@ -193,19 +196,18 @@ impl<V: Coefficient> Parametric<'_, V> {
     }
 
     /// Spec 13.3. `turned`: index of a Gaussian and the rotation by which it is carried -> the quaternion to be written.
-    fn carry(
-        &self,
-        basis: &[f32],
-        out: (&mut [[f32; 3]], &mut [Quat]),
-        turned: impl Fn(usize, Quat) -> Quat + Sync,
-    ) {
+    fn carry(&self, basis: &[f32], out: (&mut [[f32; 3]], &mut [Quat]), turned: impl Fn(usize, Quat) -> Quat + Sync) {
         let (origin, rest) = (self.origin, &self.rest.means[..]);
         if self.blend.per == 0 {
             let out = out.0.par_chunks_mut(RUN).zip(out.1.par_chunks_mut(RUN));
-            out.zip(rest.par_chunks(RUN)).enumerate().for_each(|(run, ((x, q), x0))| {
-                x.iter_mut().zip(x0).for_each(|(x, x0)| *x = add(origin, *x0));
-                q.iter_mut().zip(run * RUN..).for_each(|(q, i)| *q = turned(i, IDENTITY));
-            });
+            out.zip(rest.par_chunks(RUN))
+                .enumerate()
+                .for_each(|(run, ((x, q), x0))| {
+                    x.iter_mut().zip(x0).for_each(|(x, x0)| *x = add(origin, *x0));
+                    q.iter_mut()
+                        .zip(run * RUN..)
+                        .for_each(|(q, i)| *q = turned(i, IDENTITY));
+                });
             return;
         }
         let [rotation_step, translation_step] = self.node_steps;

@@ -1,68 +1,21 @@
 //! Positions (spec 8): a sorted multiset of grid points <-> bins.
 //!
-//! An octree, breadth first, whose nodes know how many points they hold: emptiness, single points and duplicates are all
-//! one question, how many are in the lower half. Contexts ask where the face neighbours have their points. A point
-//! with few neighbours leaves the tree, since next to nothing is known about its remaining bits. Many points are two
-//! trees, so that two threads decode them.
+//! An octree, breadth first, whose nodes know how many points they hold. One question, how many points are in the lower
+//! half, codes emptiness, single points and duplicates; its contexts are the points of the face neighbours. A point with few
+//! neighbours leaves the tree and its remaining bits are coded plainly, since they can hardly be predicted. Many points are
+//! coded as two trees, so that two threads decode them.
 
-use crate::model::Model;
+mod octree;
+mod split;
+
 use crate::range_coder::{Bins, Decoder, Encoder};
+use octree::{Children, Node, link};
+use split::{Coder, Seen, Split, seen};
 
-const LONELY: usize = 2; // face neighbours of a point that leaves the tree, at most
-const SPLIT_FROM: u32 = 1 << 14; // points that are two trees
-const NONE: u32 = u32::MAX;
-const BUCKETS: usize = 16; // of the number of points to split
-const TREE: usize = 32; // adaptive bins of one split; later ones are bypass bins
-const EVIDENCE: usize = 144;
+const LONELY: usize = 2; // most face neighbours of a point that leaves the tree
+const SPLIT_FROM: u32 = 1 << 14; // from this many points on there are two trees
 
-/// A cube of one level that holds `count` points.
-struct Node {
-    code: u64,
-    count: u32,
-    start: u32,      // encoder: index of its first point
-    lower: [u32; 3], // face neighbours at the side of 0 of x, y, z: already split
-    upper: [u32; 3], // and at the other side: still to be split
-}
-
-impl Node {
-    fn new(code: u64, count: u32, start: u32) -> Node {
-        Node {
-            code,
-            count,
-            start,
-            lower: [NONE; 3],
-            upper: [NONE; 3],
-        }
-    }
-
-    fn occupied(&self) -> usize {
-        self.lower.iter().chain(&self.upper).filter(|q| **q != NONE).count()
-    }
-}
-
-/// Points per child (bit 2: half along x, bit 1: y, bit 0: z), at most 255, as contexts see them: byte k is child k.
-type Seen = u64;
-
-/// `count` points of child `k`.
-fn seen(k: usize, count: u32) -> Seen {
-    u64::from(count.min(255)) << (8 * k)
-}
-
-/// Where the children of a node are in the next level.
-#[derive(Clone, Copy, Default)]
-struct Children {
-    first: u32,
-    mask: u8,
-}
-
-impl Children {
-    fn find(self, k: u8) -> Option<u32> {
-        let before = self.mask & ((1u8 << k) - 1);
-        (self.mask >> k & 1 != 0).then(|| self.first + before.count_ones())
-    }
-}
-
-/// The payload of points of `bits` bits an axis, given by their sorted Morton codes.
+/// Encodes points of `bits` bits per axis, given as sorted Morton codes.
 pub fn encode(points: &[u64], bits: u32) -> Vec<u8> {
     let tree = |points: &[u64]| {
         let mut c = Encoder::default();
@@ -77,7 +30,7 @@ pub fn encode(points: &[u64], bits: u32) -> Vec<u8> {
     [&(first.len() as u32).to_be_bytes()[..], &first, &second].concat()
 }
 
-/// Sorted Morton codes of the `count` points of a payload, or what is wrong with it.
+/// Decodes `count` points; returns their sorted Morton codes, or what was expected of the payload.
 pub fn decode(payload: &[u8], count: u32, bits: u32) -> Result<Vec<u64>, &'static str> {
     let tree = |payload: &[u8], count: u32| {
         let mut c = Decoder::new(payload);
@@ -98,18 +51,16 @@ pub fn decode(payload: &[u8], count: u32, bits: u32) -> Result<Vec<u64>, &'stati
     Ok(points)
 }
 
-/// Points of the first of two trees; None: there is one.
+/// Number of points in the first of two trees; None: one tree.
 fn halves_of(count: u32) -> Option<u32> {
     (count >= SPLIT_FROM).then_some(count / 2)
 }
 
-/// Codes `count` points of `bits` bits an axis as one tree. `points`: their sorted Morton codes (encoder). Returns these.
+/// Codes `count` points of `bits` bits per axis as one tree. `points`: their sorted Morton codes, in the decoder empty.
+/// Returns the codes.
 fn code<C: Bins>(c: &mut C, points: &[u64], count: u32, bits: u32) -> Vec<u64> {
     let mut out = Vec::with_capacity(count as usize);
-    let mut coder = Coder {
-        c,
-        model: Model::new(BUCKETS * TREE * EVIDENCE, BUCKETS * TREE * 3 * 7 * 8, BUCKETS * TREE),
-    };
+    let mut coder = Coder::new(c);
     let mut level = if count > 0 {
         vec![Node::new(0, count, 0)]
     } else {
@@ -125,13 +76,8 @@ fn code<C: Bins>(c: &mut C, points: &[u64], count: u32, bits: u32) -> Vec<u64> {
     out
 }
 
-struct Coder<'a, C> {
-    c: &'a mut C,
-    model: Model,
-}
-
 impl<C: Bins> Coder<'_, C> {
-    /// Splits the nodes of one level, of which `rest` bits an axis are unknown; the next level.
+    /// Splits the nodes of one level, of which `rest` bits per axis are unknown; returns the next level.
     fn level(&mut self, level: &[Node], points: &[u64], rest: u32, out: &mut Vec<u64>) -> Vec<Node> {
         let mut known: Vec<Seen> = Vec::with_capacity(level.len());
         let mut children: Vec<Children> = Vec::with_capacity(level.len());
@@ -163,183 +109,5 @@ impl<C: Bins> Coder<'_, C> {
         }
         link(level, &children, &mut next);
         next
-    }
-}
-
-/// What the contexts of one node's seven splits are made of.
-struct Split {
-    want: [u32; 8],   // encoder: points per child
-    lower: [Seen; 3], // children of the face neighbours at the side of 0
-    upper: [u32; 3],  // points of those at the other side
-    own: Seen,        // children of this node, as far as known
-    count: u32,
-    occupied: usize,
-    depth: usize,
-}
-
-impl Split {
-    fn new(node: &Node, level: &[Node], known: &[Seen], points: &[u64], rest: u32) -> Split {
-        let mut want = [0; 8];
-        let mine = points
-            .get(node.start as usize..)
-            .and_then(|p| p.get(..node.count as usize));
-        for p in mine.unwrap_or(&[]) {
-            want[(p >> (3 * (rest - 1)) & 7) as usize] += 1;
-        }
-        Split {
-            want,
-            lower: node.lower.map(|q| known.get(q as usize).copied().unwrap_or(0)),
-            upper: node.upper.map(|q| level.get(q as usize).map_or(0, |n| n.count)),
-            own: 0,
-            count: node.count,
-            occupied: node.occupied(),
-            depth: (rest as usize - 1).min(7),
-        }
-    }
-
-    /// Points per child: along x, then y, then z.
-    fn children<C: Bins>(mut self, coder: &mut Coder<C>) -> [u32; 8] {
-        let mut counts = [0; 8];
-        let [lx, ly, lz] = self.lower;
-        let c = context(halves(ly, 4, 0), halves(lz, 4, 0), sum(lx, 4, 4), self.upper[0]);
-        let low = self.split(coder, 4, 0, self.count, c, 0);
-        for (x, n) in [(0, low), (4, self.count - low)].into_iter().filter(|(_, n)| *n > 0) {
-            let sx = if x == 0 {
-                halves(lx, 2, 4)
-            } else {
-                halves(self.own, 2, 0)
-            };
-            let c = context(sx, halves(lz, 2, x), sum(ly, 6, x | 2), self.upper[1]);
-            let low = self.split(coder, 6, x, n, c, 1);
-            for (y, n) in [(0, low), (2, n - low)].into_iter().filter(|(_, n)| *n > 0) {
-                let k = x | y;
-                let sx = if x == 0 {
-                    halves(lx, 1, 4 | y)
-                } else {
-                    halves(self.own, 1, y)
-                };
-                let sy = if y == 0 {
-                    halves(ly, 1, k | 2)
-                } else {
-                    halves(self.own, 1, x)
-                };
-                let c = context(sx, sy, sum(lz, 7, k | 1), self.upper[2]);
-                let low = self.split(coder, 7, k, n, c, 2);
-                (counts[k], counts[k | 1]) = (low, n - low);
-                self.own |= seen(k, low) | seen(k | 1, n - low);
-            }
-        }
-        counts
-    }
-
-    /// What `children` does for a single point, which most nodes have: where it is, without branches on what cannot be foreseen.
-    fn child<C: Bins>(self, coder: &mut Coder<C>) -> usize {
-        let [lx, ly, lz] = self.lower;
-        let c = context(halves(ly, 4, 0), halves(lz, 4, 0), sum(lx, 4, 4), self.upper[0]);
-        let x = 4 * self.upper_half(coder, 4, 0, c, 0);
-        let sx = halves(lx, 2, 4) * usize::from(x == 0);
-        let c = context(sx, halves(lz, 2, x), sum(ly, 6, x | 2), self.upper[1]);
-        let y = 2 * self.upper_half(coder, 6, x, c, 1);
-        let k = x | y;
-        let sx = halves(lx, 1, 4 | y) * usize::from(x == 0);
-        let sy = halves(ly, 1, k | 2) * usize::from(y == 0);
-        let c = context(sx, sy, sum(lz, 7, k | 1), self.upper[2]);
-        k | self.upper_half(coder, 7, k, c, 2)
-    }
-
-    /// 0 or 1: in which half the only point is.
-    #[inline(always)]
-    fn upper_half<C: Bins>(&self, coder: &mut Coder<C>, mask: usize, half: usize, c: usize, axis: usize) -> usize {
-        1 - self.split(coder, mask, half, 1, c, axis) as usize
-    }
-
-    /// Of `n` points, how many lie in the lower half: the children k with k & mask = half.
-    #[inline(always)]
-    fn split<C: Bins>(&self, coder: &mut Coder<C>, mask: usize, half: usize, n: u32, c: usize, axis: usize) -> u32 {
-        let want = if C::DECODES {
-            0
-        } else {
-            (0..8).filter(|k| k & mask == half).map(|k| self.want[k]).sum()
-        };
-        let bucket = if n <= 8 {
-            n as usize - 1
-        } else {
-            (4 + 32 - n.leading_zeros() as usize).min(BUCKETS - 1)
-        };
-        let (mut lo, mut hi, mut tree) = (0, n, 1);
-        while lo < hi {
-            let mid = (lo + hi) >> 1;
-            let high = if tree < TREE {
-                let t = bucket * TREE + tree;
-                let b = ((t * 3 + axis) * 7 + self.occupied) * 8 + self.depth;
-                coder.model.bin(coder.c, want > mid, t * EVIDENCE + c, b, t)
-            } else {
-                coder.c.bits(u64::from(want > mid), 1) != 0
-            };
-            tree = (tree * 2 + usize::from(high)).min(TREE * 2 - 1);
-            (lo, hi) = if high { (mid + 1, hi) } else { (lo, mid) };
-        }
-        lo
-    }
-}
-
-/// Bytes of the children k with k & mask = half, at mask * 8 + half.
-const CHILDREN: [u64; 64] = {
-    let mut table = [0; 64];
-    let mut at = 0;
-    while at < 64 {
-        let (mask, half, mut k) = (at / 8, at % 8, 0);
-        while k < 8 {
-            if k & mask == half {
-                table[at] |= 0xFF << (8 * k);
-            }
-            k += 1;
-        }
-        at += 1;
-    }
-    table
-};
-
-/// Points of the children whose bits under `mask` are `half`.
-#[inline]
-fn sum(seen: Seen, mask: usize, half: usize) -> u32 {
-    const EVEN: u64 = 0x00FF_00FF_00FF_00FF;
-    let own = seen & CHILDREN[(mask * 8 + half) & 63];
-    let pairs = (own & EVEN) + (own >> 8 & EVEN);
-    (pairs.wrapping_mul(0x0001_0001_0001_0001) >> 48) as u32
-}
-
-/// On which side of the axis `bit` a neighbour has more points, of the part of it given by the bits above `bit`:
-/// 0: it has none, 1: on the low side, 2: on the high side, 3: as many.
-#[inline]
-fn halves(seen: Seen, bit: usize, part: usize) -> usize {
-    let mask = [7, 7, 6, 6, 4][bit]; // the axis and those split before it
-    let (low, high) = (sum(seen, mask, part), sum(seen, mask, part | bit));
-    usize::from(low + high > 0) * (usize::from(low >= high) + 2 * usize::from(low <= high))
-}
-
-#[inline]
-fn context(s: usize, t: usize, low: u32, up: u32) -> usize {
-    ((low.min(2) * 3 + up.min(2)) as usize * 4 + s) * 4 + t
-}
-
-/// Face neighbours of the children, from those of their parents.
-fn link(level: &[Node], children: &[Children], next: &mut [Node]) {
-    for (parent, mine) in level.iter().zip(children) {
-        for k in 0..8u8 {
-            let Some(at) = mine.find(k) else { continue };
-            for axis in 0..3 {
-                let bit = 4u8 >> axis;
-                let across = if k & bit != 0 {
-                    Some(mine)
-                } else {
-                    children.get(parent.lower[axis] as usize)
-                };
-                if let Some(q) = across.and_then(|c| c.find(k ^ bit)) {
-                    next[at as usize].lower[axis] = q;
-                    next[q as usize].upper[axis] = at;
-                }
-            }
-        }
     }
 }

@@ -1,8 +1,8 @@
-//! Range coder (spec 6.1): bins, bits, symbols and their probabilities -> bytes, and back.
+//! Range coder (spec 6.1): bins, bits and symbols with their probabilities <-> bytes.
 //!
-//! `Bins` is what the models see. Encoder and decoder both implement it, so that every syntax element is described
-//! once: the encoder's methods write their argument and return it, the decoder's ignore their argument and return what
-//! they read. Carries are resolved with a pending byte and a run length, as in LZMA; the first byte, always 0, is left out.
+//! The models use the trait `Bins`, which encoder and decoder implement, so that every syntax element is described once: the
+//! encoder's methods write their argument and return it, the decoder's ignore their argument and return what they read.
+//! Carries are resolved with a pending byte and a run length, as in LZMA; the first byte, always 0, is left out.
 
 /// One direction of the entropy coder.
 pub trait Bins {
@@ -10,7 +10,7 @@ pub trait Bins {
     const DECODES: bool;
     /// One bin; `p` is the probability of 1 times 65536, in 1..=65535.
     fn bin(&mut self, bin: bool, p: u32) -> bool;
-    /// False once the payload has been overrun beyond what an encoder may leave off: the caller may stop.
+    /// False once the decoder has read further beyond the end than an encoder may leave off: the caller may stop.
     fn alive(&self) -> bool;
 
     /// One of `SYMBOLS`; `ends` are the ends of their intervals within 65536, that of the last one modulo 65536.
@@ -34,7 +34,7 @@ pub trait Bins {
 pub const SYMBOLS: usize = 32;
 /// Cumulative probabilities times 65536.
 pub type Ends = [u16; SYMBOLS];
-/// Bits that the range has room for at once.
+/// Most bits that are coded in one step.
 const BITS_MAX: u32 = 16;
 
 /// Start and length of the interval of a symbol.
@@ -47,7 +47,7 @@ fn interval(symbol: usize, ends: &Ends) -> (u32, u32) {
 
 const TOP: u32 = 1 << 24;
 
-/// The writing side.
+/// The encoder.
 pub struct Encoder {
     low: u64, // 33 bits: bit 32 is a carry into what is pending
     range: u32,
@@ -87,7 +87,7 @@ impl Encoder {
         self.low = (self.low & 0x00FF_FFFF) << 8;
     }
 
-    /// Takes the part of the range from `start` on, `length` long.
+    /// Narrows the range to `length` from `start` on.
     #[inline]
     fn take(&mut self, start: u32, length: u32) {
         self.low += u64::from(start);
@@ -98,7 +98,8 @@ impl Encoder {
         }
     }
 
-    /// The payload: the value with the most trailing zero bits in the final interval, at most four zero bytes left off.
+    /// Ends the payload with the value in the final interval that has the most trailing zero bits; at most four zero bytes
+    /// are left off.
     pub fn finish(mut self) -> Vec<u8> {
         for bits in (0..=31u32).rev() {
             let mask = (1u64 << bits) - 1;
@@ -148,7 +149,7 @@ impl Bins for Encoder {
     }
 }
 
-/// The reading side. Never fails while reading: beyond the end it reads zeros, and `finish` tells.
+/// The decoder. Reading never fails: beyond the end it reads zeros, and `finish` reports that.
 pub struct Decoder<'a> {
     payload: &'a [u8],
     position: usize,
@@ -169,7 +170,7 @@ impl<'a> Decoder<'a> {
         d
     }
 
-    /// The bytes to come, the first one on top; zeros beyond the end.
+    /// The next four bytes, the first one on top; zeros beyond the end.
     #[inline]
     fn coming(&self) -> u32 {
         match self.payload.get(self.position..).and_then(|rest| rest.first_chunk()) {
@@ -184,8 +185,8 @@ impl<'a> Decoder<'a> {
         u32::from_be_bytes(std::array::from_fn(byte))
     }
 
-    /// Goes on with the part of the range from `start` on, `length` long. Without a branch: how much of the payload that
-    /// takes cannot be foreseen.
+    /// Narrows the range to `length` from `start` on. Without branches: prediction would fail on how many bytes are
+    /// consumed.
     #[inline]
     fn take(&mut self, start: u32, length: u32) {
         let shift = length.leading_zeros() & 24;

@@ -59,7 +59,10 @@ impl RigidBlend {
         finish: impl Fn(usize, [f32; 3], Quat) -> ([f32; 3], Quat) + Sync,
     ) {
         let per = blend.per.max(1);
-        let rows = blend.index.par_chunks(RUN * per).zip(blend.weight.par_chunks(RUN * per));
+        let rows = blend
+            .index
+            .par_chunks(RUN * per)
+            .zip(blend.weight.par_chunks(RUN * per));
         let out = out.0.par_chunks_mut(RUN).zip(out.1.par_chunks_mut(RUN));
         let runs = out.zip(rest.par_chunks(RUN)).zip(rows).enumerate();
         runs.for_each(|(run, (((means, quats), rest), (index, weight)))| {
@@ -110,11 +113,23 @@ impl RigidBlend {
     ///
     /// # Arguments
     /// * `rest`: [N] as in `carry`; `by_means`, `by_rotations`: [N] gradients by carried position and rotation.
-    pub fn backward(&self, blend: &Blend, rest: &[[f32; 3]], by_means: &[[f32; 3]], by_rotations: &[Quat]) -> Vec<Pose> {
+    pub fn backward(
+        &self,
+        blend: &Blend,
+        rest: &[[f32; 3]],
+        by_means: &[[f32; 3]],
+        by_rotations: &[Quat],
+    ) -> Vec<Pose> {
         let per = blend.per.max(1);
         let none = || vec![[[0.0f32; 4]; 5]; self.poses.len()];
-        let rows = blend.index.par_chunks(RUN * per).zip(blend.weight.par_chunks(RUN * per));
-        let grads = rest.par_chunks(RUN).zip(by_means.par_chunks(RUN)).zip(by_rotations.par_chunks(RUN));
+        let rows = blend
+            .index
+            .par_chunks(RUN * per)
+            .zip(blend.weight.par_chunks(RUN * per));
+        let grads = rest
+            .par_chunks(RUN)
+            .zip(by_means.par_chunks(RUN))
+            .zip(by_rotations.par_chunks(RUN));
         let parts: Vec<Vec<Pose>> = rows
             .zip(grads)
             .map(|((index, weight), ((rest, by_means), by_rotations))| {
@@ -143,7 +158,10 @@ impl RigidBlend {
         let unit = q.map(|v| v / length);
         let along = dot(h, unit);
         let by_q: Quat = std::array::from_fn(|i| (h[i] - along * unit[i]) / length);
-        let first = index.first().and_then(|j| self.poses.get(*j as usize)).map_or(REST[4], |p| p[4]);
+        let first = index
+            .first()
+            .and_then(|j| self.poses.get(*j as usize))
+            .map_or(REST[4], |p| p[4]);
         for (j, w) in index.iter().zip(weight) {
             let (Some(o), Some(p)) = (out.get_mut(*j as usize), self.poses.get(*j as usize)) else {
                 continue;
@@ -151,7 +169,11 @@ impl RigidBlend {
             let g = [w * g[0], w * g[1], w * g[2], 0.0];
             (0..3).for_each(|b| o[b] = plus(o[b], x[b], g));
             o[3] = plus(o[3], 1.0, g);
-            let sign = if !self.aligned && dot(p[4], first) < 0.0 { -w } else { *w };
+            let sign = if !self.aligned && dot(p[4], first) < 0.0 {
+                -w
+            } else {
+                *w
+            };
             o[4] = plus(o[4], sign, by_q);
         }
     }

@@ -1,24 +1,24 @@
-//! Symbols (spec 6.6): one of 32 in three contexts <-> the range coder, in integers only.
+//! Adaptive symbol models (spec 6.6): one of 32 symbols in three contexts <-> the range coder, in integers only.
 //!
-//! Each context has a distribution that follows what is seen in it; a symbol is predicted by the mean of three, with weights that
-//! are learned as well. One decision for what bins take eight for, in 16-bit lanes side by side, which any processor has.
+//! Each context has a distribution that adapts to its symbols; the mean of three, with weights that adapt too, is coded. One
+//! symbol replaces about eight bins; the 16-bit lanes vectorize on every processor.
 
 use crate::range_coder::{Bins, Ends, SYMBOLS};
 use std::sync::LazyLock;
 
-/// Symbols seen after which a distribution stops slowing down.
+/// A distribution that has seen this many symbols adapts no slower.
 const SEEN_MAX: u8 = 126;
 /// Least probability of a symbol, times 65536.
 const LEAST: u16 = 4;
-/// Weights adapt by 1 / 128: kept 128 times as fine.
+/// Weights adapt by 1 / 128 and have 7 extra fractional bits.
 const RATE_BITS: u32 = 7;
 
-/// A distribution: cumulative probabilities times 65536, 65535 for 1. A cache line.
+/// A distribution: cumulative probabilities times 65536, 65535 for 1. One cache line.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
 struct Distribution(Ends);
 
-/// All symbols alike.
+/// The uniform distribution.
 const NEW: Distribution = {
     let mut ends = [0; SYMBOLS];
     let mut i = 0;
@@ -69,7 +69,7 @@ impl Table {
     }
 }
 
-/// 1 / (n + 1.5) in 1/65536, and how much a distribution that has seen n symbols can be trusted, 0 to 3.
+/// Of a distribution that has seen n symbols: its rate 1 / (n + 1.5) in 1/65536, and its age, 0 to 3.
 static SEEN: LazyLock<[(u16, u8); 256]> = LazyLock::new(|| {
     std::array::from_fn(|n| {
         let age = match n {
@@ -90,7 +90,7 @@ pub struct SymbolModel {
 }
 
 impl SymbolModel {
-    /// So many contexts of each kind, and sets of weights.
+    /// `contexts` of each of the three kinds, `sets` weight sets.
     pub fn new(contexts: [usize; 3], sets: usize) -> Self {
         SymbolModel {
             tables: contexts.map(Table::new),
@@ -101,7 +101,7 @@ impl SymbolModel {
 
     /// Codes one symbol in three contexts, mixed with weight set `w`.
     ///
-    /// Contexts are made of what the caller counted, never of raw input, so they are in range by construction.
+    /// Contexts are computed from decoded values, never from raw input, so they are in range by construction.
     #[inline]
     pub fn symbol<C: Bins>(&mut self, c: &mut C, symbol: usize, contexts: [usize; 3], w: usize) -> usize {
         let [a, b, d] = &mut self.tables;

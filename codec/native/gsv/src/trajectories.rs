@@ -1,20 +1,20 @@
 //! Trajectories (spec 11, 12): DCT-II coefficients of Gaussians or nodes <-> bins.
 //!
-//! Most Gaussians have none, so storage is sparse: coding, keeping and evaluating cost what is there.
+//! Most Gaussians have no coefficients, so storage is sparse: time and memory are proportional to the coefficients present.
 
 use crate::model::Model;
 use crate::neighbors::{NEAR, Near};
 use crate::range_coder::Bins;
 use crate::values::ValueModel;
 
-const LENGTHS: usize = 32; // lengths with a model of their own
-const BLOCK: usize = 16; // indices that one bin says to have no coefficients at all
+const LENGTHS: usize = 32; // lengths with contexts of their own
+const BLOCK: usize = 16; // indices that share a bin: 0 if none of them has coefficients
 
 /// Coefficients of N Gaussians or nodes, `channels` values each, lowest frequency first.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Trajectories<V = i32> {
     pub channels: usize,
-    /// N + 1 places, in coefficients: those of i are `start[i]..start[i + 1]`.
+    /// N + 1 offsets, in coefficients: those of i are `start[i]..start[i + 1]`.
     start: Vec<u32>,
     /// `channels` values per coefficient.
     values: Vec<V>,
@@ -48,7 +48,7 @@ impl<V: Copy + Default + PartialEq> Trajectories<V> {
         }
     }
 
-    /// Appends one Gaussian: `coefficients` holds its values, `channels` per coefficient; zeros at the end are left out.
+    /// Appends one Gaussian. `coefficients`: `channels` values per coefficient; trailing zeros are dropped.
     pub fn push(&mut self, coefficients: &[V]) {
         let used = coefficients
             .iter()
@@ -58,7 +58,7 @@ impl<V: Copy + Default + PartialEq> Trajectories<V> {
         self.start.push((self.values.len() / self.channels.max(1)) as u32);
     }
 
-    /// Those of `count` Gaussians from `first` on.
+    /// The trajectories of `count` Gaussians from `first` on.
     pub fn part(&self, first: usize, count: usize) -> Self {
         let mut out = Trajectories::new(self.channels);
         (first..first + count).for_each(|i| out.push(self.get(i)));
@@ -89,7 +89,7 @@ impl<V: Copy + Default + PartialEq> Trajectories<V> {
         self.values.len()
     }
 
-    /// The values of `i`, `channels` per coefficient; none if there is no `i`.
+    /// The values of `i`, `channels` per coefficient; empty if there is no `i`.
     #[inline]
     pub fn get(&self, i: usize) -> &[V] {
         let place = |i: usize| self.start.get(i).map(|s| *s as usize * self.channels);
@@ -99,24 +99,24 @@ impl<V: Copy + Default + PartialEq> Trajectories<V> {
         }
     }
 
-    /// Number of coefficients of the longest.
+    /// The largest number of coefficients.
     pub fn max_length(&self) -> usize {
         self.start.windows(2).map(|w| (w[1] - w[0]) as usize).max().unwrap_or(0)
     }
 }
 
-/// How values are told apart.
+/// Chooses the contexts of the values.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     Gaussians,
-    Nodes,
+    Node,
 }
 
 impl Kind {
     fn class(self, k: usize, channel: usize) -> usize {
         match self {
             Kind::Gaussians => 3 * k.min(3) + channel % 3,
-            Kind::Nodes => 6 * k.min(3) + channel,
+            Kind::Node => 6 * k.min(3) + channel,
         }
     }
 }
@@ -124,13 +124,14 @@ impl Kind {
 /// Why decoding stopped.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Stop {
-    /// A forbidden value, or the payload is over.
+    /// A forbidden value was read, or the payload is over.
     Broken,
-    /// More symbols than allowed.
+    /// More symbols than the budget.
     Symbols,
 }
 
-/// Codes trajectories of up to `k_max` coefficients. Decoding takes at most `budget` values; `source` is the encoder's input.
+/// Codes trajectories of at most `k_max` coefficients. `source`: the trajectories to encode, in the decoder empty; `budget`:
+/// most values to decode.
 pub fn code<C: Bins>(
     c: &mut C,
     kind: Kind,
@@ -143,10 +144,10 @@ pub fn code<C: Bins>(
     let mut coder = Coder {
         kind,
         lengths: Model::new(16 * LENGTHS + 4, 16 * LENGTHS + 2, LENGTHS + 1),
-        values: ValueModel::new(if kind == Kind::Nodes { 24 } else { 12 }),
+        values: ValueModel::new(if kind == Kind::Node { 24 } else { 12 }),
     };
     let mut out = Trajectories::new(channels);
-    let mut before = [false; 2]; // whether blocks have any, the last one first
+    let mut before = [false; 2]; // whether the two blocks before have coefficients, the last one first
     for (block, near) in near.chunks(BLOCK).enumerate() {
         let own = block * BLOCK..block * BLOCK + near.len();
         let any = coder.any(c, own.clone().any(|i| !source.get(i).is_empty()), before);
@@ -179,7 +180,7 @@ struct Coder {
 }
 
 impl Coder {
-    /// Whether any of a block has coefficients.
+    /// Codes whether any Gaussian of a block has coefficients.
     fn any<C: Bins>(&mut self, c: &mut C, want: bool, before: [bool; 2]) -> bool {
         let [last, other] = before.map(usize::from);
         let first = 16 * LENGTHS; // contexts of its own

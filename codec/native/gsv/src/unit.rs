@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader, Writer};
 use crate::header::Header;
 
-/// Known unit types (spec 3.1).
+/// The unit types of this version (spec 3.1).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub enum UnitType {
@@ -54,7 +54,7 @@ impl UnitType {
         }
     }
 
-    /// The units that one of this type and of `attribute` must depend on, where its layer has them.
+    /// The units that a unit of this type and `attribute` must depend on, where its layer has them.
     pub fn needs(self, attribute: Option<Attribute>) -> &'static [(UnitType, Option<Attribute>)] {
         match (self, attribute) {
             (Channels, Some(Attribute::Quats)) => &[(Positions, None), (Channels, Some(Attribute::LogScales))],
@@ -74,12 +74,13 @@ pub struct Unit<'a> {
     pub layer: u8,
     pub attribute: Option<Attribute>,
     attribute_number: u8,
-    /// Of the unit in the group payload, and of its payload.
+    /// Offset of the unit in the group payload.
     pub offset: usize,
+    /// Offset of its payload in the group payload.
     pub payload_offset: usize,
     pub size: usize,
     pub payload: &'a [u8],
-    /// What is wrong with the unit, if it is damaged; then the other fields are what its bytes claim.
+    /// What was expected, if the unit is damaged; then the other fields are what its bytes claim.
     pub damage: Option<Error>,
     pub dependencies: Vec<u8>,
 }
@@ -100,10 +101,10 @@ impl Unit<'_> {
 
 const UNITS_MAX: usize = 255;
 
-/// Every layer there may be.
+/// A number of layers that no group exceeds.
 pub const ALL_LAYERS: usize = 256;
 
-/// Splits a group payload; every CRC and dependency is checked.
+/// Splits a group payload; checks every CRC and dependency.
 pub fn split(payload: &[u8], layers: usize) -> Result<Vec<Unit<'_>>> {
     let mut units = scan(payload, layers)?;
     let later = |u: &Unit| u.damage.is_some() && usize::from(u.layer) >= layers; // or so it claims: then others are missing
@@ -114,13 +115,13 @@ pub fn split(payload: &[u8], layers: usize) -> Result<Vec<Unit<'_>>> {
     }
 }
 
-/// Splits a group payload and marks damaged units (spec 3): those with a wrong CRC, those that name them, what the payload
-/// ends in, and what breaks a rule behind a damaged unit whose length may be false (where the header does not tell it).
+/// Splits a group payload and marks damaged units (spec 3): wrong CRC; a dependency on a damaged unit; cut off by the end of
+/// the payload; or a broken rule behind a damaged unit whose length may be wrong (where the header has no unit sizes).
 ///
-/// Units of the first `layers` layers only: the payload may end anywhere behind them.
+/// Returns the units of the first `layers` layers only; the payload may end anywhere behind them.
 ///
 /// # Errors
-/// Unit 0 is damaged, or sound bytes break a rule.
+/// Unit 0 is damaged; undamaged bytes break a rule.
 pub fn scan(payload: &[u8], layers: usize) -> Result<Vec<Unit<'_>>> {
     let mut units: Vec<Unit> = Vec::new();
     let (mut offset, mut damaged, mut sizes) = (0, false, Vec::new().into_iter());
@@ -168,7 +169,7 @@ pub fn first(payload: &[u8]) -> Result<Unit<'_>> {
     }
 }
 
-/// The unit that `data` starts with, of the size that the header tells; the rest of the data if it ends in the unit.
+/// The unit at the start of `data`, of the size in the header (`told`); the rest of the data, damaged, if that is too short.
 fn read(data: &[u8], offset: usize, index: usize, told: Option<usize>) -> Unit<'_> {
     let data = told.and_then(|size| data.get(..size)).unwrap_or(data);
     let mut h = [0u8; 4];
@@ -218,7 +219,7 @@ fn body<'a>(unit: &mut Unit<'a>, r: &mut Reader<'a>, data: &'a [u8], dependency_
     Err(Error::bitstream(0, "", expected))
 }
 
-/// The rules of spec 3 on a unit after those in `before`; what was expected if one is broken.
+/// Checks the rules of spec 3 for a unit behind those in `before`; returns what was expected if one is broken.
 fn check(unit: &Unit, before: &[Unit]) -> std::result::Result<(), String> {
     let index = before.len();
     if index >= UNITS_MAX {
@@ -254,7 +255,7 @@ fn check(unit: &Unit, before: &[Unit]) -> std::result::Result<(), String> {
     Ok(())
 }
 
-/// Appends a unit; `id` is its type, layer and attribute, `dependencies` are indices of earlier units. Nothing is checked.
+/// Appends a unit without checks. `id`: type, layer and attribute; `dependencies`: indices of earlier units.
 pub fn write(out: &mut Vec<u8>, id: [u8; 3], dependencies: &[u8], payload: &[u8]) -> Result<()> {
     let length = u32::try_from(payload.len()).map_err(|_| Error::Input("a unit of more than 4 GiB".into()))?;
     let mut w = Writer([&id[..], &[dependencies.len() as u8]].concat());

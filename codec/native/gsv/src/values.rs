@@ -1,7 +1,8 @@
-//! Values (spec 6.5): an integer of a channel or trajectory <-> bins, given what its neighbours hold.
+//! Values (spec 6.5): an integer of a trajectory <-> bins, in contexts made of the neighbours' integers; and the contexts of
+//! channels.
 //!
-//! The value is coded around 0 while the neighbours' mean is small, so that contexts learn how far to trust it (most
-//! channels are noise around a mean of their own), and around the mean where that is large.
+//! A value is coded relative to 0 while the mean of the neighbours is small, so that the contexts learn how reliable the
+//! mean is (most channels are noise around a mean of their own); where the mean is large, relative to the mean.
 
 use crate::model::Model;
 use crate::neighbors::NEAR;
@@ -10,13 +11,14 @@ use crate::range_coder::Bins;
 /// Integers stay within +-MAX_VALUE, which f32 holds exactly.
 pub const MAX_VALUE: i32 = 1 << 24;
 
-/// Bins of a value: zero, sign, 16 magnitudes of each sign, escape. They lie otherwise than in spec 6.5, so that those of small
-/// values, of both signs, share a cache line.
+/// Contexts of one value: zero, sign, 16 magnitudes of each sign, escape. Their order differs from spec 6.5, so that those
+/// of small values of both signs share a cache line.
 const SLOTS: usize = 64;
 const UNARY: i32 = 16;
 const NEAR_UNARY: usize = 7; // magnitudes of either sign in the first cache line
 const ESCAPE_SLOT: usize = 34;
 const ESCAPE_MAX: u32 = 25;
+/// Weights of the neighbours in the mean, nearest first.
 pub const NEAR_WEIGHT: [i32; NEAR] = [4, 3, 2, 2];
 
 /// Adaptive model of the values of one unit.
@@ -49,12 +51,12 @@ fn spread_bucket(s: i32) -> usize {
     usize::from(BUCKETS[s.clamp(0, FAR) as usize])
 }
 
-/// What the neighbours say of a value.
+/// Statistics of the neighbours' values.
 pub struct Expected {
     mean: i32,
-    /// What the value is coded relative to.
+    /// The value is coded relative to this.
     pub centre: i32,
-    /// 0 to 9, how far the neighbours are apart.
+    /// 0 to 9: how far the neighbours' values are apart.
     pub spread: usize,
 }
 
@@ -78,7 +80,7 @@ impl Expected {
         }
     }
 
-    /// 0 to 22: the mean, coarser where it is large.
+    /// 0 to 22: the mean, in wider ranges where it is large.
     #[inline]
     pub fn level(&self) -> usize {
         const FAR: i32 = 23;
@@ -97,7 +99,7 @@ impl Expected {
         usize::from(LEVELS[(self.mean.clamp(-FAR, FAR) + FAR) as usize])
     }
 
-    /// Of the mean: 0, 1 or 2.
+    /// Sign of the mean: 0, 1 or 2.
     #[inline]
     pub fn sign(&self) -> usize {
         (self.mean.clamp(-1, 1) + 1) as usize
@@ -112,7 +114,7 @@ impl ValueModel {
         }
     }
 
-    /// Codes `x`; `near` are the neighbours' values, nearest first, `prev` two values of the same Gaussian.
+    /// Codes `x`; `near`: the neighbours' values, nearest first; `prev`: two values of the same Gaussian.
     #[inline]
     pub fn value<C: Bins>(&mut self, c: &mut C, class: usize, x: i32, near: &[i32], prev: [i32; 2]) -> i32 {
         let e = Expected::new(near);

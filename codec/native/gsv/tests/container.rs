@@ -4,7 +4,8 @@ mod common;
 
 use common::Random;
 use gsv::container::config::{Camera, Config, rate};
-use gsv::container::demux::{Demuxer, Entry};
+use gsv::container::demux::Demuxer;
+use gsv::container::entry::Entry;
 use gsv::container::write::{Reference, finish, fragment, init_segment};
 use proptest::prelude::*;
 

@@ -4,14 +4,14 @@ mod common;
 
 use common::{Random, small};
 use gsv::attributes::Attribute;
+use gsv::conformance::Damage;
 use gsv::decode::{Decoding, decode_damaged, decode_group};
 use gsv::encode::encode_group;
 use gsv::error::Error;
 use gsv::evaluate::Evaluator;
-use gsv::parametric::Frame;
 use gsv::group::Group;
-use gsv::inventory::Damage;
 use gsv::levels::LEVELS;
+use gsv::parametric::Frame;
 use gsv::trajectories::Trajectories;
 use gsv::unit::{self, ALL_LAYERS, Unit, UnitType};
 use std::ops::Range;

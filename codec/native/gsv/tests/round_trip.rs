@@ -7,9 +7,9 @@ use gsv::decode::{Decoding, decode_group};
 use gsv::encode::encode_group;
 use gsv::error::Error;
 use gsv::evaluate::Evaluator;
-use gsv::parametric::Frame;
 use gsv::group::Group;
 use gsv::levels::Level;
+use gsv::parametric::Frame;
 use gsv::unit::{self, ALL_LAYERS};
 use proptest::prelude::*;
 

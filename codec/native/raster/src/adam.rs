@@ -2,13 +2,13 @@
 
 use rayon::prelude::*;
 
-use crate::scene::{RasterError, check_length};
-use crate::simd::{Level, Vector, c, dispatch};
+use crate::error::{RasterError, check_length};
+use crate::simd::{SimdLevel, Vector, c, dispatch};
 
 /// Values of one task.
 const SHARE: usize = 1 << 14;
 
-/// What all values of an attribute share in a step.
+/// Parameters of one step, the same for all values of an attribute.
 #[derive(Clone, Copy, Debug)]
 pub struct Adam {
     pub betas: [f32; 2],
@@ -24,7 +24,7 @@ impl Adam {
     /// Lengths that disagree.
     pub fn step(
         self,
-        level: Level,
+        level: SimdLevel,
         param: &mut [f32],
         grad: &[f32],
         first: &mut [f32],

@@ -1,20 +1,22 @@
-//! Gradients of one tile: every pair gets the sums over its pixels that its Gaussian's gradient is made of.
+//! Backward pass of one tile: for every Gaussian-tile pair the sums over its pixels that the gradient of the Gaussian is
+//! made of.
 //!
-//! Front to back again, with the same arithmetic as the forward pass, so transmittances agree to the bit and nothing had to be
-//! stored a pixel. With g the gradient of the pixel and D_i = g . rgb_i, dL/dalpha_i = T_i D_i - R_i / (1 - alpha_i), where the
-//! remainder R_i (everything behind Gaussian i, background included) starts as the whole pixel and loses w_i D_i each step.
+//! Front to back, with the arithmetic of the forward pass, so that transmittances agree to the bit and nothing per pixel has
+//! to be stored. With g the gradient of the pixel and D_i = g . rgb_i, dL/dalpha_i = T_i D_i - R_i / (1 - alpha_i). The
+//! remainder R_i (everything behind Gaussian i, background included) starts as the whole pixel and loses w_i D_i at each
+//! step.
 
 use std::sync::atomic::AtomicU32;
 
+use crate::adjoint::{Adjoint, Pixels};
 use crate::constants::{ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_STOP};
-use crate::picture::Pixels;
-use crate::project::Projected;
-use crate::rasterizer::Shade;
+use crate::projected::Projected;
+use crate::scene::Background;
 use crate::simd::{Vector, c, dispatch};
 use crate::tile::{BATCH, BLOCK, BLOCKS, Batch, Hits, Local, PIXEL_X, PIXEL_Y, Plane, opacities};
 
-/// Sums over the pixels of a pair. With a = dL/dalpha * alpha (the gradient by ln alpha) and w the blending weight:
-/// a, a u, a v, a u^2, a u v, a v^2, w g (3), w, largest w, unused.
+/// Sums over the pixels of a pair. With a = dL/dalpha * alpha (the gradient with respect to ln alpha) and w the blending
+/// weight: a, a u, a v, a u^2, a u v, a v^2, w g (3), w, largest w, unused.
 ///
 /// One cache line, since they are gathered in random order.
 #[derive(Clone, Copy)]
@@ -25,18 +27,9 @@ impl Sums {
     pub const ZERO: Sums = Sums([0.0; 12]);
 }
 
-/// State of the pixels of a tile.
-pub struct Adjoint {
-    /// Starts at 1 (0 outside of the image).
-    pub transmittance: Plane,
-    pub remainder: Plane,
-    /// Gradient by the blended colours.
-    pub rgb: [Plane; 3],
-}
-
-/// Visits (a Gaussian on a block) that are prepared together, and the most that one Gaussian adds to them.
+/// A visit is one Gaussian on one block. Visits prepared together, not counting those of the last Gaussian.
 const VISITS: usize = 64;
-/// Visits whose exponentials are computed together, which hides their latency.
+/// Visits whose exponentials are interleaved, which hides their latency.
 const TOGETHER: usize = 4;
 const ROOM: usize = VISITS + BLOCKS + TOGETHER;
 
@@ -81,7 +74,7 @@ impl Visits {
         }
     }
 
-    /// Appends those of a Gaussian; without branches, since the numbers of blocks cannot be foretold.
+    /// Appends the visits of a Gaussian, without branches: branch prediction would fail on the number of blocks.
     #[inline(always)]
     fn push(&mut self, splat: usize, mask: u16) {
         let [low, high] = mask.to_le_bytes();
@@ -117,7 +110,7 @@ impl Visits {
 
 struct Accumulator<V>([V; 12], V);
 
-/// Adds one visit to a Gaussian's sums.
+/// Adds one visit to the sums of its Gaussian.
 #[inline(always)]
 fn visit<V: Vector>(visits: &Visits, k: usize, at: usize, s: &Local, adjoint: &mut Adjoint, acc: &mut Accumulator<V>) {
     let zero = c::<V>(0.0);
@@ -170,18 +163,18 @@ fn transpose(hits: &Hits) -> [u16; BATCH] {
     masks
 }
 
-/// `hits` are those that the forward pass left for the batches of the tile; `sums` gets one row a pair.
+/// `hits`: the `seen` masks of the forward pass for the batches of the tile; `sums` gets one row per pair.
 #[inline(always)]
 fn backward_kernel<V: Vector>(
     projected: &[Projected],
     pairs: &[AtomicU32],
     pixels: &Pixels,
     at: [usize; 2],
-    shade: Shade,
+    background: Background,
     hits: &[Hits],
     sums: &mut [Sums],
 ) {
-    let (adjoint, origin) = (&mut pixels.adjoint(at, shade), at.map(|v| v as f32));
+    let (adjoint, origin) = (&mut pixels.adjoint(at, background), at.map(|v| v as f32));
     let mut batch = Batch::new();
     let mut visits = Visits::new();
     for (i, (hits, sums)) in hits.iter().zip(sums.chunks_mut(BATCH)).enumerate() {
@@ -223,7 +216,7 @@ dispatch!(
         pairs: &[AtomicU32],
         pixels: &Pixels,
         at: [usize; 2],
-        shade: Shade,
+        background: Background,
         hits: &[Hits],
         sums: &mut [Sums],
     )

@@ -1,9 +1,9 @@
-//! Ellipses of a picture -> those of each of k bands of rows, for workers that share no memory: each draws its band with
-//! `Rasterizer::draw`. Bands start at multiples of TILE rows, so that the picture is the same as in one piece.
+//! Splits the projected Gaussians of an image into k bands of rows, for workers that share no memory: each worker draws its
+//! band with `Rasterizer::draw`. Bands start at multiples of TILE rows, so the pixels are the same as without bands.
 
-use crate::project::{MANY, Projected, TILE};
+use crate::projected::{MANY, Projected, TILE};
 
-/// Rows of the picture and what is to be seen in them; y and tiles are relative to the first row.
+/// Rows of the image and the Gaussians that meet them; y and tiles count from the first row of the band.
 #[derive(Default)]
 pub struct Band {
     pub first: usize,
@@ -11,14 +11,14 @@ pub struct Band {
     pub splats: Vec<Projected>,
 }
 
-/// Buffers are kept from picture to picture.
+/// Splits images into bands; keeps its buffers from image to image.
 #[derive(Default)]
 pub struct Bands {
     pub bands: Vec<Band>,
     load: Vec<f32>, // of each row of tiles
 }
 
-/// What a tile costs besides its Gaussians, in Gaussians.
+/// Cost of an empty tile, in Gaussians.
 const TILE_COST: f32 = 8.0;
 
 impl Bands {
@@ -84,7 +84,7 @@ impl Band {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Level, Rasterizer, Region, Shade, Splats, Surface, View};
+    use crate::{Background, Rasterizer, Region, SimdLevel, Splats, Surface, View};
 
     /// A spiral of Gaussians, denser at the top.
     fn scene(n: usize) -> [Vec<f32>; 5] {
@@ -131,11 +131,14 @@ mod tests {
             sh_n: &[],
             sh_k: 0,
         };
-        let (view, shade) = (view(150, 141), Shade::over([0.2, 0.4, 0.6]));
-        let mut whole = Rasterizer::new(Level::best(), 0);
-        whole.forward(&splats, &view, shade, false).unwrap();
+        let (view, background) = (view(150, 141), Background::new([0.2, 0.4, 0.6]));
+        let mut whole = Rasterizer::new(SimdLevel::best(), 0);
+        whole.forward(&splats, &view, background, false).unwrap();
         for count in [1, 2, 3, 9, 40] {
-            let (mut project, mut draw) = (Rasterizer::new(Level::best(), 0), Rasterizer::new(Level::best(), 0));
+            let (mut project, mut draw) = (
+                Rasterizer::new(SimdLevel::best(), 0),
+                Rasterizer::new(SimdLevel::best(), 0),
+            );
             let (mut bands, mut row) = (Bands::default(), 0);
             for band in bands.split(project.project(&splats, &view).unwrap(), [150, 141], count) {
                 assert_eq!(band.first, row);
@@ -146,7 +149,7 @@ mod tests {
                     image: &mut image,
                     alpha: &mut alpha,
                 };
-                draw.draw(surface, [150, band.rows], shade, |p| p.clone_from(&band.splats))
+                draw.draw(surface, [150, band.rows], background, |p| p.clone_from(&band.splats))
                     .unwrap();
                 for (a, b) in image.iter().zip(&whole.image()[from..to]) {
                     assert!((a - b).abs() < 1e-4, "{count} bands: {a} {b}");
@@ -162,10 +165,10 @@ mod tests {
         let mut bands = Bands::default();
         let split = bands.split(&[], [20, 40], 2);
         assert_eq!(split.iter().map(|b| b.rows).sum::<usize>(), 40);
-        let mut draw = Rasterizer::new(Level::best(), 0);
+        let mut draw = Rasterizer::new(SimdLevel::best(), 0);
         let mut pixels = vec![[0; 4]; 800];
         let surface = Surface::Rgba(&mut pixels);
-        draw.draw(surface, [20, 40], Shade::over([1.0, 0.5, 0.0]), Vec::clear)
+        draw.draw(surface, [20, 40], Background::new([1.0, 0.5, 0.0]), Vec::clear)
             .unwrap();
         assert!(pixels.iter().all(|p| *p == [255, 128, 0, 255]));
     }

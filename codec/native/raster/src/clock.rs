@@ -1,4 +1,4 @@
-//! Time since a moment, in milliseconds. There is no clock in bare WebAssembly, where all times are 0.
+//! A stopwatch in milliseconds. Bare WebAssembly has no clock: all times are 0 there.
 
 #[cfg(not(target_family = "wasm"))]
 #[derive(Clone, Copy)]

@@ -1,4 +1,4 @@
-//! The constants of the picture. They are normative (the bitstream specification repeats them), because two players that
+//! The constants of rendering. They are normative (the bitstream specification repeats them), because two players that
 //! differ here show different pictures. Everything else in this crate is free to change.
 
 /// Added to the diagonal of the 2-D covariance, px^2 (the low-pass of 3D Gaussian Splatting).

@@ -1,14 +1,16 @@
-//! Blending of one tile, front to back. A pixel's transmittance turns negative when the pixel is finished: its magnitude stays
-//! the final transmittance and every later test on it fails, so that "finished" needs no mask of its own.
+//! Alpha blending of one tile, front to back: the Gaussian-tile pairs of the tile -> colour and transmittance per pixel.
+//!
+//! The transmittance of a finished pixel is negated: its magnitude stays the final transmittance, and every later test on it
+//! fails, so no mask of finished pixels is needed.
 
 use std::sync::atomic::AtomicU32;
 
 use crate::constants::{ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_STOP};
-use crate::project::{Projected, TILE};
+use crate::projected::{Projected, TILE};
 use crate::simd::{Vector, c, dispatch};
 use crate::tile::{BATCH, BLOCK, BLOCKS, Batch, Hits, PIXEL_X, PIXEL_Y, Plane, opacities, swizzle};
 
-/// A tile while it is drawn.
+/// Colour and transmittance of a tile during blending.
 pub struct Canvas {
     pub transmittance: Plane,
     pub rgb: [Plane; 3],
@@ -17,7 +19,7 @@ pub struct Canvas {
 }
 
 impl Canvas {
-    /// A tile of which width x height pixels are inside of the image.
+    /// A tile whose first `width` x `height` pixels are inside the image.
     pub fn new(width: usize, height: usize) -> Canvas {
         let mut canvas = Canvas {
             transmittance: Plane::ZERO,
@@ -40,8 +42,8 @@ impl Canvas {
     }
 }
 
-/// Adds the Gaussians of the batch that `hits` names to one vector of pixels; returns those that it got to see before all
-/// pixels were finished, and whether any is unfinished.
+/// Blends the Gaussians of the batch whose bit in `hits` is set onto one vector of pixels. Returns the bits of those that
+/// were visited before all pixels were finished, and whether any pixel is unfinished.
 #[inline(always)]
 fn blend<V: Vector>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut Canvas) -> (u64, bool) {
     let [red, green, blue] = &mut canvas.rgb;
@@ -81,8 +83,8 @@ fn blend<V: Vector>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut 
     (hits & !rest, V::any(c::<V>(0.0).lt(t)))
 }
 
-/// Draws the first `count` pairs onto the canvas and leaves in `seen` on which blocks each batch was drawn, for the backward
-/// pass; an empty `seen` means that there is none.
+/// Blends the first `count` pairs onto the canvas. `seen` gets, for each batch, which Gaussians were drawn on which blocks,
+/// for the backward pass; it is empty if there is none.
 #[inline(always)]
 fn forward_kernel<V: Vector>(
     projected: &[Projected],

@@ -1,112 +1,32 @@
 //! Multi-resolution hash grid (Instant-NGP, Mueller et al. 2022): [N, 3] in [0, 1] -> [N, L * F], trilinear at each level.
 //!
 //! A level whose vertices fit the table is dense, the others are hashed. A level is one task that walks all points in order:
-//! its part of the table stays in the cache, and gradients need no atomics and do not depend on the threads.
+//! its part of the table stays in the cache, gradients need no atomics, and results do not depend on the threads.
+
+mod cell;
 
 use rayon::prelude::*;
 
-use crate::divide::divide;
-use crate::scene::{RasterError, check_length};
+use crate::error::{RasterError, check_length};
+use crate::parallel::parallel_for;
+use cell::GridLevel;
 
-const PRIMES: [u32; 3] = [1, 2_654_435_761, 805_459_861]; // x is not multiplied
-/// Points of one task where levels are put together.
+/// Points of one task when the outputs of the levels are interleaved.
 const POINTS: usize = 256;
 
 /// Shape of a grid; the table is [entries, F], level after level.
 pub struct HashGrid {
     features: usize,
-    levels: Vec<Level>,
+    levels: Vec<GridLevel>,
     entries: usize,
     scratch: Vec<f32>, // [L, N, F] or [L, N, 3], kept from call to call
 }
 
-#[derive(Clone, Copy)]
-struct Level {
-    cells: u32, // on a side
-    first: usize,
-    entries: usize,
-    dense: bool,
-}
-
-/// The cell around a point: table rows of its 8 corners, position in the cell, and whether each coordinate was in [0, 1].
-struct Cell {
-    rows: [u32; 8],
-    frac: [f32; 3],
-    inside: [bool; 3],
-}
-
-impl Level {
-    #[inline(always)]
-    fn cell(&self, point: &[f32; 3]) -> Cell {
-        let (mut low, mut frac, mut inside) = ([0u32; 3], [0.0; 3], [true; 3]);
-        for d in 0..3 {
-            inside[d] = (0.0..=1.0).contains(&point[d]);
-            let x = if inside[d] { point[d] } else { f32::from(point[d] > 0.5) }; // NaN becomes 0
-            let x = x * self.cells as f32;
-            low[d] = (x as u32).min(self.cells - 1);
-            frac[d] = x - low[d] as f32;
-        }
-        let side = self.cells + 1;
-        let [x, y, z] = low;
-        let mut rows = [0; 8];
-        if self.dense {
-            let first = (z * side + y) * side + x;
-            for (corner, row) in rows.iter_mut().enumerate() {
-                let c = corner as u32;
-                *row = first + (c & 1) + (c >> 1 & 1) * side + (c >> 2) * side * side;
-            }
-        } else {
-            let (y0, z0) = (y.wrapping_mul(PRIMES[1]), z.wrapping_mul(PRIMES[2]));
-            let hx = [x, x + 1];
-            let hy = [y0, y0.wrapping_add(PRIMES[1])];
-            let hz = [z0, z0.wrapping_add(PRIMES[2])];
-            let mask = self.entries as u32 - 1;
-            for (corner, row) in rows.iter_mut().enumerate() {
-                *row = (hx[corner & 1] ^ hy[corner >> 1 & 1] ^ hz[corner >> 2]) & mask;
-            }
-        }
-        Cell { rows, frac, inside }
-    }
-}
-
-impl Cell {
-    /// Trilinear weights of the corners.
-    #[inline(always)]
-    fn weights(&self) -> [f32; 8] {
-        let [x, y, z] = self.frac;
-        let (x0, y0, z0) = (1.0 - x, 1.0 - y, 1.0 - z);
-        let yz = [y0 * z0, y * z0, y0 * z, y * z];
-        [
-            x0 * yz[0],
-            x * yz[0],
-            x0 * yz[1],
-            x * yz[1],
-            x0 * yz[2],
-            x * yz[2],
-            x0 * yz[3],
-            x * yz[3],
-        ]
-    }
-
-    /// Derivatives of sum(weight * value) by the coordinates, in units of cells; 0 outside of [0, 1].
-    #[inline(always)]
-    fn slopes(&self, value: &[f32; 8]) -> [f32; 3] {
-        let [x, y, z] = self.frac;
-        let mix = |a: f32, b: f32, t: f32| a + t * (b - a);
-        let face = |step: usize, i: usize, j: usize, s: f32, t: f32| {
-            let rise = |at: usize| value[at + step] - value[at];
-            mix(mix(rise(0), rise(i), s), mix(rise(j), rise(i + j), s), t)
-        };
-        let all = [face(1, 2, 4, y, z), face(2, 1, 4, x, z), face(4, 1, 2, x, y)];
-        std::array::from_fn(|d| if self.inside[d] { all[d] } else { 0.0 })
-    }
-}
-
 impl HashGrid {
-    /// `cells` on a side of each level; `table` entries at most a level, a power of two.
+    /// `cells`: number of cells along a side of each level; `table`: most entries of a level, a power of two.
     ///
     /// # Errors
-    /// A number of features that is none of 1, 2, 4, 8; no cells; a table that is no power of two.
+    /// `features` is not 1, 2, 4 or 8; a level has no cells; `table` is not a power of two.
     pub fn new(features: usize, cells: &[u32], table: usize) -> Result<HashGrid, RasterError> {
         if !matches!(features, 1 | 2 | 4 | 8) {
             return Err(RasterError::Shape {
@@ -134,7 +54,7 @@ impl HashGrid {
             }
             let vertices = (cells as usize + 1).pow(3);
             let (dense, entries) = (vertices <= table, vertices.min(table));
-            levels.push(Level {
+            levels.push(GridLevel {
                 cells,
                 first,
                 entries,
@@ -155,7 +75,7 @@ impl HashGrid {
         self.entries
     }
 
-    /// Values a point: L * F.
+    /// Values per point: L * F.
     pub fn outputs(&self) -> usize {
         self.levels.len() * self.features
     }
@@ -248,7 +168,7 @@ impl HashGrid {
             let n = self.levels[middle].first - self.levels[levels.start].first;
             <[[f32; F]]>::split_at_mut(rows, n)
         };
-        divide(0..self.levels.len(), 1, rows, &cut, &|l, rows: &mut [[f32; F]]| {
+        parallel_for(0..self.levels.len(), 1, rows, &cut, &|l, rows: &mut [[f32; F]]| {
             let level = self.levels[l.start];
             for (g, point) in grad_out.chunks_exact(stride).zip(points.as_chunks::<3>().0) {
                 let g = &g[l.start * F..(l.start + 1) * F];

@@ -1,41 +1,56 @@
-//! CPU rasterizer and training kernels: Gaussians + view -> image, and gradients back; image loss; hash grid.
+//! CPU rasterizer and training kernels: Gaussians and a view -> image, and gradients back; image loss; Adam; hash grid.
 //!
-//! scene -> soa -> project -> sort -> bin -> forward (tiles) -> picture; backward (tiles) -> project_backward (Gaussians).
-//! `simd` is the only place with `unsafe`. This crate never sees bytes of a stream: everything here may be fed floats of any value.
+//! Forward: scene -> soa -> project (ewa) -> sort -> tile_binning -> tile_passes (forward) -> framebuffer. Backward: adjoint
+//! -> tile_passes (backward) -> project_backward.
+//!
+//! `simd` is the only place with `unsafe`. This crate never sees bytes of a stream; its inputs may be floats of any value.
 
 // Kernels index several arrays in step; iterators over some of them would hide that.
 #![allow(clippy::needless_range_loop)]
 
 mod adam;
+mod adjoint;
 mod backward;
 mod bands;
-mod bin;
 mod clock;
 pub mod constants;
-mod divide;
+mod ellipse;
+mod error;
+mod ewa;
 mod forward;
+mod framebuffer;
 mod hashgrid;
+mod image_pair;
 mod loss;
-mod picture;
+mod parallel;
 mod project;
 mod project_backward;
+mod projected;
 mod rasterizer;
+mod region;
 mod scene;
 mod sh;
 mod simd;
 mod soa;
 mod sort;
 mod ssim;
+mod ssim_window;
 mod step;
 mod tile;
+mod tile_binning;
+mod tile_passes;
+mod tile_rect;
 
 pub use adam::Adam;
 pub use bands::{Band, Bands};
+pub use error::RasterError;
+pub use framebuffer::Surface;
 pub use hashgrid::HashGrid;
-pub use loss::{ImageLoss, LossValue, Pair};
-pub use picture::Surface;
-pub use project::Projected;
-pub use rasterizer::{Rasterizer, Shade, Timings};
-pub use scene::{Gradients, RasterError, Region, Splats, View};
-pub use simd::Level;
-pub use step::{Lambdas, Step, StepValue, Target};
+pub use image_pair::Pair;
+pub use loss::{ImageLoss, LossValue};
+pub use projected::Projected;
+pub use rasterizer::{Rasterizer, Timings};
+pub use region::Region;
+pub use scene::{Background, Gradients, Splats, View};
+pub use simd::SimdLevel;
+pub use step::{Lambdas, Step, StepValue, TargetImage};

@@ -9,10 +9,12 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::divide::divide;
-use crate::scene::{RasterError, check_length};
-use crate::simd::{Level, Vector, c, dispatch};
-use crate::ssim::{ROWS, derivative_rows, gradient_rows};
+use crate::error::{RasterError, check_length};
+use crate::image_pair::Pair;
+use crate::parallel::parallel_for;
+use crate::simd::{SimdLevel, Vector, c, dispatch};
+use crate::ssim::{derivative_rows, gradient_rows};
+use crate::ssim_window::ROWS;
 
 /// Means over the (weighted) pixels and channels.
 #[derive(Clone, Copy, Default, Debug, PartialEq)]
@@ -28,27 +30,8 @@ pub struct LossValue {
 pub struct ImageLoss {
     maps: [Vec<f32>; 3],
     partial: Vec<[f64; 3]>,
-    /// Values of each row from the first to the last that differ.
+    /// Of each row the range of values from the first to the last that differs.
     spans: Vec<Range<usize>>,
-}
-
-/// Two images [H, W, 3] and their weights.
-#[derive(Clone, Copy)]
-pub struct Pair<'a> {
-    pub image: &'a [f32],
-    pub target: &'a [f32],
-    pub width: usize,
-    /// [H, W]
-    pub weight: Option<&'a [f32]>,
-}
-
-impl Pair<'_> {
-    pub fn row_values(&self) -> usize {
-        3 * self.width
-    }
-    pub fn rows(&self) -> usize {
-        self.image.len() / self.row_values().max(1)
-    }
 }
 
 impl ImageLoss {
@@ -56,7 +39,13 @@ impl ImageLoss {
     ///
     /// # Errors
     /// Lengths that disagree.
-    pub fn run(&mut self, level: Level, pair: Pair, lambda: f32, grad: &mut [f32]) -> Result<LossValue, RasterError> {
+    pub fn run(
+        &mut self,
+        level: SimdLevel,
+        pair: Pair,
+        lambda: f32,
+        grad: &mut [f32],
+    ) -> Result<LossValue, RasterError> {
         check_length("target", pair.target.len(), pair.image.len())?;
         check_length("gradient of the image", grad.len(), pair.image.len())?;
         check_length("image", pair.image.len(), pair.rows() * pair.row_values())?;
@@ -83,8 +72,8 @@ impl ImageLoss {
         Ok(LossValue { loss, l1, mse, ssim })
     }
 
-    /// Pass 1: the maps times `scale` and the weight; returns sums of |x - y|, (x - y)^2 and SSIM.
-    fn derivatives(&mut self, level: Level, pair: Pair, scale: f64) -> [f64; 3] {
+    /// Pass 1: derivative maps, times `scale` and the weight. Returns the sums of |x - y|, (x - y)^2 and SSIM.
+    fn derivatives(&mut self, level: SimdLevel, pair: Pair, scale: f64) -> [f64; 3] {
         let (values, rows) = (pair.row_values(), pair.rows());
         self.partial.clear();
         self.partial.resize(rows, [0.0; 3]);
@@ -101,7 +90,7 @@ impl ImageLoss {
         }
         let spans = &self.spans;
         let [a, b, d] = &mut self.maps;
-        divide(
+        parallel_for(
             0..rows,
             ROWS,
             ([&mut a[..], &mut b[..], &mut d[..]], &mut self.partial[..]),
@@ -124,10 +113,10 @@ impl ImageLoss {
     }
 
     /// Pass 2: blurs the maps and adds the gradient of L1.
-    fn gradient(&self, level: Level, pair: Pair, l1: f32, grad: &mut [f32]) {
+    fn gradient(&self, level: SimdLevel, pair: Pair, l1: f32, grad: &mut [f32]) {
         let values = pair.row_values();
         let maps = [&self.maps[0][..], &self.maps[1][..], &self.maps[2][..]];
-        divide(
+        parallel_for(
             0..pair.rows(),
             ROWS,
             grad,
@@ -140,11 +129,12 @@ impl ImageLoss {
     }
 }
 
-/// The columns that matter to a band: those of all rows nearer than `reach`, widened by `margin` values and to whole vectors.
+/// The columns that a band of rows needs: those with differences in the rows nearer than `reach`, widened by `margin` values
+/// and to whole vectors.
 ///
-/// A gradient is nonzero within 10 pixels of a difference and uses maps 5 pixels further. Pass 2 takes 10 rows and, rounded up
-/// to vectors, at most 45 values; what it reads, 60 values and 5 rows away, is inside of what pass 1 takes for any band of
-/// such a row.
+/// A gradient is nonzero within 10 pixels of a difference, and reads maps 5 pixels further. Pass 2 takes 10 rows and,
+/// rounded up to vectors, at most 45 values; it reads 60 values and 5 rows further, which pass 1 has computed for any band
+/// of such a row.
 fn columns(spans: &[Range<usize>], band: &Range<usize>, reach: usize, margin: usize, values: usize) -> Range<usize> {
     let rows = band.start.saturating_sub(reach)..(band.end + reach).min(spans.len());
     let used = spans[rows].iter().filter(|s| !s.is_empty());
@@ -160,7 +150,7 @@ fn differ<V: Vector>(x: &[f32], y: &[f32], at: usize) -> bool {
     V::any(!c::<V>(0.0).ge((V::load(&x[at..]) - V::load(&y[at..])).abs())) // NaN differs from everything
 }
 
-/// From the first to the last value that differs, give or take a vector.
+/// From the first to the last value that differs, to within a vector.
 #[inline(always)]
 fn differing_kernel<V: Vector>(x: &[f32], y: &[f32]) -> Range<usize> {
     let n = x.len().min(y.len());

@@ -1,234 +1,19 @@
-//! Gaussians in the world -> `Projected` ellipses on the image (EWA splatting), 16 at a time.
+//! Gaussians in the world -> `Projected` ellipses on the image, 16 at a time (EWA splatting, see `ewa`).
 //!
-//! The covariance is kept as M M^T with M = J W R S (2x3): positive semi-definite by construction, and its determinant follows
-//! from the cross product of the rows (Cauchy-Binet) without the cancellation of ac - b^2. The inverse covariance is kept as
-//! its Cholesky factor, scaled so that the exponent in base 2 is log2(alpha) = log2_opacity - u^2 - v^2 with
-//! u = l11 dx + l21 dy, v = l22 dy: as cheap per pixel as the quadratic form and never positive by rounding.
+//! The inverse covariance is kept as its Cholesky factor, scaled so that the exponent in base 2 is
+//! log2(alpha) = log2_opacity - u^2 - v^2 with u = l11 dx + l21 dy, v = l22 dy. That costs as little per pixel as the
+//! quadratic form, and rounding never makes the exponent positive.
 
-use crate::constants::{FOV_MARGIN, LOG2_ALPHA_MIN, LOW_PASS, NEAR};
-use crate::scene::{Splats, View};
-use crate::sh;
+use crate::constants::{LOG2_ALPHA_MIN, NEAR};
+use crate::ellipse::{Ellipse, reach};
+use crate::ewa::{Lens, WHITEN, colour, ewa, exp};
+use crate::projected::{MANY, Projected, SLACK, TILE};
+use crate::scene::Splats;
 use crate::simd::{MAGIC, Vector, c, dispatch};
 use crate::soa::{CHUNK, Row, Soa, load_rows};
-use crate::tile::{Ellipse, reach};
 
-/// Side of a tile in pixels.
-pub const TILE: usize = 16;
-/// Widens the box and the ellipse a little, so that rounding never loses a pixel that the blending would have drawn.
-pub const SLACK: f32 = 1e-3;
-
-/// A Gaussian on the image; x and y in pixels of the region.
-///
-/// One cache line: tiles fetch them in depth order, which is random in memory.
-#[derive(Clone, Copy, Default, Debug)]
-#[repr(C, align(64))]
-pub struct Projected {
-    pub x: f32,
-    pub y: f32,
-    pub l11: f32,
-    pub l21: f32,
-    pub l22: f32,
-    pub log2_opacity: f32,
-    pub rgb: [f32; 3],
-    pub depth: f32,
-    /// Half width and height of the box around the pixels where alpha >= ALPHA_MIN; rx < 0: not visible.
-    pub rx: f32,
-    pub ry: f32,
-    /// Tiles that the box meets: first and last column, first and last row.
-    pub tiles: [u16; 4],
-    /// Which of them the ellipse meets if they are at most 2 x 2: bit 2 row + column, from the first ones. Else `MANY`.
-    pub met: u16,
-}
-
-/// `met` of a box of more tiles than that.
-pub const MANY: u16 = 1 << 4;
-
-impl Projected {
-    pub fn visible(&self) -> bool {
-        self.rx >= 0.0
-    }
-
-    /// Larger half side of the box in pixels, 0 for the invisible.
-    pub fn radius(&self) -> f32 {
-        if self.visible() { self.rx.max(self.ry) } else { 0.0 }
-    }
-}
-
-/// u^2 = log2(e)/2 * (whitened distance)^2
-pub const WHITEN: f32 = 0.5 * std::f32::consts::LOG2_E;
-
-/// The view with what all Gaussians need of it.
-pub struct Lens {
-    pub rotation: [[f32; 3]; 3],
-    pub translation: [f32; 3],
-    pub eye: [f32; 3],
-    pub focal: [f32; 2],
-    pub center: [f32; 2],
-    pub slope_min: [f32; 2],
-    pub slope_max: [f32; 2],
-    pub size: [f32; 2], // of the region
-    pub full: [f32; 2], // of the image
-}
-
-impl Lens {
-    pub fn new(view: &View) -> Lens {
-        let full = [view.width as f32, view.height as f32];
-        let origin = [view.region.x as f32, view.region.y as f32];
-        let margin = |i: usize| FOV_MARGIN * 0.5 * full[i] / view.focal[i];
-        Lens {
-            rotation: view.rotation,
-            translation: view.translation,
-            eye: view.eye(),
-            focal: view.focal,
-            center: [view.center[0] - origin[0], view.center[1] - origin[1]],
-            slope_min: std::array::from_fn(|i| -view.center[i] / view.focal[i] - margin(i)),
-            slope_max: std::array::from_fn(|i| (full[i] - view.center[i]) / view.focal[i] + margin(i)),
-            size: [view.region.width as f32, view.region.height as f32],
-            full,
-        }
-    }
-}
-
-/// Everything between the parameters and the 2-D covariance; the backward pass computes it again.
-pub struct Ewa<V: Vector> {
-    pub p: [V; 3], // camera space
-    pub inv_z: V,
-    pub free: [V::Mask; 2], // not clamped
-    pub unit: [V; 4],       // normalised quaternion
-    pub inv_norm: V,
-    pub rot: [[V; 3]; 3],
-    pub scale: [V; 3],
-    pub jw: [[V; 3]; 2], // Jacobian times world-to-camera rotation
-    pub m: [[V; 3]; 2],  // jw rot scale
-    pub cov: [V; 3],     // xx, xy, yy with the low-pass
-    pub det: V,
-}
-
-#[inline(always)]
-pub fn dot3<V: Vector>(a: [V; 3], b: [V; 3]) -> V {
-    a[0].mul_add(b[0], a[1].mul_add(b[1], a[2] * b[2]))
-}
-
-#[inline(always)]
-fn rotation<V: Vector>([w, x, y, z]: [V; 4]) -> [[V; 3]; 3] {
-    let (one, two) = (c::<V>(1.0), c::<V>(2.0));
-    [
-        [
-            one - two * (y * y + z * z),
-            two * (x * y - w * z),
-            two * (x * z + w * y),
-        ],
-        [
-            two * (x * y + w * z),
-            one - two * (x * x + z * z),
-            two * (y * z - w * x),
-        ],
-        [
-            two * (x * z - w * y),
-            two * (y * z + w * x),
-            one - two * (x * x + y * y),
-        ],
-    ]
-}
-
-/// exp(x)
-#[inline(always)]
-pub fn exp<V: Vector>(x: V) -> V {
-    (x * c::<V>(std::f32::consts::LOG2_E)).exp2()
-}
-
-/// The lanes `at ..` of the chunk.
-#[inline(always)]
-pub fn ewa<V: Vector>(soa: &Soa, lens: &Lens, at: usize) -> Ewa<V> {
-    let mean: [V; 3] = load_rows(&soa.means, at);
-    let w = &lens.rotation;
-    let mut p = mean;
-    for i in 0..3 {
-        p[i] = dot3([c(w[i][0]), c(w[i][1]), c(w[i][2])], mean) + c::<V>(lens.translation[i]);
-    }
-    let inv_z = c::<V>(1.0) / p[2];
-    let q: [V; 4] = load_rows(&soa.quats, at);
-    let norm = (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]).sqrt();
-    let inv_norm = c::<V>(1.0) / norm;
-    let unit = [q[0] * inv_norm, q[1] * inv_norm, q[2] * inv_norm, q[3] * inv_norm];
-    let rot = rotation(unit);
-    let log_scale: [V; 3] = load_rows(&soa.log_scales, at);
-    let scale = [exp(log_scale[0]), exp(log_scale[1]), exp(log_scale[2])];
-
-    let mut free = [p[0].finite(); 2];
-    let mut jw = [[c::<V>(0.0); 3]; 2];
-    let mut m = jw;
-    for i in 0..2 {
-        let (lo, hi) = (c::<V>(lens.slope_min[i]), c::<V>(lens.slope_max[i]));
-        let s = p[i] * inv_z;
-        free[i] = s.ge(lo) & !s.ge(hi);
-        let slope = s.max(lo).min(hi);
-        let a = c::<V>(lens.focal[i]) * inv_z;
-        for j in 0..3 {
-            jw[i][j] = a * slope.neg_mul_add(c(w[2][j]), c(w[i][j]));
-        }
-        for j in 0..3 {
-            m[i][j] = dot3(jw[i], [rot[0][j], rot[1][j], rot[2][j]]) * scale[j];
-        }
-    }
-    let low = c::<V>(LOW_PASS);
-    let (xx, xy, yy) = (dot3(m[0], m[0]), dot3(m[0], m[1]), dot3(m[1], m[1]));
-    let [a, b] = m;
-    let cross = [
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    ];
-    let det = low * low + low * (xx + yy) + dot3(cross, cross);
-    let cov = [xx + low, xy, yy + low];
-    Ewa {
-        p,
-        inv_z,
-        free,
-        unit,
-        inv_norm,
-        rot,
-        scale,
-        jw,
-        m,
-        cov,
-        det,
-    }
-}
-
-/// Unit direction from the eye to the mean, and 1 / distance.
-#[inline(always)]
-pub fn direction<V: Vector>(soa: &Soa, lens: &Lens, at: usize) -> ([V; 3], V) {
-    let mean: [V; 3] = load_rows(&soa.means, at);
-    let d = [
-        mean[0] - c(lens.eye[0]),
-        mean[1] - c(lens.eye[1]),
-        mean[2] - c(lens.eye[2]),
-    ];
-    let inv = c::<V>(1.0) / dot3(d, d).sqrt();
-    ([d[0] * inv, d[1] * inv, d[2] * inv], inv)
-}
-
-/// Colour before the clamp at 0.
-#[inline(always)]
-pub fn colour<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize) -> [V; 3] {
-    let mut rgb: [V; 3] = load_rows(&soa.sh0, at);
-    for channel in &mut rgb {
-        *channel = channel.mul_add(c(sh::SH_C0), c(0.5));
-    }
-    if k > 0 {
-        let (dir, _) = direction::<V>(soa, lens, at);
-        let basis = sh::basis(k, dir);
-        for i in 0..k {
-            for ch in 0..3 {
-                rgb[ch] = basis[i].mul_add(V::load(&soa.sh_n[i][ch][at..]), rgb[ch]);
-            }
-        }
-    }
-    rgb
-}
-
-/// The fields of `Projected` of 16 Gaussians, as rows; MAGIC is added to the last five, so that they are in the low bits.
+/// The fields of `Projected` of 16 Gaussians, as rows. The last five hold integers: MAGIC is added, so that they are in the
+/// low bits.
 struct Out([Row; 17]);
 
 #[inline(always)]
@@ -272,19 +57,7 @@ fn project_lanes<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize, out: &m
     }
     rx.select(seen, c(-1.0)).store(&mut out.0[10][at..]);
     ry.store(&mut out.0[11][at..]);
-    let (wide, high) = (rx + c(SLACK), ry + c(SLACK));
-    // the first pixel centre at or after an edge, the last one at or before it; a tile too many is found out by `meet`
-    let tile = |edge: V, axis: usize| {
-        let pixel = edge.max(c(0.0)).min(c(lens.size[axis] - 1.0));
-        pixel.mul_add(c(1.0 / TILE as f32), c(-0.5)) + c(MAGIC)
-    };
-    let half_on = c::<V>(0.25); // so that the last pixel of a picture is not rounded down
-    let tiles = [
-        tile(x - wide + half, 0),
-        tile(x + wide - half + half_on, 0),
-        tile(y - high + half, 1),
-        tile(y + high - half + half_on, 1),
-    ];
+    let tiles = tile_range(lens, [x, y], [rx + c(SLACK), ry + c(SLACK)]);
     for (i, tile) in tiles.into_iter().enumerate() {
         tile.store(&mut out.0[12 + i][at..]);
     }
@@ -297,7 +70,25 @@ fn project_lanes<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize, out: &m
     meet(&ellipse, [x, y], tiles.map(|tile| tile - c(MAGIC))).store(&mut out.0[16][at..]);
 }
 
-/// `met` of the ellipse around the point, + MAGIC, by a test at the pixel centres of 2 x 2 tiles.
+/// First and last column, first and last row of the tiles that the box around (x, y) meets, + MAGIC: the tile of the first
+/// pixel centre at or after an edge, and of the last one at or before it. A tile too many is found out by `meet`.
+#[inline(always)]
+fn tile_range<V: Vector>(lens: &Lens, [x, y]: [V; 2], [wide, high]: [V; 2]) -> [V; 4] {
+    let half = c::<V>(0.5);
+    let tile = |edge: V, axis: usize| {
+        let pixel = edge.max(c(0.0)).min(c(lens.size[axis] - 1.0));
+        pixel.mul_add(c(1.0 / TILE as f32), c(-0.5)) + c(MAGIC)
+    };
+    let half_on = c::<V>(0.25); // so that the last pixel of an image is not rounded down
+    [
+        tile(x - wide + half, 0),
+        tile(x + wide - half + half_on, 0),
+        tile(y - high + half, 1),
+        tile(y + high - half + half_on, 1),
+    ]
+}
+
+/// `Projected::met` of the ellipse around the point, + MAGIC, by a test at the pixel centres of 2 x 2 tiles.
 #[inline(always)]
 fn meet<V: Vector>(ellipse: &Ellipse<V>, [x, y]: [V; 2], [x0, x1, y0, y1]: [V; 4]) -> V {
     let side = TILE as f32;

@@ -1,14 +1,17 @@
-//! Sums over the pixels of a Gaussian -> gradients of its parameters; the mirror of project.rs, 16 Gaussians at a time.
+//! Backward pass of the projection: sums over the pixels of each Gaussian -> gradients of its parameters, 16 Gaussians at a
+//! time.
+//!
+//! The mirror of project.rs.
 
 use std::ops::Range;
 
 use crate::backward::Sums;
-use crate::bin::Bins;
-use crate::project::{Ewa, Lens, WHITEN, colour, direction, dot3, ewa};
+use crate::ewa::{Ewa, Lens, WHITEN, colour, direction, dot3, ewa};
 use crate::scene::{Gradients, Splats};
 use crate::sh;
 use crate::simd::{Vector, c, dispatch, prefetch};
 use crate::soa::{CHUNK, Row, Soa, write_columns};
+use crate::tile_binning::TileBins;
 
 /// Gradients of a chunk as rows.
 struct GradientRows {
@@ -35,7 +38,7 @@ impl GradientRows {
         }
     }
 
-    /// To the `n` Gaussians `at ..` of `out`; 0 for those without a bit in `seen`.
+    /// Writes the gradients of `n` Gaussians from `at` on to `out`; 0 for those without a bit in `seen`.
     #[inline(always)]
     fn write(&self, n: usize, seen: u16, sums: &[Row; 12], at: usize, k: usize, out: &mut Gradients) {
         let (to, add) = (at + n, out.add);
@@ -73,12 +76,12 @@ impl GradientRows {
     }
 }
 
-/// Gaussians between a prefetch of their pairs and its use; their places are fetched twice as early.
+/// Prefetch distance in Gaussians: sums are fetched this far ahead, their places twice as far.
 const AHEAD: usize = 24;
 
 /// Adds up the pairs of `n` Gaussians, in the order of their tiles. Bit i of the mask is set if Gaussian first + i has any.
 #[inline(always)] // into the kernel, whose wide instructions it needs
-fn gather(bins: &Bins, sums: &[Sums], first: usize, n: usize, rows: &mut [Row; 12]) -> u16 {
+fn gather(bins: &TileBins, sums: &[Sums], first: usize, n: usize, rows: &mut [Row; 12]) -> u16 {
     let mut seen = 0;
     for lane in 0..n {
         let g = first + lane;
@@ -226,7 +229,7 @@ fn chunk<V: Vector>(soa: &Soa, lens: &Lens, k: usize, sums: &[Row; 12], out: &mu
         colour_backward::<V>(soa, lens, k, sums, at, out);
         // d ln(sigmoid(x)) / dx = 1 - sigmoid(x)
         let logit = V::load(&soa.logits[0][at..]).max(c(-55.0));
-        let up = crate::project::exp(-logit);
+        let up = crate::ewa::exp(-logit);
         (V::load(&sums[0][at..]) * up / (c::<V>(1.0) + up)).store(&mut out.logits[0][at..]);
         let gx = s.mean2d[0] * c(0.5 * lens.full[0]);
         let gy = s.mean2d[1] * c(0.5 * lens.full[1]);
@@ -238,7 +241,7 @@ fn chunk<V: Vector>(soa: &Soa, lens: &Lens, k: usize, sums: &[Row; 12], out: &mu
 fn project_backward_kernel<V: Vector>(
     splats: &Splats,
     lens: &Lens,
-    bins: &Bins,
+    bins: &TileBins,
     sums: &[Sums],
     range: Range<usize>,
     out: &mut Gradients,
@@ -257,7 +260,7 @@ dispatch!(
     pub fn project_backward = project_backward_kernel(
         splats: &Splats,
         lens: &Lens,
-        bins: &Bins,
+        bins: &TileBins,
         sums: &[Sums],
         range: Range<usize>,
         out: &mut Gradients,

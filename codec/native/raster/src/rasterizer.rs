@@ -1,31 +1,36 @@
-//! The rasterizer's workspace and the order of its passes: project, sort, bin, blend; backward: tiles, then Gaussians.
+//! The rasterizer: its buffers and the order of the passes. Forward: project, sort, bin, blend; backward: tiles, then
+//! Gaussians.
 //!
-//! All buffers are kept from picture to picture. Work is divided in ways that depend on the input only (16 pixel rows, 256
-//! Gaussians), every piece owns what it writes, and sums over pairs have a fixed order: results do not depend on the threads.
+//! All buffers are kept from image to image. Work is divided by the input only (16 pixel rows, 256 Gaussians), every task
+//! owns the memory it writes, and sums over pairs have a fixed order: results do not depend on the threads.
+
+mod backward_pass;
 
 use std::mem::take;
-use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::backward::{Sums, backward};
-use crate::bin::{Bins, Tiles};
+use crate::backward::Sums;
 use crate::clock::Clock;
-use crate::divide::divide;
-use crate::forward::{Canvas, forward};
-use crate::picture::{Pixels, Surface, finish, finish_empty};
-use crate::project::{Lens, Projected, TILE, project};
-use crate::project_backward::project_backward;
-use crate::scene::{Gradients, MAX_PAIRS, RasterError, Region, Splats, View, check_length, check_size};
-use crate::simd::Level;
+use crate::error::RasterError;
+use crate::ewa::Lens;
+use crate::framebuffer::Surface;
+use crate::project::project;
+use crate::projected::Projected;
+use crate::region::Region;
+use crate::scene::{Background, MAX_PAIRS, Splats, View, check_size};
+use crate::simd::SimdLevel;
 use crate::sort::DepthSort;
 use crate::tile::{BLOCKS, Hits};
+use crate::tile_binning::TileBins;
+use crate::tile_passes::blend_tiles;
+use crate::tile_rect::TileRect;
 
 /// Gaussians of one task.
 const SHARE: usize = 256;
 
-/// Gaussian-tile pairs that a picture may take at a time, a Gaussian or in all; 8 bytes each. A tile alone needs at most two
-/// entries a Gaussian, so that dividing the tiles always ends.
+/// Gaussian-tile pairs that rendering may hold at a time, per Gaussian or in all; 8 bytes each. One tile needs at most two
+/// entries per Gaussian, so halving the tiles always ends.
 const PAIRS_EACH: usize = 8;
 const PAIRS_FREE: usize = 1 << 20;
 
@@ -40,37 +45,24 @@ pub struct Timings {
     pub loss: f64,
 }
 
-/// Colours around and on the Gaussians.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Shade {
-    pub background: [f32; 3],
-    /// Per-camera exposure: what the Gaussians send is multiplied by it, the background is not.
-    pub gain: Option<[f32; 3]>,
-}
-
-impl Shade {
-    pub fn over(background: [f32; 3]) -> Shade {
-        Shade { background, gain: None }
-    }
-}
-
+/// Renders and differentiates; one image at a time.
 pub struct Rasterizer {
-    level: Level,
+    level: SimdLevel,
     pool: Option<rayon::ThreadPool>,
     projected: Vec<Projected>,
     sort: DepthSort,
-    bins: Bins,
+    bins: TileBins,
     seen: Vec<Hits>,
     sums: Vec<Sums>,
     pub(crate) image: Vec<f32>, // [H, W, 3] of the region
     pub(crate) alpha: Vec<f32>, // [H, W]
-    drawn: Option<(Lens, Region, Shade)>,
+    drawn: Option<(Lens, Region, Background)>,
     pub timings: Timings,
 }
 
 impl Rasterizer {
-    /// `threads` 0: the threads of the process-wide pool.
-    pub fn new(level: Level, threads: usize) -> Rasterizer {
+    /// `threads` = 0: uses the threads of the process-wide pool.
+    pub fn new(level: SimdLevel, threads: usize) -> Rasterizer {
         let pool = if threads == 0 {
             None
         } else {
@@ -81,7 +73,7 @@ impl Rasterizer {
             pool,
             projected: Vec::new(),
             sort: DepthSort::default(),
-            bins: Bins::default(),
+            bins: TileBins::default(),
             seen: Vec::new(),
             sums: Vec::new(),
             image: Vec::new(),
@@ -91,15 +83,16 @@ impl Rasterizer {
         }
     }
 
-    pub fn level(&self) -> Level {
+    pub fn level(&self) -> SimdLevel {
         self.level
     }
 
-    /// Of the last forward pass: [H, W, 3] and [H, W] of the region, and the ellipses.
+    /// [H, W, 3] of the region, by the last forward pass.
     pub fn image(&self) -> &[f32] {
         &self.image
     }
 
+    /// [H, W] of the region, by the last forward pass.
     pub fn alpha(&self) -> &[f32] {
         &self.alpha
     }
@@ -111,11 +104,12 @@ impl Rasterizer {
         gaussians + self.bins.memory() + pairs + 4 * (self.image.capacity() + self.alpha.capacity())
     }
 
+    /// [N] the Gaussians after projection.
     pub fn projected(&self) -> &[Projected] {
         &self.projected
     }
 
-    /// The first half of `forward` alone: the ellipses of `view`, to be drawn elsewhere (see `Bands`).
+    /// The first half of `forward` alone: projects the Gaussians of `view`, to be drawn elsewhere (see `Bands`).
     ///
     /// # Errors
     /// As `forward`.
@@ -128,8 +122,8 @@ impl Rasterizer {
         Ok(&self.projected)
     }
 
-    /// The second half of `forward` alone: `fill` gets those of the last call and sets the ellipses to draw on a picture of
-    /// width x height, which must be what `project` made for one of that size.
+    /// The second half of `forward` alone: draws projected Gaussians on an image of width x height. `fill` gets the
+    /// Gaussians of the last call and replaces them; they must come from `project` for an image of that size.
     ///
     /// # Errors
     /// As `paint`.
@@ -137,7 +131,7 @@ impl Rasterizer {
         &mut self,
         surface: Surface,
         [width, height]: [usize; 2],
-        shade: Shade,
+        background: Background,
         fill: impl FnOnce(&mut Vec<Projected>),
     ) -> Result<(), RasterError> {
         fill(&mut self.projected);
@@ -150,20 +144,26 @@ impl Rasterizer {
         check_size(region, width, height)?;
         surface.check(region)?;
         self.drawn = None;
-        self.run(|s| s.draw_on(surface, region, shade, false))
+        self.run(|s| s.draw_on(surface, region, background, false))
     }
 
-    /// Draws the view on a surface of the caller's; `image` and `alpha` stay what they are.
+    /// Renders the view onto a surface of the caller; `image` and `alpha` keep their values.
     ///
     /// # Errors
-    /// As `forward`, or a surface of another size.
-    pub fn paint(&mut self, surface: Surface, splats: &Splats, view: &View, shade: Shade) -> Result<(), RasterError> {
+    /// As `forward`; a surface of another size.
+    pub fn paint(
+        &mut self,
+        surface: Surface,
+        splats: &Splats,
+        view: &View,
+        background: Background,
+    ) -> Result<(), RasterError> {
         self.project(splats, view)?;
         surface.check(view.region)?;
-        self.run(|s| s.draw_on(surface, view.region, shade, false))
+        self.run(|s| s.draw_on(surface, view.region, background, false))
     }
 
-    /// Runs `f` with this workspace in its own threads.
+    /// Runs `f` in the thread pool of this rasterizer.
     pub(crate) fn run<R: Send>(&mut self, f: impl FnOnce(&mut Self) -> R + Send) -> R {
         match self.pool.take() {
             None => f(self),
@@ -175,21 +175,27 @@ impl Rasterizer {
         }
     }
 
-    /// Draws the view. `training` keeps what `backward` needs.
+    /// Renders the view. `training` keeps what `backward` needs.
     ///
     /// # Errors
     /// Wrong lengths, an empty or too large view, too many Gaussian-tile pairs.
-    pub fn forward(&mut self, splats: &Splats, view: &View, shade: Shade, training: bool) -> Result<(), RasterError> {
+    pub fn forward(
+        &mut self,
+        splats: &Splats,
+        view: &View,
+        background: Background,
+        training: bool,
+    ) -> Result<(), RasterError> {
         splats.check()?;
         view.check()?;
-        self.run(|s| s.forward_here(splats, view, shade, training))
+        self.run(|s| s.forward_here(splats, view, background, training))
     }
 
     pub(crate) fn forward_here(
         &mut self,
         splats: &Splats,
         view: &View,
-        shade: Shade,
+        background: Background,
         training: bool,
     ) -> Result<(), RasterError> {
         let lens = Lens::new(view);
@@ -202,11 +208,11 @@ impl Rasterizer {
             image: &mut image,
             alpha: &mut alpha,
         };
-        let drawn = self.draw_on(surface, view.region, shade, training);
+        let drawn = self.draw_on(surface, view.region, background, training);
         (self.image, self.alpha) = (image, alpha);
         drawn?;
         if training {
-            self.drawn = Some((lens, view.region, shade));
+            self.drawn = Some((lens, view.region, background));
         }
         Ok(())
     }
@@ -224,23 +230,23 @@ impl Rasterizer {
         &mut self,
         mut surface: Surface,
         region: Region,
-        shade: Shade,
+        background: Background,
         training: bool,
     ) -> Result<(), RasterError> {
         let start = Clock::start();
         self.sort.sort(&self.projected);
         (self.timings.bin, self.timings.blend) = (start.ms(), 0.0);
-        self.draw_tiles(&mut surface, Tiles::of(region), region, shade, training)
+        self.draw_tiles(&mut surface, TileRect::of(region), region, background, training)
     }
 
-    /// Bins and blends a rectangle of tiles; in halves if that would take too much memory, but for training, which needs all
-    /// pairs afterwards.
+    /// Bins and blends a rectangle of tiles. If its pairs exceed the memory limit, both halves one after the other; not in
+    /// training, where the backward pass needs all pairs.
     fn draw_tiles(
         &mut self,
         surface: &mut Surface,
-        tiles: Tiles,
+        tiles: TileRect,
         region: Region,
-        shade: Shade,
+        background: Background,
         training: bool,
     ) -> Result<(), RasterError> {
         let (start, halves) = (Clock::start(), tiles.halves());
@@ -255,145 +261,18 @@ impl Rasterizer {
         self.timings.bin += start.ms();
         match (built, halves) {
             (Err(_), Some([first, second])) if !training => {
-                self.draw_tiles(surface, first, region, shade, training)?;
-                return self.draw_tiles(surface, second, region, shade, training);
+                self.draw_tiles(surface, first, region, background, training)?;
+                return self.draw_tiles(surface, second, region, background, training);
             }
             (built, _) => built?,
         }
         let start = Clock::start();
         let batches = self.bins.batches(self.bins.tiles.len());
         self.seen.resize(if training { batches } else { 0 }, [0; BLOCKS]);
-        self.blend(surface, region, shade);
+        let (level, projected, seen) = (self.level, &self.projected, &mut self.seen);
+        blend_tiles(level, projected, &self.bins, region, background, surface, seen);
         self.timings.blend += start.ms();
         Ok(())
-    }
-
-    fn blend(&mut self, surface: &mut Surface, region: Region, shade: Shade) {
-        let (level, bins, projected, width) = (self.level, &self.bins, &self.projected[..], region.width);
-        let (top, left) = (bins.tiles.rows.start, bins.tiles.columns.start);
-        let pixels = top * TILE * width..(bins.tiles.rows.end * TILE).min(region.height) * width;
-        let work = (surface.part(pixels), &mut self.seen[..]);
-        let (rows, columns) = (bins.tiles.rows.len(), bins.tiles.columns.len());
-        divide(
-            0..rows,
-            1,
-            work,
-            &|(band, seen), rows, middle| {
-                let (band, band_rest) = band.split_at((middle - rows.start) * TILE * width);
-                let (seen, seen_rest) = bins.cut(seen, rows.start, middle, Bins::batches);
-                ((band, seen), (band_rest, seen_rest))
-            },
-            &|row, (mut band, mut seen)| {
-                let mut empty = left * TILE; // where the tiles without Gaussians begin that end here
-                for column in 0..columns {
-                    let t = row.start * columns + column;
-                    let range = bins.tile(t);
-                    let (own, rest) = bins.cut_tile(seen, t, Bins::batches);
-                    seen = rest;
-                    let x = (left + column) * TILE;
-                    if range.is_empty() {
-                        continue;
-                    }
-                    finish_empty(shade, empty..x, width, &mut band);
-                    empty = x + TILE;
-                    let mut canvas = Canvas::new(width - x, band.pixels() / width);
-                    let origin = [x as f32, ((top + row.start) * TILE) as f32];
-                    forward(
-                        level,
-                        projected,
-                        &bins.pairs[range.start..],
-                        range.len(),
-                        origin,
-                        &mut canvas,
-                        own,
-                    );
-                    finish(&canvas, shade, x, width, &mut band);
-                }
-                finish_empty(shade, empty..((left + columns) * TILE).min(width), width, &mut band);
-            },
-        );
-    }
-
-    /// Gradients of the last training picture. `grad_image` [H, W, 3], `grad_alpha` [H, W] of the region.
-    ///
-    /// # Errors
-    /// Wrong lengths, or no forward pass with `training` before.
-    pub fn backward(
-        &mut self,
-        splats: &Splats,
-        grad_image: &[f32],
-        grad_alpha: &[f32],
-        out: &mut Gradients,
-    ) -> Result<(), RasterError> {
-        splats.check()?;
-        self.run(|s| s.backward_here(splats, grad_image, grad_alpha, out))
-    }
-
-    pub(crate) fn backward_here(
-        &mut self,
-        splats: &Splats,
-        grad_image: &[f32],
-        grad_alpha: &[f32],
-        out: &mut Gradients,
-    ) -> Result<(), RasterError> {
-        out.check(splats)?;
-        let Some((lens, region, shade)) = self.drawn.take() else {
-            return Err(RasterError::NothingRendered);
-        };
-        check_length(
-            "gradient of the Gaussians rendered last",
-            splats.len(),
-            self.projected.len(),
-        )?;
-        check_length("gradient of the image", grad_image.len(), 3 * region.pixels())?;
-        check_length("gradient of alpha", grad_alpha.len(), region.pixels())?;
-        let start = Clock::start();
-        self.sums.resize(self.bins.pairs.len(), Sums::ZERO);
-        self.backward_tiles(region.width, shade, grad_image, grad_alpha);
-        self.timings.backward_tiles = start.ms();
-        let start = Clock::start();
-        self.backward_gaussians(splats, &lens, out);
-        self.timings.backward_project = start.ms();
-        self.drawn = Some((lens, region, shade));
-        Ok(())
-    }
-
-    fn backward_tiles(&mut self, width: usize, shade: Shade, grad_image: &[f32], grad_alpha: &[f32]) {
-        let (level, bins, projected, seen) = (self.level, &self.bins, &self.projected[..], &self.seen[..]);
-        let pixels = Pixels {
-            image: &self.image,
-            alpha: &self.alpha,
-            grad_image,
-            grad_alpha,
-            width,
-        };
-        let cut = |sums, rows: &Range<usize>, middle| bins.cut(sums, rows.start, middle, Bins::first);
-        let (rows, columns) = (bins.tiles.rows.len(), bins.tiles.columns.len());
-        divide(0..rows, 1, &mut self.sums[..], &cut, &|row, mut sums: &mut [Sums]| {
-            for column in 0..columns {
-                let t = row.start * columns + column;
-                let (own, rest) = bins.cut_tile(sums, t, Bins::first);
-                sums = rest;
-                if own.is_empty() {
-                    continue;
-                }
-                let (x, y) = (column * TILE, row.start * TILE);
-                let (pairs, hits) = (&bins.pairs[bins.first(t)..], &seen[bins.batches(t)..]);
-                backward(level, projected, pairs, &pixels, [x, y], shade, hits, own);
-            }
-        });
-    }
-
-    fn backward_gaussians(&self, splats: &Splats, lens: &Lens, out: &mut Gradients) {
-        let n = splats.len();
-        let out = out.reborrow();
-        divide(
-            0..n,
-            SHARE,
-            out,
-            &|g, range, middle| g.split_at(middle - range.start, splats.sh_k),
-            &|range, mut out| project_backward(self.level, splats, lens, &self.bins, &self.sums, range, &mut out),
-        );
     }
 }
 

@@ -1,6 +1,8 @@
-//! What goes in and out of the rasterizer: Gaussians, a view, gradients; flat slices in the layout of the Python arrays.
+//! Inputs and outputs of the rasterizer: Gaussians, a view, the background, gradients; flat slices in the layout of the
+//! Python arrays.
 
-use std::fmt;
+use crate::error::{RasterError, check_length};
+use crate::region::Region;
 
 /// N Gaussians, parameters before activation (exp, sigmoid and normalisation happen inside).
 #[derive(Clone, Copy)]
@@ -24,7 +26,7 @@ impl Splats<'_> {
     }
 
     /// # Errors
-    /// A length that does not belong to N Gaussians, or a K that is no SH degree.
+    /// A length that does not belong to N Gaussians; a K that is no SH degree.
     pub fn check(&self) -> Result<(), RasterError> {
         let n = self.len();
         let k = self.sh_k;
@@ -51,7 +53,7 @@ impl Splats<'_> {
 
 /// Gradients, same shapes as `Splats`.
 pub struct Gradients<'a> {
-    /// Add to what is there (of `max_weight` keep the larger); else overwrite it.
+    /// If true, gradients are added to the present values (of `max_weight` the larger is kept); else they overwrite them.
     pub add: bool,
     pub means: &'a mut [f32],
     pub quats: &'a mut [f32],
@@ -82,7 +84,7 @@ impl<'a> Gradients<'a> {
         }
     }
 
-    /// The first `n` Gaussians, and the others.
+    /// Splits after the first `n` Gaussians.
     pub fn split_at(self, n: usize, sh_k: usize) -> (Gradients<'a>, Gradients<'a>) {
         let (means, means2) = self.means.split_at_mut(3 * n);
         let (quats, quats2) = self.quats.split_at_mut(4 * n);
@@ -137,22 +139,7 @@ impl<'a> Gradients<'a> {
     }
 }
 
-/// A pixel rectangle of the view; what is rendered.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Region {
-    pub x: usize,
-    pub y: usize,
-    pub width: usize,
-    pub height: usize,
-}
-
-impl Region {
-    pub fn pixels(&self) -> usize {
-        self.width * self.height
-    }
-}
-
-/// A pinhole camera (OpenCV axes, pixel centres at half-integers) and the part of its image that is wanted.
+/// A pinhole camera (OpenCV axes, pixel centres at half-integers) and the region of its image to render.
 #[derive(Clone, Copy, Debug)]
 pub struct View {
     pub width: usize,
@@ -166,7 +153,7 @@ pub struct View {
 
 impl View {
     /// # Errors
-    /// An empty or too large image, or a region that is not inside of it.
+    /// An empty or too large image; a region that is not inside the image.
     pub fn check(&self) -> Result<(), RasterError> {
         check_size(self.region, self.width, self.height)
     }
@@ -178,52 +165,25 @@ impl View {
     }
 }
 
+/// What the Gaussians are composited over, and the exposure that they are multiplied by.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Background {
+    pub rgb: [f32; 3],
+    /// Per-camera exposure: multiplies the light of the Gaussians, not the background. None: 1.
+    pub gain: Option<[f32; 3]>,
+}
+
+impl Background {
+    /// The colour without an exposure.
+    pub fn new(rgb: [f32; 3]) -> Background {
+        Background { rgb, gain: None }
+    }
+}
+
 pub const MAX_SIDE: usize = 16384;
 pub const MAX_GAUSSIANS: usize = 1 << 26;
 /// Gaussian-tile pairs of one image; 2^28 of them take 16 GB in training.
 pub const MAX_PAIRS: usize = 1 << 28;
-
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum RasterError {
-    Shape {
-        name: &'static str,
-        expected: usize,
-        got: usize,
-    },
-    Region {
-        region: Region,
-        width: usize,
-        height: usize,
-    },
-    TooMany {
-        what: &'static str,
-        limit: usize,
-    },
-    NothingRendered,
-}
-
-impl fmt::Display for RasterError {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        match self {
-            RasterError::Shape { name, expected, got } => write!(f, "{name} has {got} values, expected {expected}"),
-            RasterError::Region {
-                region: r,
-                width,
-                height,
-            } => write!(
-                f,
-                "region {}x{} at ({}, {}) is empty or not inside of the {width}x{height} image",
-                r.width, r.height, r.x, r.y
-            ),
-            RasterError::TooMany { what, limit } => write!(f, "more than {limit} {what}"),
-            RasterError::NothingRendered => {
-                write!(f, "backward without a forward pass of these Gaussians and this view")
-            }
-        }
-    }
-}
-
-impl std::error::Error for RasterError {}
 
 /// See `View::check`.
 pub(crate) fn check_size(r: Region, width: usize, height: usize) -> Result<(), RasterError> {
@@ -242,12 +202,4 @@ pub(crate) fn check_size(r: Region, width: usize, height: usize) -> Result<(), R
         });
     }
     Ok(())
-}
-
-pub(crate) fn check_length(name: &'static str, got: usize, expected: usize) -> Result<(), RasterError> {
-    if got == expected {
-        Ok(())
-    } else {
-        Err(RasterError::Shape { name, expected, got })
-    }
 }

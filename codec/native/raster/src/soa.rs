@@ -1,4 +1,5 @@
-//! Arrays of Gaussians, [N, D], -> rows of 16 lanes, and vectors from rows.
+//! Transposes arrays of Gaussians, [N, D], into rows of 16 lanes (structure of arrays) and back, and loads vectors from
+//! rows.
 
 use crate::scene::Splats;
 use crate::simd::{Vector, c};

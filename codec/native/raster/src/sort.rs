@@ -1,20 +1,20 @@
-//! Visible Gaussians front to back: a stable least-significant-digit radix sort of (depth, index).
+//! Depth sort of the visible Gaussians, nearest first: a stable least-significant-digit radix sort of (depth, index).
 //!
-//! Depths of one picture span few exponents, so that two digits usually tell them apart: the low one of the bits, and the
-//! others relative to those of the smallest depth. Ties keep the order of the indices, which makes the picture independent
-//! of everything but its input. A pass counts (the first one while the keys are made) and moves fixed chunks in parallel; a
-//! prefix sum over (digit, chunk) gives each its places.
+//! The depths of an image span few exponents, so two digits usually suffice: the low bits, and the others relative to those
+//! of the smallest depth. Ties keep the order of the indices, so the image depends on its input only. A pass counts (the
+//! first one while the keys are made) and moves fixed chunks in parallel; a prefix sum over (digit, chunk) gives each chunk
+//! its places.
 
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
-use crate::project::Projected;
+use crate::projected::Projected;
 
 const DIGIT: u32 = 11;
 const BUCKETS: usize = 1 << DIGIT;
-/// Bounds the parallelism of sorting.
+/// Chunks, which bound the parallelism of sorting.
 const CHUNKS: usize = 4;
 
 #[derive(Default)]
@@ -26,7 +26,7 @@ pub struct DepthSort {
 }
 
 impl DepthSort {
-    /// Indices of the visible Gaussians of the last `sort`, nearest first, as the low halves.
+    /// Keys of the visible Gaussians of the last `sort`, nearest first; the low half of a key is the index.
     pub fn keys(&self) -> &[AtomicU64] {
         &self.keys[..self.visible]
     }
@@ -86,7 +86,7 @@ impl DepthSort {
         self.visible = total;
     }
 
-    /// Fills `places` with how often each digit occurs in each part.
+    /// Counts into `places` how often each digit occurs in each chunk.
     fn count(&mut self, parts: &[Range<usize>; CHUNKS], digit: impl Fn(u64) -> usize + Sync) {
         let keys = &self.keys;
         let places = self.places.par_chunks_exact_mut(BUCKETS).zip(parts);
@@ -98,7 +98,7 @@ impl DepthSort {
         });
     }
 
-    /// Sorts by a digit that is counted in `places`.
+    /// Moves the keys by a digit whose counts are in `places`.
     fn move_all(&mut self, parts: &[Range<usize>; CHUNKS], digit: impl Fn(u64) -> usize + Sync) {
         let mut sum = 0;
         for bucket in 0..BUCKETS {

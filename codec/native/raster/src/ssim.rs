@@ -1,163 +1,17 @@
 //! The two passes over rows of an image pair: derivative maps of the SSIM, and their blur back to a gradient.
 //!
-//! Only E[x], E[y], E[x^2 + y^2] and E[xy] are needed, since the variances occur as their sum. Rows are worked on in strips
-//! that live on the stack: vertical taps from the images into a wide strip, then horizontal taps 3 apart.
+//! Both work on strips of columns (`ssim_window`), row by row, and write only the columns that they are given.
 
 use std::ops::Range;
 
-use crate::loss::Pair;
+use crate::image_pair::Pair;
 use crate::simd::{Vector, c, dispatch};
+use crate::ssim_window::{Narrow, STRIP, Strip, Wide, horizontal, moments, tap_rows, taps, vertical};
 
-const RADIUS: usize = 5;
-const TAPS: usize = 2 * RADIUS + 1;
-/// exp(-d^2 / (2 1.5^2)), normalised.
-#[rustfmt::skip]
-const WINDOW: [f32; TAPS] = [
-    0.001_028_38, 0.007_598_758, 0.036_000_773, 0.109_360_69, 0.213_005_54, 0.266_011_72,
-    0.213_005_54, 0.109_360_69, 0.036_000_773, 0.007_598_758, 0.001_028_38,
-];
 const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
 
-/// Values of a strip, and with room for the taps on both sides (16, so that 3 * RADIUS fits and vectors align).
-const STRIP: usize = 384;
-const MARGIN: usize = 16;
-const WIDE: usize = STRIP + 2 * MARGIN;
-/// Rows of one task.
-pub const ROWS: usize = 8;
-
-#[repr(align(64))]
-struct Wide([f32; WIDE]);
-#[repr(align(64))]
-struct Narrow([f32; STRIP]);
-
-impl Wide {
-    const ZERO: Wide = Wide([0.0; WIDE]);
-}
-
-impl Narrow {
-    const ZERO: Narrow = Narrow([0.0; STRIP]);
-
-    /// `source`, then zeros.
-    fn copy(&mut self, source: &[f32]) {
-        self.0[..source.len()].copy_from_slice(source);
-        self.0[source.len()..].fill(0.0);
-    }
-}
-
-/// Where a strip lies: `n` values from `start`, with those of its margin that exist `reach`.
-struct Strip {
-    start: usize,
-    n: usize,
-    reach: Range<usize>,
-}
-
-impl Strip {
-    fn new(start: usize, end: usize, values: usize) -> Strip {
-        let n = STRIP.min(end - start);
-        Strip {
-            start,
-            n,
-            reach: start.saturating_sub(MARGIN)..(start + n + MARGIN).min(values),
-        }
-    }
-
-    /// Index in the wide strip of the first value of `reach`.
-    fn offset(&self) -> usize {
-        self.reach.start + MARGIN - self.start
-    }
-}
-
-/// Rows that the taps of `row` touch, `reach` of each; `k` says which taps are inside of the image.
-fn tap_rows<'a>(
-    image: &'a [f32],
-    values: usize,
-    row: usize,
-    k: Range<usize>,
-    reach: &Range<usize>,
-) -> [&'a [f32]; TAPS] {
-    let mut out: [&[f32]; TAPS] = [&[]; TAPS];
-    for k in k {
-        let at = (row + k - RADIUS) * values;
-        out[k] = &image[at + reach.start..at + reach.end];
-    }
-    out
-}
-
-/// Taps of `row` that are inside of the image.
-fn taps(row: usize, rows: usize) -> Range<usize> {
-    RADIUS.saturating_sub(row)..TAPS.min(rows + RADIUS - row)
-}
-
-/// sum_k w_k of [x, y, x^2 + y^2, xy] over the rows, U vectors from `at` on.
-#[inline(always)]
-fn moments<V: Vector, const U: usize>(
-    x: &[&[f32]; TAPS],
-    y: &[&[f32]; TAPS],
-    k: Range<usize>,
-    at: usize,
-    offset: usize,
-    temp: &mut [Wide; 4],
-) {
-    let mut m = [[c::<V>(0.0); U]; 4];
-    for k in k {
-        let (w, x, y) = (
-            c::<V>(WINDOW[k]),
-            &x[k][at..at + U * V::LANES],
-            &y[k][at..at + U * V::LANES],
-        );
-        for u in 0..U {
-            let (x, y) = (V::load(&x[u * V::LANES..]), V::load(&y[u * V::LANES..]));
-            let (wx, wy) = (w * x, w * y);
-            m[0][u] = m[0][u] + wx;
-            m[1][u] = m[1][u] + wy;
-            m[2][u] = wy.mul_add(y, wx.mul_add(x, m[2][u]));
-            m[3][u] = wx.mul_add(y, m[3][u]);
-        }
-    }
-    for (temp, m) in temp.iter_mut().zip(m) {
-        let temp = &mut temp.0[offset + at..offset + at + U * V::LANES];
-        for u in 0..U {
-            m[u].store(&mut temp[u * V::LANES..]);
-        }
-    }
-}
-
-/// sum_k w_k of one map over the rows.
-#[inline(always)]
-fn vertical<V: Vector, const U: usize>(
-    rows: &[&[f32]; TAPS],
-    k: Range<usize>,
-    at: usize,
-    offset: usize,
-    temp: &mut Wide,
-) {
-    let mut m = [c::<V>(0.0); U];
-    for k in k {
-        let (w, row) = (c::<V>(WINDOW[k]), &rows[k][at..at + U * V::LANES]);
-        for u in 0..U {
-            m[u] = w.mul_add(V::load(&row[u * V::LANES..]), m[u]);
-        }
-    }
-    let temp = &mut temp.0[offset + at..offset + at + U * V::LANES];
-    for u in 0..U {
-        m[u].store(&mut temp[u * V::LANES..]);
-    }
-}
-
-#[inline(always)]
-fn horizontal<V: Vector, const N: usize>(temp: &[Wide; N], at: usize) -> [V; N] {
-    let mut m = [c::<V>(0.0); N];
-    for i in 0..N {
-        let row = &temp[i].0[at + MARGIN - 3 * RADIUS..at + MARGIN + 3 * RADIUS + V::LANES];
-        for k in 0..TAPS {
-            m[i] = V::load(&row[3 * k..]).mul_add(c(WINDOW[k]), m[i]);
-        }
-    }
-    m
-}
-
-/// SSIM of the local means, and its derivatives by E[x], E[x^2] and E[xy].
+/// SSIM of the local means, and its derivatives with respect to E[x], E[x^2] and E[xy].
 #[inline(always)]
 fn ssim<V: Vector>([x, y, squares, xy]: [V; 4]) -> (V, [V; 3]) {
     let two = c::<V>(2.0);
@@ -172,7 +26,7 @@ fn ssim<V: Vector>([x, y, squares, xy]: [V; 4]) -> (V, [V; 3]) {
     (s, [d_x, d_xx, d_xy])
 }
 
-/// The weights of the strip's values; 0 past its end.
+/// The weights of the values of a strip; 0 past its end.
 fn weights(pair: Pair, row: usize, strip: &Strip, out: &mut Narrow) {
     match pair.weight {
         None => out.0[..strip.n].fill(1.0),

@@ -1,18 +1,20 @@
-//! The image side of a training step in one call: draw, compare with an 8-bit target, differentiate.
+//! The image side of a training step in one call: render, compare with an 8-bit target image, differentiate.
 //!
 //! Target: unassociated 8-bit colour and optional alpha, composited on the same background as the Gaussians. Loss: the image
-//! loss plus mask_lambda * mean |alpha - target alpha|. Nothing a pixel large ever passes through the caller.
+//! loss plus mask_lambda * mean |alpha - target alpha|. No buffer with a value per pixel passes through the caller.
 
 use rayon::prelude::*;
 
 use crate::clock::Clock;
-use crate::loss::{ImageLoss, LossValue, Pair};
-use crate::rasterizer::{Rasterizer, Shade};
-use crate::scene::{Gradients, RasterError, Splats, View, check_length};
+use crate::error::{RasterError, check_length};
+use crate::image_pair::Pair;
+use crate::loss::{ImageLoss, LossValue};
+use crate::rasterizer::Rasterizer;
+use crate::scene::{Background, Gradients, Splats, View};
 
-/// What the picture of a view should be: [H, W, 3], [H, W] and [H, W] of the whole image, not of the region.
+/// The target of a view: [H, W, 3], [H, W] and [H, W] of the whole image, not of the region.
 #[derive(Clone, Copy)]
-pub struct Target<'a> {
+pub struct TargetImage<'a> {
     pub rgb: &'a [u8],
     pub alpha: Option<&'a [u8]>,
     pub weight: Option<&'a [f32]>,
@@ -29,7 +31,7 @@ pub struct StepValue {
     pub image: LossValue,
     pub mask: f64,
     pub loss: f64,
-    /// Gradient by the gain of `Shade`.
+    /// Gradient with respect to the gain of `Background`.
     pub gain: [f64; 3],
 }
 
@@ -64,8 +66,8 @@ impl Step {
         rasterizer: &mut Rasterizer,
         splats: &Splats,
         view: &View,
-        shade: Shade,
-        target: Target,
+        background: Background,
+        target: TargetImage,
         lambdas: Lambdas,
         out: &mut Gradients,
     ) -> Result<StepValue, RasterError> {
@@ -76,21 +78,21 @@ impl Step {
         check_length("target alpha", target.alpha.map_or(pixels, <[u8]>::len), pixels)?;
         check_length("weight", target.weight.map_or(pixels, <[f32]>::len), pixels)?;
         rasterizer.run(|r| {
-            r.forward_here(splats, view, shade, true)?;
+            r.forward_here(splats, view, background, true)?;
             let start = Clock::start();
-            let value = self.compare(r, view, shade, target, lambdas)?;
+            let value = self.photometric_loss(r, view, background, target, lambdas)?;
             r.timings.loss = start.ms();
             r.backward_here(splats, &self.grad_image, &self.grad_alpha, out)?;
             Ok(value)
         })
     }
 
-    fn compare(
+    fn photometric_loss(
         &mut self,
         r: &Rasterizer,
         view: &View,
-        shade: Shade,
-        target: Target,
+        background: Background,
+        target: TargetImage,
         lambdas: Lambdas,
     ) -> Result<StepValue, RasterError> {
         let n = view.region.pixels();
@@ -98,7 +100,7 @@ impl Step {
         self.grad_image.resize(3 * n, 0.0);
         self.grad_alpha.resize(n, 0.0);
         self.rows.resize(view.region.height, [0.0; 4]);
-        self.composite(r, view, shade, target, lambdas.mask);
+        self.composite(r, view, background, target, lambdas.mask);
         let weight = target.weight.map(|w| {
             let region = view.region;
             self.weight.clear();
@@ -116,7 +118,7 @@ impl Step {
         };
         let image = self.loss.run(r.level(), pair, lambdas.ssim, &mut self.grad_image)?;
         let mask = self.rows.iter().map(|s| s[0]).sum::<f64>() / n as f64;
-        let gain = self.gain_gradient(r, view.region.width, shade);
+        let gain = self.gain_gradient(r, view.region.width, background);
         Ok(StepValue {
             image,
             mask,
@@ -125,8 +127,15 @@ impl Step {
         })
     }
 
-    /// Fills `target` and `grad_alpha`, and the mask sums.
-    fn composite(&mut self, r: &Rasterizer, view: &View, shade: Shade, target: Target, mask_lambda: f32) {
+    /// Composites the target, and writes the gradient and the sums of the mask loss.
+    fn composite(
+        &mut self,
+        r: &Rasterizer,
+        view: &View,
+        background: Background,
+        target: TargetImage,
+        mask_lambda: f32,
+    ) {
         let region = view.region;
         let width = region.width;
         let slope = mask_lambda / region.pixels() as f32;
@@ -153,11 +162,11 @@ impl Step {
                 .zip(alpha);
             for (((out, rgb), &a), (grad, drawn)) in pixels.zip(grad.iter_mut().zip(drawn)) {
                 *out = match a {
-                    0 => shade.background,
+                    0 => background.rgb,
                     255 => rgb.map(|v| BYTE[usize::from(v)]),
                     _ => {
                         let a = BYTE[usize::from(a)];
-                        [0, 1, 2].map(|ch| BYTE[usize::from(rgb[ch])] * a + (1.0 - a) * shade.background[ch])
+                        [0, 1, 2].map(|ch| BYTE[usize::from(rgb[ch])] * a + (1.0 - a) * background.rgb[ch])
                     }
                 };
                 let d = drawn - BYTE[usize::from(a)];
@@ -169,8 +178,8 @@ impl Step {
     }
 
     /// sum over pixels of g . (image - T background) / gain
-    fn gain_gradient(&mut self, r: &Rasterizer, width: usize, shade: Shade) -> [f64; 3] {
-        let Some(gain) = shade.gain else { return [0.0; 3] };
+    fn gain_gradient(&mut self, r: &Rasterizer, width: usize, background: Background) -> [f64; 3] {
+        let Some(gain) = background.gain else { return [0.0; 3] };
         let grads = self.grad_image.par_chunks(3 * width);
         let drawn = r.image().par_chunks(3 * width).zip(r.alpha().par_chunks(width));
         grads
@@ -180,7 +189,7 @@ impl Step {
                 let mut s = [0.0f64; 3];
                 for (x, a) in alpha.iter().enumerate() {
                     for ch in 0..3 {
-                        let own = image[3 * x + ch] - (1.0 - a) * shade.background[ch];
+                        let own = image[3 * x + ch] - (1.0 - a) * background.rgb[ch];
                         s[ch] += f64::from(g[3 * x + ch] * own);
                     }
                 }

@@ -1,10 +1,12 @@
-//! What the forward and backward tile kernels share: a tile is 16 blocks of 4 x 4 pixels, block by block in memory, so that
-//! a small ellipse touches few vectors; and for a batch of Gaussians, which of them meet each block.
+//! Layout and batches that the forward and backward tile kernels share.
+//!
+//! A tile is 16 blocks of 4 x 4 pixels, stored block by block, so that a small ellipse touches few vectors. Gaussians are
+//! processed in batches of 64; for each batch a mask tells which Gaussians meet which block.
 
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
-use crate::constants::LOG2_ALPHA_MIN;
-use crate::project::{Projected, SLACK, TILE};
+use crate::ellipse::{Ellipse, reach};
+use crate::projected::{Projected, TILE};
 use crate::simd::{Vector, c, prefetch};
 
 pub const BLOCKS: usize = 16;
@@ -17,7 +19,7 @@ const AHEAD: usize = 16;
 /// Which Gaussians of a batch meet each block: bit i of entry b is Gaussian i on block b.
 pub type Hits = [u64; BLOCKS];
 
-/// One value a pixel, [block][pixel of the block].
+/// One value per pixel, [block][pixel of the block].
 #[derive(Clone, Copy)]
 #[repr(align(64))]
 pub struct Plane(pub [[f32; BLOCK]; BLOCKS]);
@@ -26,7 +28,7 @@ impl Plane {
     pub const ZERO: Plane = Plane([[0.0; BLOCK]; BLOCKS]);
 }
 
-/// Pixel centres inside of the tile.
+/// Pixel centres in pixels from the corner of the tile.
 pub static PIXEL_X: Plane = pixel_centres(true);
 pub static PIXEL_Y: Plane = pixel_centres(false);
 
@@ -42,13 +44,13 @@ const fn pixel_centres(x: bool) -> Plane {
     Plane(p)
 }
 
-/// Block and pixel of the block of a pixel of the tile.
+/// Block, and pixel of the block, of pixel (x, y) of the tile.
 #[inline(always)]
 pub fn swizzle(x: usize, y: usize) -> (usize, usize) {
     ((y / 4 * 4 + x / 4) & 15, (y % 4 * 4 + x % 4) & 15)
 }
 
-/// A Gaussian as the pixels of one tile see it: u = l11 x + l21 y + u0, v = l22 y + v0 with x, y in pixels of the tile.
+/// A Gaussian relative to one tile: u = l11 x + l21 y + u0, v = l22 y + v0 with x, y in pixels from the corner of the tile.
 #[derive(Clone, Copy, Default)]
 #[repr(C, align(64))]
 pub struct Local {
@@ -78,8 +80,8 @@ impl Local {
     };
 }
 
-/// u, v, log2(alpha) and alpha before the clamp of a Gaussian on a vector of pixels, N times at once: the exponentials do not
-/// depend on each other, and a processor looks too few instructions ahead to find that out by itself.
+/// u, v, log2(alpha) and alpha before the clamp of N Gaussians on a vector of pixels each. The N exponentials are
+/// independent and interleaved, since a processor does not look far enough ahead to interleave them itself.
 #[inline(always)]
 pub fn opacities<V: Vector, const N: usize>(s: [&Local; N], x: [V; N], y: [V; N]) -> [[V; N]; 4] {
     let (mut u, mut v, mut e) = (x, y, x);
@@ -93,42 +95,7 @@ pub fn opacities<V: Vector, const N: usize>(s: [&Local; N], x: [V; N], y: [V; N]
     [u, v, e, V::exp2_near(e)]
 }
 
-/// log2(alpha / ALPHA_MIN) at the centre, with the slack: the squared radius in units of u, v.
-#[inline(always)]
-pub fn reach<V: Vector>(log2_opacity: V) -> V {
-    (log2_opacity - c(LOG2_ALPHA_MIN)).mul_add(c(1.0 + SLACK), c(SLACK))
-}
-
-/// u^2 + v^2 <= reach around the origin.
-pub struct Ellipse<V> {
-    pub l11: V,
-    pub l21: V,
-    pub l22: V,
-    pub reach: V,
-}
-
-impl<V: Vector> Ellipse<V> {
-    /// y where it is widest to the right: -l21 sqrt(reach) / (l22 sqrt(l21^2 + l22^2))
-    #[inline(always)]
-    pub fn peak(&self) -> V {
-        let norm = self.l21.mul_add(self.l21, self.l22 * self.l22);
-        -(self.l21 * (self.reach / norm).sqrt() / self.l22)
-    }
-
-    /// Whether it meets the rows from `top` to `bottom`, and its ends there, times l11.
-    #[inline(always)]
-    pub fn span(&self, peak: V, top: V, bottom: V) -> (V::Mask, V, V) {
-        let zero = c(0.0);
-        let (yr, yl) = (peak.max(top).min(bottom), (-peak).max(top).min(bottom));
-        let (vr, vl) = (self.l22 * yr, self.l22 * yl);
-        let (hr, hl) = (vr.neg_mul_add(vr, self.reach), vl.neg_mul_add(vl, self.reach));
-        let right = self.l21.neg_mul_add(yr, hr.max(zero).sqrt());
-        let left = self.l21.neg_mul_add(yl, -hl.max(zero).sqrt());
-        (hr.ge(zero) & hl.ge(zero), left, right)
-    }
-}
-
-/// Up to 64 Gaussians of the tile, copied together.
+/// Up to 64 Gaussians of the tile, copied to consecutive memory.
 pub struct Batch {
     pub splats: [Local; BATCH],
     rows: [[f32; BATCH]; 6], // x y l11 l21 l22 reach
@@ -142,7 +109,7 @@ impl Batch {
         }
     }
 
-    /// The first `n` of `pairs`.
+    /// Copies the Gaussians of the first `n` pairs.
     #[inline(always)]
     pub fn fill(&mut self, projected: &[Projected], pairs: &[AtomicU32], n: usize, origin: [f32; 2]) {
         for (i, (s, pair)) in self.splats[..n].iter_mut().zip(pairs).enumerate() {
@@ -165,7 +132,7 @@ impl Batch {
         }
     }
 
-    /// Takes the next two Gaussians from `hits`, filled up with one that meets no pixel.
+    /// Removes the next two Gaussians from `hits`; missing ones are replaced by one that meets no pixel.
     #[inline(always)]
     pub fn take(&self, hits: &mut u64) -> [&Local; 2] {
         let mut next = [&Local::NOWHERE; 2];

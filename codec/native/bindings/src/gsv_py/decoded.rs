@@ -3,13 +3,13 @@
 use super::group_from::group_from;
 use super::parametric::{carried, frame};
 use super::values::{bytes_of, raise};
-use gsv::curve::{Curve, PIECES};
+use gsv::companding::{Companding, PIECES};
+use gsv::conformance::Damage;
 use gsv::decode::{Decoding, decode_damaged, decode_group};
 use gsv::evaluate::Evaluator;
 use gsv::group::{BIRTH, Group};
-use gsv::inventory::Damage;
+use gsv::hilbert_layout::HilbertLayout;
 use gsv::levels::Level;
-use gsv::map::Map;
 use gsv::trajectories::Trajectories;
 use gsv::unit::{self, ALL_LAYERS};
 use numpy::ndarray::{Array2, Array3};
@@ -110,7 +110,9 @@ impl DecodedGroup {
     fn reconstruct(py: Python, group: &Bound<PyAny>, reference: Option<Py<DecodedGroup>>) -> PyResult<Self> {
         let reference = reference.as_ref().map(|r| r.get().group());
         let group = group_from(group, reference)?;
-        let evaluator = py.detach(|| Evaluator::reconstruct(group, reference)).map_err(|e| raise(py, e))?;
+        let evaluator = py
+            .detach(|| Evaluator::reconstruct(group, reference))
+            .map_err(|e| raise(py, e))?;
         Ok(DecodedGroup {
             evaluator,
             units: Vec::new(),
@@ -180,7 +182,7 @@ impl DecodedGroup {
         let d = PyDict::new(py);
         for k in 0..group.layers.len() {
             let range = group.range(k..k + 1);
-            let map = Map::new(range.len());
+            let map = HilbertLayout::new(range.len());
             let layer = if group.layers.len() > 1 {
                 format!("layer{k}_")
             } else {
@@ -244,7 +246,7 @@ fn parents_into<'py>(py: Python<'py>, parents: &[u32]) -> Bound<'py, PyArray1<i3
 }
 
 /// low, width, slopes.
-fn companding_row(c: &Curve) -> [f32; 2 + PIECES] {
+fn companding_row(c: &Companding) -> [f32; 2 + PIECES] {
     let slopes = c.slopes.iter().map(|s| f32::from(*s));
     let mut row = [c.low, c.width].into_iter().chain(slopes);
     std::array::from_fn(|_| row.next().unwrap_or(0.0))
@@ -265,7 +267,10 @@ fn quantized<'py>(py: Python<'py>, e: &Evaluator) -> PyResult<Bound<'py, PyAny>>
     d.set_item("grid_bits", h.grid_bits)?;
     d.set_item("positions", grid(py, &g.positions)?)?;
     d.set_item("channels", channels_of(py, g)?)?;
-    d.set_item("scale_exponents", matrix(py, &h.levers.map(|l| l.map(i32::from)))?)?;
+    d.set_item(
+        "scale_exponents",
+        matrix(py, &h.scale_exponents.map(|l| l.map(i32::from)))?,
+    )?;
     let layers = g.layers.iter().map(|l| l.count).collect::<Vec<_>>();
     d.set_item("layers", PyTuple::new(py, layers)?)?;
     d.set_item("corrections", matrix(py, &g.corrections)?)?;
@@ -310,7 +315,7 @@ fn channels_of<'py>(py: Python<'py>, g: &Group) -> PyResult<Bound<'py, PyDict>> 
         one.set_item("values", planes.into_pyarray(py))?;
         one.set_item("steps", scale.steps.clone().into_pyarray(py))?;
         one.set_item("offsets", scale.offsets.clone().into_pyarray(py))?;
-        let rows: Vec<[f32; 2 + PIECES]> = h.curves_of(*a).iter().map(companding_row).collect();
+        let rows: Vec<[f32; 2 + PIECES]> = h.companding_of(*a).iter().map(companding_row).collect();
         if !rows.is_empty() {
             one.set_item("companding", matrix(py, &rows)?)?;
         }
@@ -320,7 +325,10 @@ fn channels_of<'py>(py: Python<'py>, g: &Group) -> PyResult<Bound<'py, PyDict>> 
 }
 
 /// Rows as a matrix.
-fn matrix<'py, T: numpy::Element + Copy, const C: usize>(py: Python<'py>, rows: &[[T; C]]) -> PyResult<Bound<'py, PyAny>> {
+fn matrix<'py, T: numpy::Element + Copy, const C: usize>(
+    py: Python<'py>,
+    rows: &[[T; C]],
+) -> PyResult<Bound<'py, PyAny>> {
     let flat = rows.as_flattened().to_vec().into_pyarray(py);
     Ok(flat.reshape([rows.len(), C])?.into_any())
 }

@@ -2,7 +2,7 @@
 
 use super::values::{array, invalid, item, optional, points, value};
 use gsv::attributes::{Attribute, sh_coefficients};
-use gsv::curve::{Curve, PIECES};
+use gsv::companding::{Companding, PIECES};
 use gsv::group::{BIRTH, Group};
 use gsv::header::{Header, LayerHeader, NodeHeader, Scale, TrajectoryHeader};
 use gsv::trajectories::Trajectories;
@@ -41,9 +41,9 @@ pub fn group_from(d: &Bound<PyAny>, reference: Option<&Group>) -> PyResult<Group
         }
         header.scales.push(Scale { steps, offsets });
     }
-    header.levers = value(d, "scale_exponents")?;
+    header.scale_exponents = value(d, "scale_exponents")?;
     header.shifts = shifts_from(d, &header)?;
-    header.curves = curves_from(&channels)?;
+    header.companding = companding_from(&channels)?;
     motion_from(&value(d, "trajectories")?, &mut header, &mut group)?;
     if let Some(n) = optional(d, "nodes")? {
         nodes_from(&n, &mut header, &mut group)?;
@@ -61,8 +61,13 @@ pub fn group_from(d: &Bound<PyAny>, reference: Option<&Group>) -> PyResult<Group
     let same = |r: &Group| {
         let h = &r.header;
         (h.origin, h.grid_step, h.grid_bits) == (header.origin, header.grid_step, header.grid_bits)
-            && (&h.scales, &h.levers, &h.shifts, &h.curves)
-                == (&header.scales, &header.levers, &header.shifts, &header.curves)
+            && (&h.scales, &h.scale_exponents, &h.shifts, &h.companding)
+                == (
+                    &header.scales,
+                    &header.scale_exponents,
+                    &header.shifts,
+                    &header.companding,
+                )
     };
     if header.reference > 0 && !reference.is_some_and(same) {
         return invalid(
@@ -128,13 +133,13 @@ fn shifts_from(d: &Bound<PyAny>, header: &Header) -> PyResult<Vec<[u8; 6]>> {
 }
 
 /// `companding` of log_scales and logit_opacities: for each channel low, width, and the slopes.
-fn curves_from(channels: &Bound<PyDict>) -> PyResult<Option<[Curve; 4]>> {
+fn companding_from(channels: &Bound<PyDict>) -> PyResult<Option<[Companding; 4]>> {
     let mut found = Vec::new();
     for a in [Attribute::LogScales, Attribute::LogitOpacities] {
         let c = entry(channels, a.name())?;
         if optional(&c, "companding")?.is_some() {
             let rows: Vec<[f32; 2 + PIECES]> = value(&c, "companding")?;
-            found.extend(rows.into_iter().map(|[low, width, slopes @ ..]| Curve {
+            found.extend(rows.into_iter().map(|[low, width, slopes @ ..]| Companding {
                 low,
                 width,
                 slopes: slopes.map(|s| s as u8),

@@ -90,7 +90,10 @@ impl ParametricEvaluator {
     /// Attributes of frame `t` of all Gaussians, f32.
     fn frame<'py>(&self, py: Python<'py>, t: u16) -> PyResult<Bound<'py, PyDict>> {
         if t >= self.frames {
-            return Err(PyIndexError::new_err(format!("frame {t} of a group of {}", self.frames)));
+            return Err(PyIndexError::new_err(format!(
+                "frame {t} of a group of {}",
+                self.frames
+            )));
         }
         frame(py, &self.parametric(), t)
     }
@@ -158,17 +161,22 @@ fn sparse(
     let values = a.as_slice()?;
     Ok(py.detach(|| {
         let rows = k * c;
-        let blocks: Vec<Trajectories<f32>> = (0..n.div_ceil(BLOCK)).into_par_iter().map(|block| {
-            let (first, last) = (block * BLOCK, n.min((block + 1) * BLOCK));
-            let mut own = vec![0.0; (last - first) * rows];
-            for r in 0..rows {
-                let row = &values[r * n + first..r * n + last];
-                row.iter().zip(own[r..].iter_mut().step_by(rows)).for_each(|(v, o)| *o = *v);
-            }
-            let mut out = Trajectories::new(c);
-            own.chunks(rows.max(1)).for_each(|one| out.push(one));
-            out
-        }).collect();
+        let blocks: Vec<Trajectories<f32>> = (0..n.div_ceil(BLOCK))
+            .into_par_iter()
+            .map(|block| {
+                let (first, last) = (block * BLOCK, n.min((block + 1) * BLOCK));
+                let mut own = vec![0.0; (last - first) * rows];
+                for r in 0..rows {
+                    let row = &values[r * n + first..r * n + last];
+                    row.iter()
+                        .zip(own[r..].iter_mut().step_by(rows))
+                        .for_each(|(v, o)| *o = *v);
+                }
+                let mut out = Trajectories::new(c);
+                own.chunks(rows.max(1)).for_each(|one| out.push(one));
+                out
+            })
+            .collect();
         let mut out = Trajectories::new(c);
         blocks.into_iter().for_each(|b| out.append(b));
         out
@@ -280,7 +288,11 @@ pub fn blend_rigid<'py>(
     let blend = blend_of(&neighbors, &weights, x.len())?;
     let (mut means, mut rotations) = (vec![[0.0f32; 3]; x.len()], vec![[0.0f32; 4]; x.len()]);
     py.detach(|| nodes.carry(&blend, x, (&mut means, &mut rotations), |_, x, q| (x, q)));
-    let means = means.into_flattened().into_pyarray(py).reshape([x.len(), 3])?.into_any();
+    let means = means
+        .into_flattened()
+        .into_pyarray(py)
+        .reshape([x.len(), 3])?
+        .into_any();
     let rotations = rotations.into_flattened().into_pyarray(py);
     Ok((means, rotations.reshape([x.len(), 4])?.into_any()))
 }
@@ -298,14 +310,31 @@ pub fn blend_rigid_backward<'py>(
 ) -> PyResult<Bound<'py, PyAny>> {
     let (x, nodes) = (rest.as_slice()?.as_chunks::<3>().0, self::poses(&poses)?);
     let blend = blend_of(&neighbors, &weights, x.len())?;
-    let (g, h) = (by_means.as_slice()?.as_chunks().0, by_rotations.as_slice()?.as_chunks().0);
+    let (g, h) = (
+        by_means.as_slice()?.as_chunks().0,
+        by_rotations.as_slice()?.as_chunks().0,
+    );
     let grads = py.detach(|| nodes.backward(&blend, x, g, h));
     let row = |p: &Pose| -> [f32; 16] {
         let r = |a: usize, b: usize| p[b][a];
         let [s, q] = [p[3], p[4]];
         [
-            r(0, 0), r(0, 1), r(0, 2), r(1, 0), r(1, 1), r(1, 2), r(2, 0), r(2, 1), r(2, 2),
-            s[0], s[1], s[2], q[0], q[1], q[2], q[3],
+            r(0, 0),
+            r(0, 1),
+            r(0, 2),
+            r(1, 0),
+            r(1, 1),
+            r(1, 2),
+            r(2, 0),
+            r(2, 1),
+            r(2, 2),
+            s[0],
+            s[1],
+            s[2],
+            q[0],
+            q[1],
+            q[2],
+            q[3],
         ]
     };
     let rows: Vec<[f32; 16]> = grads.iter().map(row).collect();

@@ -2,9 +2,9 @@
 
 use numpy::{PyArray1, prelude::*};
 use pyo3::prelude::*;
-use raster::{Adam, ImageLoss, Level, Pair};
+use raster::{Adam, ImageLoss, Pair, SimdLevel};
 
-use super::{In, InOut, contiguous, level, usage};
+use super::arrays::{In, InOut, contiguous, level, usage};
 
 /// (loss, l1, mse, ssim, gradient [H * W * 3]) of an image [H, W, 3].
 #[pyfunction]
@@ -63,7 +63,7 @@ pub fn adam(
     };
     let (param, grad) = (contiguous(param.as_slice_mut())?, contiguous(grad.as_slice())?);
     let (first, second) = (contiguous(first.as_slice_mut())?, contiguous(second.as_slice_mut())?);
-    py.detach(|| adam.step(Level::best(), param, grad, first, second))
+    py.detach(|| adam.step(SimdLevel::best(), param, grad, first, second))
         .map_err(usage)
 }
 

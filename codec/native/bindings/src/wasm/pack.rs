@@ -1,8 +1,9 @@
-//! Gaussians as Spark takes them (https://sparkjs.dev, `PackedSplats`), for the player's GPU path: 16 bytes each.
+//! Gaussians -> the format of Spark (https://sparkjs.dev, `PackedSplats`), 16 bytes each, for the GPU renderer of the
+//! player.
 //!
 //! r g b opacity, 8 bits each | x, y | z as half floats, rotation axis (octahedral, 8 bits each) | log scales, angle, 8 bits
-//! each. Half floats are relative to an origin in the middle of the scene, where they are finest. Colours are those of the
-//! view, and what the view does not show is left out.
+//! each. Half floats are relative to an origin in the middle of the scene, where they are most precise. Colours are those of
+//! the view; Gaussians that the view does not show are left out.
 
 use gsv::parametric::Frame;
 use raster::Projected;
@@ -11,7 +12,7 @@ use std::f32::consts::PI;
 /// Log scales that the 254 steps of Spark's encoding span.
 const LOG_SCALE: [f32; 2] = [-12.0, 9.0];
 
-/// Appends those of `frame` that are visible to `out`; `projected` holds the ellipses of all of them.
+/// Appends the visible Gaussians of `frame` to `out`; `projected`: all of them after projection.
 pub fn pack(frame: &Frame, projected: &[Projected], origin: [f32; 3], out: &mut Vec<u8>) {
     let shapes = frame.quats.iter().zip(frame.log_scales.as_chunks::<3>().0);
     for ((p, mean), (quat, log_scale)) in projected.iter().zip(&frame.means).zip(shapes) {
@@ -41,7 +42,7 @@ fn scale(log: f32) -> u8 {
     (1.0 + (log - low) * 254.0 / (high - low)).round().clamp(1.0, 255.0) as u8
 }
 
-/// The nearest half float; what is too large becomes the largest.
+/// The nearest half float; larger values become the largest one.
 fn half(value: f32) -> u32 {
     let bits = value.clamp(-65504.0, 65504.0).to_bits();
     let sign = bits >> 16 & 0x8000;
@@ -52,7 +53,7 @@ fn half(value: f32) -> u32 {
     sign | ((size.to_bits() + 0xfff + (size.to_bits() >> 13 & 1)) >> 13).wrapping_sub(112 << 10)
 }
 
-/// Axis as an octahedron unfolded on a square, and angle from 0 to pi.
+/// Rotation axis on an octahedron unfolded to a square, and angle from 0 to pi.
 fn rotation([w, x, y, z]: [f32; 4]) -> [u8; 3] {
     let sign = if w < 0.0 { -1.0 } else { 1.0 };
     let sum = x.abs() + y.abs() + z.abs();

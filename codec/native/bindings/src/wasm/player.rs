@@ -1,18 +1,18 @@
-//! What an instance holds, and what its exports do.
+//! The state of an instance, and the bodies of its exports.
 
 use super::{pack, text};
 use gsv::attributes::sh_coefficients;
 use gsv::container::demux::Demuxer;
 use gsv::decode::{Decoding, decode_group, reference_of};
 use gsv::evaluate::Evaluator;
+use gsv::levels::Level;
 use gsv::parametric::Frame;
-use gsv::levels::Level as Caps;
-use raster::{Band, Bands, Level, Projected, Rasterizer, Region, Shade, Splats, Surface, View};
+use raster::{Background, Band, Bands, Projected, Rasterizer, Region, SimdLevel, Splats, Surface, View};
 use std::fmt::Display;
 
-/// 4096 x 4096. A larger picture is refused; an allocation that fails would end the instance.
+/// Most pixels of an image, 4096 x 4096: a failed allocation would end the instance.
 const MAX_PIXELS: usize = 1 << 24;
-/// Groups that an instance can hold.
+/// Slots for decoded groups.
 const SLOTS: usize = 8;
 
 pub struct Player {
@@ -37,7 +37,7 @@ impl Default for Player {
             groups: Default::default(),
             frame: Frame::default(),
             sh_k: 0,
-            raster: Rasterizer::new(Level::best(), 0),
+            raster: Rasterizer::new(SimdLevel::best(), 0),
             bands: Bands::default(),
             splats: Vec::new(),
             pixels: Vec::new(),
@@ -46,7 +46,7 @@ impl Default for Player {
 }
 
 impl Player {
-    /// True, or false with the message in `output`.
+    /// Returns true, or false with the message in `output`.
     fn done<T>(&mut self, result: Result<T, impl Display>) -> bool {
         if let Err(e) = &result {
             self.output = e.to_string().into_bytes();
@@ -63,9 +63,9 @@ impl Player {
         self.output = text::describe(&self.demuxer, first).into_bytes();
     }
 
-    /// The reference of a predicted group is in its slot.
+    /// Decodes the input to `slot`. The reference of a predicted group is in the slot `reference`.
     pub fn decode(&mut self, slot: usize, level: u8, reference: usize, layers: usize) -> bool {
-        let decoded = Caps::get(level).and_then(|caps| {
+        let decoded = Level::get(level).and_then(|caps| {
             let how = Decoding {
                 level: &caps,
                 reference: self
@@ -92,7 +92,7 @@ impl Player {
         }
     }
 
-    /// How many groups back the group of the input refers; -1 with the message in `output` if that cannot be told.
+    /// How many groups back the group in the input refers; -1 with the message in `output` if that is unknown.
     pub fn reference(&mut self) -> i32 {
         let result = reference_of(&self.input);
         let back = result.as_ref().map_or(-1, |back| i32::from(*back));
@@ -181,16 +181,18 @@ impl Player {
     }
 
     pub fn draw(&mut self, size: [usize; 2], background: [f32; 3]) -> bool {
-        let (shade, splats) = (Shade::over(background), &mut self.splats);
+        let (background, splats) = (Background::new(background), &mut self.splats);
         self.pixels
             .resize(size[0].saturating_mul(size[1]).min(MAX_PIXELS), [255; 4]);
         let surface = Surface::Rgba(&mut self.pixels);
-        let drawn = self.raster.draw(surface, size, shade, |p| std::mem::swap(p, splats));
+        let drawn = self
+            .raster
+            .draw(surface, size, background, |p| std::mem::swap(p, splats));
         self.done(drawn)
     }
 
     pub fn use_level(&mut self, i: usize) -> bool {
-        let level = Level::available().get(i).copied();
+        let level = SimdLevel::available().get(i).copied();
         if let Some(level) = level {
             self.raster = Rasterizer::new(level, 0);
         }
@@ -214,7 +216,7 @@ fn floats(values: &[f32]) -> Vec<u8> {
     values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }
 
-/// 18 f32; what is missing is 0, which the rasterizer refuses.
+/// A view from 18 f32; missing ones are 0, which the rasterizer refuses.
 fn view(bytes: &[u8]) -> View {
     let mut v = [0.0f32; 18];
     for (v, b) in v.iter_mut().zip(bytes.as_chunks::<4>().0) {

@@ -1,11 +1,12 @@
-//! What the host wants to know, as JSON.
+//! Answers to the host as JSON.
 
 use gsv::container::config::{COLOR_SPACES, Camera, Config, SH_FRAMES, UP_AXES};
-use gsv::container::demux::{Demuxer, Entry};
+use gsv::container::demux::Demuxer;
+use gsv::container::entry::Entry;
 use gsv::header::Header;
 use std::fmt::Write;
 
-/// {config, groups, pending, index, layers, complete}; config is null before moov has passed, pending but after a moof.
+/// {config, groups, pending, index, layers, complete}; config is null before moov, pending is null except after a moof.
 pub fn describe(d: &Demuxer, first: usize) -> String {
     let groups = list(d.groups().iter().skip(first), entry);
     let index = list(d.index().iter(), entry);

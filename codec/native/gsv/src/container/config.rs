@@ -1,4 +1,4 @@
-//! gsvC (spec 2.3) and the frame rate: what holds for the whole file.
+//! gsvC (spec 2.3) and the frame rate: the configuration of the whole file.
 
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader, Writer};

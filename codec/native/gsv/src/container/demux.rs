@@ -1,37 +1,27 @@
-//! Push parser of the container (spec 2): bytes in any pieces -> config and groups.
+//! Push parser of the container (spec 2): bytes in pieces of any size -> config and groups.
 //!
-//! No I/O inside, so that it serves files, HTTP ranges and a growing file alike. Media data is never copied: a caller that
-//! can seek asks `skippable` and leaves it out. Waiting for more bytes is a state, not an error.
+//! No I/O inside, so it serves files, HTTP ranges and growing files alike. Media data is never copied: a caller that can
+//! seek asks `skippable` and omits those bytes. Waiting for more bytes is a state, not an error.
 
 use super::config::Config;
-use super::movie::{self, Track};
+use super::entry::{Entry, name};
+use super::isobmff::{self, Track};
 use crate::error::{Error, Result};
 
-/// Largest box that is read as a whole.
+/// Largest body of a header box.
 const HEADER_BOX_MAX: u64 = 16 << 20;
-
-/// A group in the file.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Entry {
-    /// Of the sample's first byte, from the start of the file.
-    pub offset: u64,
-    pub size: u64,
-    pub start_frame: u64,
-    pub frames: u32,
-    pub sync: bool,
-}
 
 enum State {
     /// Collecting the header of a box.
     Head,
-    /// Collecting the body of a box that is read as a whole.
+    /// Collecting the body of a header box.
     Body {
         kind: [u8; 4],
         start: u64,
         head: u64,
         size: usize,
     },
-    /// Passing over a body; `media`: that of an mdat, the only place of samples (spec 2.4).
+    /// Skipping a body; `media`: that of an mdat, which alone may hold samples (spec 2.4).
     Skip { left: u64, media: bool },
 }
 
@@ -43,7 +33,7 @@ pub struct Demuxer {
     track: Option<Track>,
     pending: Option<Entry>,
     groups: Vec<Entry>,
-    /// Where the fragments end according to sidx.
+    /// End of the fragments according to sidx.
     end: Option<u64>,
     index: Vec<Entry>,
     layers: Vec<Vec<u64>>,
@@ -67,7 +57,7 @@ impl Default for Demuxer {
 }
 
 impl Demuxer {
-    /// Known once moov has passed.
+    /// None before moov.
     pub fn config(&self) -> Option<&Config> {
         self.track.as_ref().map(|t| &t.config)
     }
@@ -77,22 +67,22 @@ impl Demuxer {
         &self.groups
     }
 
-    /// The group whose header has passed and whose bytes have not.
+    /// The group whose moof has passed, but not all of its bytes.
     pub fn pending(&self) -> Option<&Entry> {
         self.pending.as_ref()
     }
 
-    /// Bytes consumed so far: where the next `push` is taken to start.
+    /// Bytes consumed so far: the offset of the next byte to `push`.
     pub fn position(&self) -> u64 {
         self.position
     }
 
-    /// True if everything that the index announces has passed.
+    /// True if all fragments of sidx have passed.
     pub fn complete(&self) -> bool {
         self.pending.is_none() && matches!(self.state, State::Head) && self.end.is_some_and(|end| self.position >= end)
     }
 
-    /// Bytes from `position` that need not be pushed.
+    /// Number of bytes from `position` on that need not be pushed.
     pub fn skippable(&self) -> u64 {
         if let State::Skip { left, .. } = self.state {
             left
@@ -101,7 +91,7 @@ impl Demuxer {
         }
     }
 
-    /// Passes over `n` bytes, at most `skippable`.
+    /// Skips `n` bytes, at most `skippable`.
     pub fn skip(&mut self, n: u64) {
         let State::Skip { left, media } = &mut self.state else {
             return;
@@ -119,18 +109,18 @@ impl Demuxer {
         }
     }
 
-    /// What sidx announces, for players that fetch only what they show: `offset` and `size` are those of the fragments, moof
-    /// and mdat. A promise, which the fragments need not keep (spec 2.5).
+    /// The groups according to sidx, for players that fetch only what they show; `offset` and `size` are those of the
+    /// fragments, moof and mdat. The fragments may differ (spec 2.5).
     pub fn index(&self) -> &[Entry] {
         &self.index
     }
 
-    /// For each entry of `index` the bytes of the fragment that end with each layer; empty where ssix does not tell.
+    /// For each entry of `index` the bytes of the fragment up to the end of each layer; empty without ssix.
     pub fn layers(&self) -> &[Vec<u64>] {
         &self.layers
     }
 
-    /// Takes group `i` from the index, its fragment in place of its sample: what is in it cannot be told.
+    /// Takes group `i` from the index: `offset` and `size` of its fragment, since those of its sample are unknown.
     pub fn replace_by_index(&mut self, i: usize) {
         self.forget(i);
         self.groups.extend(self.index.get(i).copied());
@@ -141,7 +131,7 @@ impl Demuxer {
         self.groups.truncate(i);
     }
 
-    /// Goes on at the fragment that starts at `position`: what is pushed next is taken to come from there.
+    /// Continues at the fragment that starts at `position`, the offset of the next byte to `push`.
     pub fn seek(&mut self, position: u64) {
         self.state = State::Head;
         self.buffer.clear();
@@ -150,7 +140,7 @@ impl Demuxer {
         self.position = position;
     }
 
-    /// Takes the next bytes of the file.
+    /// Parses the next bytes of the file.
     pub fn push(&mut self, mut data: &[u8]) -> Result<()> {
         while !data.is_empty() {
             if let State::Skip { left, .. } = self.state {
@@ -173,7 +163,7 @@ impl Demuxer {
         Ok(())
     }
 
-    /// Acts on what is in the buffer, if it is whole.
+    /// Handles the buffer once it holds a whole header or body.
     fn advance(&mut self) -> Result<()> {
         match self.state {
             State::Head => self.head(),
@@ -192,6 +182,7 @@ impl Demuxer {
         }
     }
 
+    /// Parses the header of a box and chooses the next state.
     fn head(&mut self) -> Result<()> {
         let Some(([size @ .., a, b, c, d], large)) = self.buffer.split_first_chunk::<8>() else {
             return Ok(());
@@ -238,7 +229,7 @@ impl Demuxer {
         Ok(())
     }
 
-    /// Spec 2.4: the sample that a moof announced lies in the next mdat.
+    /// Spec 2.4: checks that the sample of a moof lies in the next mdat.
     fn sample_within(&self, body: u64) -> std::result::Result<(), &'static str> {
         let Some(g) = &self.pending else { return Ok(()) };
         let end = g.offset.checked_add(g.size);
@@ -252,10 +243,10 @@ impl Demuxer {
 
     fn body(&mut self, kind: &[u8; 4], start: u64, body: &[u8]) -> Result<()> {
         match kind {
-            b"ftyp" => movie::brands(body),
+            b"ftyp" => isobmff::ftyp(body),
             b"moov" if self.track.is_some() => Err(Error::bitstream(0, "", "one moov box")),
             b"moov" => {
-                self.track = Some(movie::movie(body)?);
+                self.track = Some(isobmff::moov(body)?);
                 Ok(())
             }
             b"sidx" => {
@@ -263,7 +254,7 @@ impl Demuxer {
                 Ok(())
             }
             b"ssix" => {
-                let told = movie::layer_index(body).filter(|l| l.len() == self.index.len());
+                let told = isobmff::ssix(body).filter(|l| l.len() == self.index.len());
                 self.layers = told.unwrap_or_default();
                 Ok(())
             }
@@ -271,9 +262,9 @@ impl Demuxer {
         }
     }
 
-    /// Spec 2.5.
+    /// Stores the groups of sidx (spec 2.5).
     fn announced(&mut self, sidx: &[u8]) {
-        let (Some((first, references)), Some(track)) = (movie::index(sidx), &self.track) else {
+        let (Some((first, references)), Some(track)) = (isobmff::sidx(sidx), &self.track) else {
             return;
         };
         let frame = u64::from(track.config.frame_duration);
@@ -300,12 +291,7 @@ impl Demuxer {
         if self.pending.is_some() {
             return Err(Error::bitstream(0, "", "the mdat box of the moof before"));
         }
-        self.pending = movie::fragment(body, track, start)?;
+        self.pending = isobmff::moof(body, track, start)?;
         Ok(())
     }
-}
-
-/// For messages.
-pub fn name(kind: &[u8; 4]) -> String {
-    format!("{} box", kind.escape_ascii())
 }

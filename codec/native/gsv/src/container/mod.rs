@@ -1,9 +1,11 @@
 //! The container (spec 2): fragmented MP4 with one fragment per group.
 //!
-//! `config` is the gsvC box, `write` makes boxes, `demux` finds groups in bytes that arrive in any pieces.
+//! `config` is the gsvC box, `write` writes boxes, `isobmff` parses header boxes, `demux` finds the groups in a stream of
+//! bytes, `whole` reads a file in memory and recovers from damage.
 
 pub mod config;
 pub mod demux;
-mod movie;
+pub mod entry;
+mod isobmff;
 pub mod whole;
 pub mod write;

@@ -1,21 +1,22 @@
-//! A whole file in memory -> its groups: the demuxer over data that is there, and what an index can save of a damaged one.
+//! A whole file in memory -> its groups. Wraps the demuxer, and recovers the groups behind damaged boxes.
 //!
-//! Where the boxes of a fragment are damaged, the walk from box to box ends; with an index (spec 2.5) that agrees so far it
-//! goes on at the next fragment.
+//! Damaged boxes of a fragment end the walk from box to box. With an index (spec 2.5) that agrees with the groups so far,
+//! the walk continues at the next fragment.
 
-use super::demux::{Demuxer, Entry};
+use super::demux::Demuxer;
+use super::entry::Entry;
 use crate::error::{Error, Result};
 
-/// Groups that are taken from the index: a file with more damage is no file of ours, and each costs a walk.
+/// Most groups taken from the index; it bounds the number of walks.
 const LOST_MAX: usize = 64;
-/// Bytes that the demuxer is shown at a time between the boxes that it passes over.
+/// Bytes pushed to the demuxer at a time between skipped boxes.
 const LOOK: usize = 4096;
 
-/// Reads the headers of a file. Strict: damage is an error. Otherwise groups that only the index tells of are in their places,
-/// with the bytes of their fragment, and the errors come with the number of the group.
+/// Reads the headers of a file. Strict: damage is an error. Otherwise groups that only the index has are listed with the
+/// bytes of their fragment, and the errors are returned with the number of the group.
 ///
 /// # Errors
-/// There is no moov, or boxes are damaged and no index helps.
+/// There is no moov; boxes are damaged and no index helps.
 pub fn read(data: &[u8], strict: bool) -> Result<(Demuxer, Vec<(usize, Error)>)> {
     let mut demuxer = Demuxer::default();
     let (mut at, mut tried, mut damage) = (0, None, Vec::new());
@@ -49,7 +50,7 @@ pub fn read(data: &[u8], strict: bool) -> Result<(Demuxer, Vec<(usize, Error)>)>
     }
 }
 
-/// The first group that is not as the index tells, and its fragment, if the data has that.
+/// The first group that differs from the index, and its fragment; None if the data does not hold that fragment.
 fn missing(demuxer: &Demuxer, size: usize) -> Option<(usize, Entry)> {
     let differ = |(a, b): (&Entry, &Entry)| (a.start_frame, a.frames) != (b.start_frame, b.frames);
     let groups = demuxer.groups();

@@ -1,4 +1,4 @@
-//! Writing boxes (spec 2): init segment, fragment, sidx.
+//! Writer of the container (spec 2): init segment, fragments, sidx and ssix.
 
 use super::config::Config;
 use crate::error::{Error, Result};
@@ -7,18 +7,18 @@ pub const TRACK_ID: u32 = 1;
 pub const BRAND: &[u8; 4] = b"gsv1";
 const FLAGS_SYNC: u32 = 0x0200_0000; // sample_depends_on = 2: on no other
 const FLAGS_OTHER: u32 = 0x0101_0000; // depends on others, is not a sync sample
-/// Bytes that a range of ssix can hold.
+/// Most bytes of a range in ssix.
 const RANGE_MAX: u64 = (1 << 24) - 1;
 const UNITY: [u32; 9] = [1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30];
 
-/// A group as sidx and demuxers see it.
+/// A fragment for the index.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Reference {
     /// Bytes of the fragment: moof and mdat.
     pub size: u64,
     pub frames: u32,
     pub sync: bool,
-    /// Bytes of the fragment that end with each layer; none if that is not known.
+    /// Bytes of the fragment up to the end of each layer; empty if unknown.
     pub layers: Vec<u64>,
 }
 
@@ -44,7 +44,7 @@ fn words(v: &[u32]) -> Vec<u8> {
     v.iter().flat_map(|w| w.to_be_bytes()).collect()
 }
 
-/// ftyp and moov: what opens every file.
+/// ftyp and moov, which start every file.
 pub fn init_segment(config: &Config) -> Result<Vec<u8>> {
     let mut out = boxed(b"ftyp", &[BRAND, &[0; 4], BRAND, b"iso6", b"cmfc"]);
     let mvhd = [
@@ -131,8 +131,8 @@ pub fn fragment(
     Ok(out)
 }
 
-/// What precedes the fragments of a finished file: the init segment, a sidx of them (spec 2.5), and where a group has more
-/// than one layer a ssix (spec 2.6).
+/// What precedes the fragments in a finished file: the init segment, a sidx (spec 2.5), and where a group has more than one
+/// layer a ssix (spec 2.6).
 pub fn finish(init: &[u8], config: &Config, groups: &[Reference]) -> Result<Vec<u8>> {
     let per = groups.len().div_ceil(usize::from(u16::MAX)).max(1); // groups per reference
     let mut references = Vec::new();
@@ -165,7 +165,7 @@ pub fn finish(init: &[u8], config: &Config, groups: &[Reference]) -> Result<Vec<
     Ok([init, &full(b"sidx", 1, 0, &[&head, &references]), &ssix].concat())
 }
 
-/// Spec 2.6.
+/// ssix (spec 2.6).
 fn layer_index(groups: &[Reference]) -> Vec<u8> {
     let mut body = words(&[groups.len() as u32]);
     for g in groups {

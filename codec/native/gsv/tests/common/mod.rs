@@ -2,7 +2,7 @@
 #![allow(dead_code)] // each test takes what it needs
 
 use gsv::attributes::Attribute;
-use gsv::curve::Curve;
+use gsv::companding::Companding;
 use gsv::decode::Decoding;
 use gsv::group::{BIRTH, Group};
 use gsv::header::{Header, LayerHeader, NodeHeader, Scale, TrajectoryHeader};
@@ -121,8 +121,8 @@ pub fn group(s: &Shape) -> Group {
         grid_bits: s.bits,
         sh_degree: s.sh_degree,
         layers: s.counts.iter().map(|n| layer(*n, *n)).collect(),
-        levers: [[0, 40, -8], [20, 0, 0], [127, -128, 3]],
-        curves: (s.counts.len() > 1).then(|| std::array::from_fn(|c| curve(c as f32))),
+        scale_exponents: [[0, 40, -8], [20, 0, 0], [127, -128, 3]],
+        companding: (s.counts.len() > 1).then(|| std::array::from_fn(|c| companding(c as f32))),
         ..Header::default()
     };
     let count: usize = s.counts.iter().sum();
@@ -146,8 +146,8 @@ pub fn group(s: &Shape) -> Group {
     g
 }
 
-fn curve(low: f32) -> Curve {
-    Curve {
+fn companding(low: f32) -> Companding {
+    Companding {
         low,
         width: 0.5,
         slopes: [0, 255, 7, 16, 0, 3, 80, 1],

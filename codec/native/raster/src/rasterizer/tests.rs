@@ -1,14 +1,15 @@
 //! The rasterizer as a whole: its levels against each other, and its memory.
 
 use super::*;
+use crate::scene::Gradients;
 
 /// `n` round splats of the given scale on a line that winds through the view, and a camera of size x size pixels.
 fn draw(n: usize, log_scale: f32, size: usize, training: bool) -> Rasterizer {
-    draw_at(Level::best(), n, log_scale, size, training).0
+    draw_at(SimdLevel::best(), n, log_scale, size, training).0
 }
 
 /// The same, and the gradient of the means if `training`.
-fn draw_at(level: Level, n: usize, log_scale: f32, size: usize, training: bool) -> (Rasterizer, Vec<f32>) {
+fn draw_at(level: SimdLevel, n: usize, log_scale: f32, size: usize, training: bool) -> (Rasterizer, Vec<f32>) {
     let t = |i: usize| i as f32 / n as f32;
     let means: Vec<f32> = (0..n)
         .flat_map(|i| [(9.0 * t(i)).sin(), t(i) - 0.5, 3.0 + t(i)])
@@ -38,7 +39,7 @@ fn draw_at(level: Level, n: usize, log_scale: f32, size: usize, training: bool) 
         region,
     };
     let mut r = Rasterizer::new(level, 0);
-    r.forward(&splats, &view, Shade::over([0.1, 0.2, 0.3]), training)
+    r.forward(&splats, &view, Background::new([0.1, 0.2, 0.3]), training)
         .unwrap();
     let mut grads = [3, 4, 3, 1, 3, 0, 1, 1, 1].map(|d| vec![0.0; d * n]);
     if training {
@@ -74,10 +75,10 @@ fn draw_at(level: Level, n: usize, log_scale: f32, size: usize, training: bool) 
 
 #[test]
 fn every_level_draws_and_differentiates_like_scalar() {
-    let (want, slopes) = draw_at(Level::SCALAR, 300, -3.0, 90, true);
+    let (want, slopes) = draw_at(SimdLevel::SCALAR, 300, -3.0, 90, true);
     let largest = slopes.iter().fold(0.0f32, |m, s| m.max(s.abs()));
     assert!(largest > 0.0);
-    for level in Level::available() {
+    for level in SimdLevel::available() {
         let (got, other) = draw_at(level, 300, -3.0, 90, true);
         let image = got.image.iter().zip(&want.image);
         assert!(image.clone().all(|(a, b)| (a - b).abs() < 1e-4), "{}", level.name());

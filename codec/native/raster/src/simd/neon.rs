@@ -6,7 +6,7 @@
 use std::arch::aarch64::*;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
 
-use super::{MAGIC, Vector, exp2_poly, exp2_polys};
+use super::vector::{MAGIC, Vector, exp2_poly, exp2_polys};
 
 #[derive(Clone, Copy)]
 pub struct F32x4(float32x4_t);

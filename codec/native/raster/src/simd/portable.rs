@@ -1,12 +1,12 @@
-//! 4 lanes in plain Rust, for machines that have no instance of their own, and on x86-64 to be tested.
+//! 4 lanes in plain Rust, for machines without an instance of their own; on x86-64 it is compiled for the tests.
 //!
-//! The compiler takes most of the arrays apart into scalar instructions; four pixels at a time still skip more than one, so
-//! that this is up to twice as fast as `scalar`.
+//! The compiler turns most of the arrays into scalar instructions; four pixels at a time still skip more work than one, so
+//! this is up to twice as fast as `scalar`.
 
 use std::array::from_fn;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
 
-use super::{MAGIC, Vector, exp2_poly, exp2_polys};
+use super::vector::{MAGIC, Vector, exp2_poly, exp2_polys};
 
 const LANES: usize = 4;
 

@@ -1,6 +1,6 @@
-//! The plain reference instance: one lane, the standard library's functions.
+//! The scalar reference instance: one lane, functions of the standard library.
 
-use super::Vector;
+use super::vector::Vector;
 
 impl Vector for f32 {
     const LANES: usize = 1;

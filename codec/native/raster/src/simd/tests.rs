@@ -34,7 +34,7 @@ dispatch!(fn run_at = run(out: &mut [f32; 4]));
 
 #[test]
 fn functions_are_accurate_at_every_level() {
-    for level in Level::available() {
+    for level in SimdLevel::available() {
         let mut worst = [1.0; 4];
         run_at(level, &mut worst);
         assert!(worst.iter().all(|&w| w < 5e-6), "{}: {worst:?}", level.name());
@@ -56,7 +56,7 @@ dispatch!(fn lanes_at = lanes(x: &[f32], out: &mut Vec<f32>));
 #[test]
 fn masks_select_the_right_lanes() {
     let x: Vec<f32> = (0..64).map(|i| (i as f32 * 0.618_034).fract()).collect();
-    for level in Level::available() {
+    for level in SimdLevel::available() {
         let mut out = Vec::new();
         lanes_at(level, &x, &mut out);
         let width = x.len() / (out.len() - x.len());
@@ -85,7 +85,7 @@ fn exp2_of_extremes_is_zero_infinity_or_nan() {
         }
     }
     dispatch!(fn extremes_at = extremes(out: &mut [f32; 3]));
-    for level in Level::available() {
+    for level in SimdLevel::available() {
         let mut out = [1.0; 3];
         extremes_at(level, &mut out);
         assert!(

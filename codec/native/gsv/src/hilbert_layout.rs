@@ -1,26 +1,26 @@
-//! Maps (spec 7.2): index of a Gaussian -> cell of the W x H map that channels are shown in.
+//! Hilbert layout (spec 7.2): index of a Gaussian -> cell of the W x H map in which channels are shown.
 //!
-//! Squares of W x W below each other, each filled along a Hilbert curve that ends where the next square begins.
-//! Consecutive indices are neighbours in space (Morton order), so a map looks like a folded surface.
+//! The map is a column of W x W squares, each filled along a Hilbert curve that ends where the next square begins.
+//! Consecutive indices are neighbours in space (Morton order), so neighbours in space are near each other on the map.
 
-/// The arrangement of N indices.
-pub struct Map {
+/// The map of N indices.
+pub struct HilbertLayout {
     pub width: usize,
     pub height: usize,
     count: usize,
     bits: u32,
 }
 
-/// The map width that spec 7.2 prescribes, as a power of two.
+/// log2 of the map width that spec 7.2 prescribes.
 pub fn width_log2(n: usize) -> u32 {
     n.checked_ilog2().unwrap_or(0) >> 1
 }
 
-impl Map {
-    pub fn new(count: usize) -> Map {
+impl HilbertLayout {
+    pub fn new(count: usize) -> HilbertLayout {
         let bits = width_log2(count);
         let width = 1usize << bits;
-        Map {
+        HilbertLayout {
             width,
             height: count.div_ceil(width * width) * width,
             count,

@@ -1,38 +1,40 @@
-//! Quaternions -> the integers of quats (spec 13.1), by what they and their bits are worth. The mirror of `dequantize::rotations`.
+//! Quantization of rotation residuals (spec 13.1): quaternions -> the integers of quats, by rate-distortion cost. The mirror
+//! of `dequantize::rotations`.
 //!
-//! Each turn is taken from the decoded quaternion of the neighbour, so errors do not add up. Of the four forms of a Gaussian
-//! whose axes are sorted, the one that turns least is coded.
+//! Each residual refers to the decoded quaternion of the neighbour, so errors do not accumulate. A Gaussian with sorted axes
+//! has four equivalent quaternions (forms); the one with the smallest residual is coded.
 
-use crate::dequantize::{Quat, before, multiply, turn};
+use crate::dequantize::{Quat, before, multiply, rotation_residual};
 use crate::neighbors::Near;
 use crate::values::NEAR_WEIGHT;
 
-/// Integers and contexts beyond are counted together.
+/// Integers and contexts beyond +-RANGE share their statistics.
 pub const RANGE: i32 = 15;
-/// Integers that code lengths tell apart.
+/// Integers with a code length of their own.
 pub const SIDE: usize = 2 * RANGE as usize + 1;
 
-/// Gaussians to be coded: of each its quaternion, the steps of its three integers, and what an error of a step is worth, in bits,
-/// squared.
-pub struct Turns<'a> {
+/// The births of a layer, to be quantized.
+pub struct RotationResiduals<'a> {
     pub quats: &'a [Quat],
+    /// Steps of the three integers of each Gaussian.
     pub steps: &'a [[f32; 3]],
-    pub worth: &'a [[f32; 3]],
-    /// Bits of an integer (last) in a context, for each channel: 3 * SIDE * SIDE. Empty: all cost the same.
+    /// Bits that an error of one step is worth; an error of x steps is worth x^2 times as many.
+    pub error_bits: &'a [[f32; 3]],
+    /// Code lengths in bits: [3, SIDE, SIDE] by channel, context, integer. Empty: all integers cost the same.
     pub lengths: &'a [f32],
 }
 
-/// A Gaussian as it is coded.
-pub struct Coded {
+/// The residual of one Gaussian.
+pub struct QuantizedRotation {
     pub integers: [i32; 3],
-    /// Of 1, i, j, k the one whose inverse the quaternion was multiplied by from the right.
+    /// The form: 0 to 3, the quaternion was multiplied from the right by the inverse of 1, i, j or k.
     pub form: u8,
 }
 
-impl Turns<'_> {
-    /// What each Gaussian is coded as. `near`: neighbours of each.
-    pub fn code(&self, near: &[Near]) -> Vec<Coded> {
-        let mut out: Vec<Coded> = Vec::with_capacity(self.quats.len());
+impl RotationResiduals<'_> {
+    /// Quantizes all residuals in order. `near`: context neighbours of each Gaussian.
+    pub fn quantize(&self, near: &[Near]) -> Vec<QuantizedRotation> {
+        let mut out: Vec<QuantizedRotation> = Vec::with_capacity(self.quats.len());
         let mut decoded = Vec::with_capacity(self.quats.len());
         for (i, (q, near)) in self.quats.iter().zip(near).enumerate() {
             let before = before(&decoded, i, near);
@@ -47,17 +49,17 @@ impl Turns<'_> {
                     weight += w;
                 }
                 let context = (sum as f32 / weight.max(1) as f32).round_ties_even() as i32;
-                self.choose(c, v[c] / step[c], self.worth[i][c], context.clamp(-RANGE, RANGE))
+                self.choose(c, v[c] / step[c], self.error_bits[i][c], context.clamp(-RANGE, RANGE))
             });
             let rounded = std::array::from_fn(|c| step[c] * integers[c] as f32);
-            decoded.push(multiply(before, turn(rounded)));
-            out.push(Coded { integers, form });
+            decoded.push(multiply(before, rotation_residual(rounded)));
+            out.push(QuantizedRotation { integers, form });
         }
         out
     }
 
-    /// The integer for `x` of channel `c` that costs least: error and bits.
-    fn choose(&self, c: usize, x: f32, worth: f32, context: i32) -> i32 {
+    /// The integer for `x` (in steps) of channel `c` with the least cost: error plus code length.
+    fn choose(&self, c: usize, x: f32, error_bits: f32, context: i32) -> i32 {
         let nearest = x.round_ties_even() as i32;
         let row = (c * SIDE + (context + RANGE) as usize) * SIDE;
         let Some(lengths) = self.lengths.get(row..row + SIDE) else {
@@ -66,7 +68,7 @@ impl Turns<'_> {
         let cost = |k: &i32| {
             let off = x - *k as f32;
             let beyond = (k.abs() - RANGE).max(0) as f32;
-            worth * off * off + lengths[(k.clamp(&-RANGE, &RANGE) + RANGE) as usize] + 2.0 * (1.0 + beyond).log2()
+            error_bits * off * off + lengths[(k.clamp(&-RANGE, &RANGE) + RANGE) as usize] + 2.0 * (1.0 + beyond).log2()
         };
         let toward = nearest + (context - nearest).signum();
         let candidates = [nearest, toward, nearest - nearest.signum(), context, 0];
@@ -75,7 +77,7 @@ impl Turns<'_> {
     }
 }
 
-/// What `turn` makes `q` of.
+/// The mirror of `rotation_residual`: the sines of half the three angles.
 fn halves([w, x, y, z]: Quat) -> [f32; 3] {
     let first = (2.0 * (w * x + y * z)).atan2(1.0 - 2.0 * (x * x + y * y));
     let second = (2.0 * (w * y - z * x)).clamp(-1.0, 1.0).asin();
@@ -87,7 +89,7 @@ fn inverse([w, x, y, z]: Quat) -> Quat {
     [w, -x, -y, -z]
 }
 
-/// The form of `q` with the largest real part, and which it is.
+/// The form of `q` with the largest real part, which is the smallest rotation: its number and quaternion.
 fn least(q: Quat) -> (u8, Quat) {
     let form = (0..4).max_by(|a, b| q[*a].abs().total_cmp(&q[*b].abs())).unwrap_or(0);
     let mut unit = [0.0; 4];

@@ -1,138 +1,52 @@
-//! Depth-sorted Gaussians -> for each 16 x 16 tile the list of those whose ellipse (alpha >= ALPHA_MIN) meets it, in depth order.
+//! Tile binning: depth-sorted Gaussians -> for each 16 x 16 tile the Gaussians whose ellipse (alpha >= ALPHA_MIN) meets it,
+//! in depth order.
 //!
-//! A counting sort. Fixed chunks of the sorted order list and count their tiles in parallel, a prefix sum gives each
-//! (tile, chunk) its place, and the chunks fill in parallel; the places do not depend on the threads. In the chunk's list the
-//! places then replace the tiles: from them the backward pass gathers the gradients of a Gaussian in a fixed order.
+//! A counting sort. Fixed chunks of the sorted order list and count their tiles in parallel, a prefix sum gives each (tile,
+//! chunk) its first place, and the chunks write their pairs in parallel; the places do not depend on the threads. The
+//! chunk's list then keeps the places instead of the tiles: the backward pass gathers the gradients of a Gaussian from them
+//! in a fixed order.
 
-use std::ops::Range;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
-use crate::project::{MANY, Projected, SLACK, TILE};
-use crate::scene::{RasterError, Region};
+use crate::error::RasterError;
+use crate::projected::{MANY, Projected};
 use crate::simd::prefetch;
-use crate::tile::{BATCH, Ellipse, reach};
+use crate::tile::BATCH;
+use crate::tile_rect::{TileRect, for_tiles};
 
-/// Chunks of the sorted order; bounds the parallelism of binning. Few Gaussians have fewer, but not fewer than the least:
-/// each chunk has a counter a tile.
+/// Chunks of the sorted order, which bound the parallelism of binning. Each chunk has a counter per tile, so few Gaussians
+/// are fewer chunks, down to the minimum.
 const CHUNKS: usize = 16;
 const CHUNKS_MIN: usize = 4;
 const CHUNK_SIZE: usize = 4096;
 /// Entry of a Gaussian whose ellipse meets no tile.
 const NOWHERE: u32 = u32::MAX;
-/// The most that `append` adds for a Gaussian whose tiles are known.
+/// Most entries that `append` adds for a Gaussian whose tiles are known (2 x 2).
 const FEW: usize = 4;
 /// An entry of `owned` is chunk << OFFSET_BITS | offset in the chunk's list.
 const OFFSET_BITS: u32 = 28;
 const HIDDEN: u32 = u32::MAX;
-/// Items between a prefetch and its use.
+/// Prefetch distance in items.
 const AHEAD: usize = 12;
 
-/// A rectangle of tiles.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Tiles {
-    pub columns: Range<usize>,
-    pub rows: Range<usize>,
-}
-
-impl Tiles {
-    /// Those that cover a region.
-    pub fn of(region: Region) -> Tiles {
-        Tiles {
-            columns: 0..region.width.div_ceil(TILE),
-            rows: 0..region.height.div_ceil(TILE),
-        }
-    }
-
-    pub fn len(&self) -> usize {
-        self.columns.len() * self.rows.len()
-    }
-
-    /// Two halves, none of a single tile.
-    pub fn halves(&self) -> Option<[Tiles; 2]> {
-        let half = |r: &Range<usize>| (r.start..r.start + r.len() / 2, r.start + r.len() / 2..r.end);
-        let (columns, rows) = (self.columns.clone(), self.rows.clone());
-        if rows.len() > 1 {
-            let (top, bottom) = half(&rows);
-            let left = columns.clone();
-            Some([
-                Tiles {
-                    columns: left,
-                    rows: top,
-                },
-                Tiles { columns, rows: bottom },
-            ])
-        } else if columns.len() > 1 {
-            let (left, right) = half(&columns);
-            let all = rows.clone();
-            Some([
-                Tiles {
-                    columns: left,
-                    rows: all,
-                },
-                Tiles { columns: right, rows },
-            ])
-        } else {
-            None
-        }
-    }
-}
-
 #[derive(Default)]
-pub struct Bins {
-    pub tiles: Tiles,
+pub struct TileBins {
+    pub tiles: TileRect,
     /// [tiles + 1] first pair of each tile
     pub starts: Vec<u32>,
     /// Gaussian of each pair
     pub pairs: Vec<AtomicU32>,
-    /// [N] where a Gaussian's entry in the lists begins; HIDDEN for the invisible
+    /// [N] where the entries of a Gaussian begin; HIDDEN if it is invisible
     owned: Vec<AtomicU32>,
-    /// of each chunk: for each Gaussian the positions of its pairs in `pairs`, << 1, with 1 added to the last; or NOWHERE
+    /// of each chunk: for each Gaussian the places of its pairs in `pairs`, << 1, with 1 added to the last one; NOWHERE if
+    /// it has none
     lists: Vec<Vec<u32>>,
     cursors: Vec<u32>, // [chunks, tiles]
 }
 
-/// Calls `visit(tile)` for those of the tiles that the ellipse of `p` meets at pixel centres.
-#[inline(always)]
-fn for_tiles(p: &Projected, tiles: &Tiles, mut visit: impl FnMut(usize)) {
-    let [x0, x1, y0, y1] = p.tiles.map(usize::from);
-    let (x0, y0) = (x0.max(tiles.columns.start), y0.max(tiles.rows.start));
-    let (x1, y1) = (x1.min(tiles.columns.end - 1), y1.min(tiles.rows.end - 1));
-    let start = |row: usize| (row - tiles.rows.start) * tiles.columns.len();
-    if p.met != MANY {
-        let first = [usize::from(p.tiles[0]), usize::from(p.tiles[2])];
-        for row in y0..=y1 {
-            for column in x0..=x1 {
-                if p.met >> (2 * (row - first[1]) + column - first[0]) & 1 == 1 {
-                    visit(start(row) + column - tiles.columns.start);
-                }
-            }
-        }
-        return;
-    }
-    let ellipse = Ellipse {
-        l11: p.l11,
-        l21: p.l21,
-        l22: p.l22,
-        reach: reach(p.log2_opacity),
-    };
-    let peak = ellipse.peak();
-    let tile = |v: f32| v.max(0.0) as usize / TILE;
-    for row in y0..=y1 {
-        let top = (row * TILE) as f32 + 0.5 - p.y;
-        let (met, left, right) = ellipse.span(peak, top, top + (TILE - 1) as f32);
-        if met {
-            let first = tile(p.x + left / p.l11 - SLACK + 0.5);
-            let last = tile(p.x + right / p.l11 + SLACK - 0.5);
-            for column in first.max(x0)..=last.min(x1) {
-                visit(start(row) + column - tiles.columns.start);
-            }
-        }
-    }
-}
-
-/// Makes room for `more` entries; by a quarter, since twice as much would be felt in the memory of a picture.
+/// Reserves `more` entries and a quarter; doubling would cost noticeable memory.
 #[inline(always)]
 fn grow(list: &mut Vec<u32>, more: usize) {
     if list.capacity() - list.len() < more {
@@ -140,10 +54,10 @@ fn grow(list: &mut Vec<u32>, more: usize) {
     }
 }
 
-/// A Gaussian's entries of a chunk's list, tile << 1 | last, from `used` on; counts them. Returns their end. There is room for
-/// FEW, and no branch for those that are met: which ones cannot be foretold.
+/// Writes the entries of a Gaussian, tile << 1 | last, to the list from `used` on, and counts them per tile. Returns the new
+/// end. At most FEW entries are written without branches, since branch prediction would fail on which tiles are met.
 #[inline(always)]
-fn append(p: &Projected, tiles: &Tiles, count: &mut [u32], list: &mut Vec<u32>, used: usize) -> usize {
+fn append(p: &Projected, tiles: &TileRect, count: &mut [u32], list: &mut Vec<u32>, used: usize) -> usize {
     let [x0, x1, y0, y1] = p.tiles.map(usize::from);
     let inside = x0 >= tiles.columns.start && x1 < tiles.columns.end && y0 >= tiles.rows.start && y1 < tiles.rows.end;
     let mut end = used;
@@ -183,7 +97,7 @@ fn index(key: &AtomicU64) -> usize {
     key.load(Relaxed) as u32 as usize
 }
 
-impl Bins {
+impl TileBins {
     /// Bytes of the buffers.
     pub fn memory(&self) -> usize {
         let lists = self.lists.iter().map(Vec::capacity).sum::<usize>();
@@ -199,36 +113,37 @@ impl Bins {
         self.starts[t] as usize
     }
 
-    /// Where the batches of tile `t` begin, if each tile has as many as its pairs need (a few places stay unused).
+    /// First batch of tile `t`, if every tile has as many batches as its pairs need (a few places stay unused).
     pub fn batches(&self, t: usize) -> usize {
         self.first(t) / BATCH + t
     }
 
-    /// Cuts what belongs to rows `first ..` of tiles, placed by `start`, at row `middle`; nothing of nothing.
+    /// Splits `items` of the rows of tiles from `first` on at row `middle`; `start` gives the place of a tile. Empty stays
+    /// empty.
     pub fn cut<'a, T>(
         &self,
         items: &'a mut [T],
         first: usize,
         middle: usize,
-        start: fn(&Bins, usize) -> usize,
+        start: fn(&TileBins, usize) -> usize,
     ) -> (&'a mut [T], &'a mut [T]) {
         let columns = self.tiles.columns.len();
         let length = start(self, middle * columns) - start(self, first * columns);
         items.split_at_mut(length.min(items.len()))
     }
 
-    /// Cuts what belongs to tile `t` off what belongs to the tiles `t ..`.
+    /// Splits the items of tile `t` off those of the tiles from `t` on.
     pub fn cut_tile<'a, T>(
         &self,
         items: &'a mut [T],
         t: usize,
-        start: fn(&Bins, usize) -> usize,
+        start: fn(&TileBins, usize) -> usize,
     ) -> (&'a mut [T], &'a mut [T]) {
         let length = start(self, t + 1) - start(self, t);
         items.split_at_mut(length.min(items.len()))
     }
 
-    /// The list from the entries of a visible Gaussian on.
+    /// The chunk list from the entries of a Gaussian on; empty if it is invisible.
     #[inline(always)]
     fn entries(&self, gaussian: usize) -> &[u32] {
         let Some(owned) = self.owned.get(gaussian) else {
@@ -240,13 +155,13 @@ impl Bins {
             .unwrap_or(&[])
     }
 
-    /// Fetches what `places` will read.
+    /// Prefetches the entries that `places` reads.
     #[inline(always)]
     pub fn prefetch_places(&self, gaussian: usize) {
         prefetch(self.entries(gaussian), 0);
     }
 
-    /// Calls `visit` with each position in `pairs` of a Gaussian; none if it is invisible.
+    /// Calls `visit` with each place in `pairs` of a Gaussian; never if it is invisible.
     #[inline(always)]
     pub fn places(&self, gaussian: usize, mut visit: impl FnMut(usize)) {
         for &entry in self.entries(gaussian) {
@@ -261,12 +176,12 @@ impl Bins {
     }
 
     /// # Errors
-    /// More than `limit` pairs, visible Gaussians included, or more than its share of them in one chunk.
+    /// More than `limit` pairs in all, visible Gaussians included, or more than its share in one chunk.
     pub fn build(
         &mut self,
         projected: &[Projected],
         sorted: &[AtomicU64],
-        rectangle: Tiles,
+        rectangle: TileRect,
         limit: usize,
     ) -> Result<(), RasterError> {
         let tiles = rectangle.len();
@@ -317,7 +232,7 @@ impl Bins {
         Ok(())
     }
 
-    /// Turns the counts into first places and sets `starts` and the size of `pairs`.
+    /// Prefix sum: counts -> first places; sets `starts` and the size of `pairs`.
     fn prefix(&mut self, tiles: usize) {
         self.starts.clear();
         let mut sum = 0;
@@ -331,7 +246,7 @@ impl Bins {
         self.pairs.resize_with(sum as usize, AtomicU32::default);
     }
 
-    /// Writes the pairs; the tiles in the lists become places.
+    /// Writes the pairs, and replaces the tiles in the lists by places.
     fn fill(&mut self, tiles: usize, sorted: &[AtomicU64], share: usize) {
         let pairs = &self.pairs;
         let work = self

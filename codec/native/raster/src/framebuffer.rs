@@ -1,15 +1,14 @@
-//! Between tiles, whose pixels lie block by block, and images, whose pixels lie row by row.
+//! Finished tiles, stored block by block -> rows of an image, as floats or as 8-bit colour.
 
 use std::ops::Range;
 
-use crate::backward::Adjoint;
+use crate::error::{RasterError, check_length};
 use crate::forward::Canvas;
-use crate::project::TILE;
-use crate::rasterizer::Shade;
-use crate::scene::{RasterError, Region, check_length};
-use crate::tile::{Plane, swizzle};
+use crate::projected::TILE;
+use crate::region::Region;
+use crate::scene::Background;
 
-/// What is drawn on: rows of pixels of the region, as floats or, for viewers, as bytes without a float image in between.
+/// The pixels of the rendered region, in rows. Viewers draw straight to bytes, without a float image in between.
 pub enum Surface<'a> {
     /// [H, W, 3] and [H, W]
     Floats {
@@ -79,7 +78,7 @@ impl<'a> Surface<'a> {
         }
     }
 
-    /// Writes as many pixels from `at` on as `columns` says.
+    /// Writes `columns` pixels from index `at` on.
     #[inline(always)]
     fn put(&mut self, at: usize, columns: usize, rgb: &[[f32; 3]; TILE], opacity: &[f32; TILE]) {
         let (rgb, opacity) = (&rgb[..columns], &opacity[..columns]);
@@ -102,16 +101,16 @@ impl<'a> Surface<'a> {
     }
 }
 
-/// 0 to 1 -> 0 to 255, rounded. The sum with 2^23 leaves the integer in the low bits, which WebAssembly engines do faster than
-/// to convert.
+/// 0 to 1 -> 0 to 255, rounded. Adding 2^23 leaves the integer in the low bits, which is faster than a conversion in
+/// WebAssembly engines.
 #[inline(always)]
 fn byte(v: f32) -> u8 {
     (v.clamp(0.0, 1.0) * 255.0 + 8_388_608.0).to_bits() as u8
 }
 
-/// Writes a finished tile to the rows of its band.
-pub fn finish(canvas: &Canvas, shade: Shade, x: usize, width: usize, band: &mut Surface) {
-    let (gain, back) = (shade.gain.unwrap_or([1.0; 3]), shade.background);
+/// Writes a finished tile at column `x` to its rows of pixels.
+pub fn finish(canvas: &Canvas, background: Background, x: usize, width: usize, band: &mut Surface) {
+    let (gain, back) = (background.gain.unwrap_or([1.0; 3]), background.rgb);
     let columns = TILE.min(width - x);
     for y in 0..band.pixels() / width {
         let mut rgb_row = [[0.0; 3]; TILE];
@@ -135,12 +134,12 @@ pub fn finish(canvas: &Canvas, shade: Shade, x: usize, width: usize, band: &mut 
     }
 }
 
-/// Columns without Gaussians: whole stretches of rows, which memory likes better than tile after tile.
-pub fn finish_empty(shade: Shade, columns: Range<usize>, width: usize, band: &mut Surface) {
+/// Fills columns that no Gaussian meets with the background: whole stretches of rows, which is faster than tile after tile.
+pub fn finish_empty(background: Background, columns: Range<usize>, width: usize, band: &mut Surface) {
     if columns.is_empty() {
         return;
     }
-    let colour = shade.background;
+    let colour = background.rgb;
     for y in 0..band.pixels() / width {
         let row = y * width + columns.start..y * width + columns.end;
         match band {
@@ -154,54 +153,5 @@ pub fn finish_empty(shade: Shade, columns: Range<usize>, width: usize, band: &mu
                 p[row].fill([r, g, b, 255]);
             }
         }
-    }
-}
-
-/// A rendered region and the gradient of the loss by it.
-pub struct Pixels<'a> {
-    pub image: &'a [f32],
-    pub alpha: &'a [f32],
-    pub grad_image: &'a [f32],
-    pub grad_alpha: &'a [f32],
-    pub width: usize,
-}
-
-impl Pixels<'_> {
-    /// The tile at (x, y). With image = gain sum(w rgb) + T background and alpha = 1 - T, the remainder of the whole pixel,
-    /// g . sum(w rgb) + T (g . background - g_alpha), is g . image - T g_alpha.
-    #[inline(always)] // into the kernel, whose wide instructions it needs
-    pub fn adjoint(&self, [x, y]: [usize; 2], shade: Shade) -> Adjoint {
-        let mut a = Adjoint {
-            transmittance: Plane::ZERO,
-            remainder: Plane::ZERO,
-            rgb: [Plane::ZERO; 3],
-        };
-        let (rows, gain) = (
-            (self.alpha.len() / self.width - y).min(TILE),
-            shade.gain.unwrap_or([1.0; 3]),
-        );
-        let columns = TILE.min(self.width - x);
-        for j in 0..rows {
-            let at = (y + j) * self.width + x;
-            let image = &self.image[3 * at..3 * (at + columns)];
-            let grad = &self.grad_image[3 * at..3 * (at + columns)];
-            let (alpha, grad_alpha) = (&self.alpha[at..at + columns], &self.grad_alpha[at..at + columns]);
-            let four = grad
-                .chunks(12)
-                .zip(image.chunks(12))
-                .zip(alpha.chunks(4).zip(grad_alpha.chunks(4)));
-            for (column, ((g, c), (t, gt))) in four.enumerate() {
-                let (b, first) = swizzle(4 * column, j);
-                for (i, (g, c)) in g.as_chunks::<3>().0.iter().zip(c.as_chunks::<3>().0).enumerate() {
-                    let k = (first + i) & 15;
-                    a.transmittance.0[b][k] = 1.0;
-                    for ch in 0..3 {
-                        a.rgb[ch].0[b][k] = g[ch] * gain[ch];
-                    }
-                    a.remainder.0[b][k] = g[0] * c[0] + g[1] * c[1] + g[2] * c[2] - (1.0 - t[i]) * gt[i];
-                }
-            }
-        }
-        a
     }
 }

@@ -1,12 +1,13 @@
-//! What is inside ftyp, moov, moof and sidx (spec 2.1 to 2.5): the parts that a reader needs, other boxes are skipped.
+//! Parsers of the header boxes ftyp, moov, moof, sidx and ssix (spec 2.1 to 2.6). Only the fields that a reader needs are
+//! parsed; unknown boxes are skipped.
 
 use super::config::Config;
-use super::demux::{Entry, name};
+use super::entry::{Entry, name};
 use super::write::BRAND;
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader};
 
-/// What moov says about the gsv track.
+/// The gsv track, as moov describes it.
 pub struct Track {
     id: u32,
     pub config: Config,
@@ -21,7 +22,7 @@ struct Defaults {
     flags: u32,
 }
 
-/// A box within a header box; `offset` is that of its body.
+/// A box inside a header box; `offset`: of its body.
 struct Inner<'a> {
     kind: [u8; 4],
     offset: usize,
@@ -47,7 +48,7 @@ fn boxes(data: &[u8]) -> Result<Vec<Inner<'_>>> {
     Ok(out)
 }
 
-/// The body of the box at `path` and its offset, the first of its kind on each step.
+/// The body of the box at `path` and its offset; at each step the first box of that type.
 fn find<'a>(data: &'a [u8], path: &[&[u8; 4]]) -> Result<(&'a [u8], usize)> {
     let (mut data, mut base) = (data, 0);
     for kind in path {
@@ -64,8 +65,8 @@ fn find<'a>(data: &'a [u8], path: &[&[u8; 4]]) -> Result<(&'a [u8], usize)> {
     Ok((data, base))
 }
 
-/// Checks the body of ftyp.
-pub fn brands(body: &[u8]) -> Result<()> {
+/// Checks the brands in the body of ftyp.
+pub fn ftyp(body: &[u8]) -> Result<()> {
     let brands = body.as_chunks::<4>().0;
     let known = brands.iter().enumerate().any(|(i, b)| i != 1 && b == BRAND); // the second word is minor_version
     if known {
@@ -79,8 +80,8 @@ pub fn brands(body: &[u8]) -> Result<()> {
     }
 }
 
-/// What the body of moov says about the first track with handler volv.
-pub fn movie(body: &[u8]) -> Result<Track> {
+/// Parses the body of moov: the first track with handler volv.
+pub fn moov(body: &[u8]) -> Result<Track> {
     for b in boxes(body)?.into_iter().filter(|b| &b.kind == b"trak") {
         let (hdlr, _) = find(b.body, &[b"mdia", b"hdlr"]).map_err(|e| e.at(b.offset, ""))?;
         if hdlr.get(8..12) == Some(b"volv") {
@@ -117,7 +118,7 @@ fn track(body: &[u8]) -> Result<(u32, Config)> {
     Ok((id, config))
 }
 
-/// The u32 behind the two time stamps that open tkhd and mdhd.
+/// The u32 behind the two time stamps at the start of tkhd and mdhd.
 fn after_times(body: &[u8], path: &[&[u8; 4]]) -> Result<u32> {
     let (body, base) = find(body, path)?;
     let mut r = Reader::new(body);
@@ -132,7 +133,7 @@ fn after_times(body: &[u8], path: &[&[u8; 4]]) -> Result<u32> {
     Ok(value)
 }
 
-/// trex of the track.
+/// The sample defaults in trex.
 fn extends(moov: &[u8], id: u32) -> Result<Defaults> {
     let Ok((mvex, base)) = find(moov, &[b"mvex"]) else {
         return Ok(Defaults::default());
@@ -158,11 +159,11 @@ fn extends(moov: &[u8], id: u32) -> Result<Defaults> {
     Ok(Defaults::default())
 }
 
-/// A reference of sidx: bytes, units of the timescale, and whether it starts with a sync sample.
-pub type Reference = (u32, u32, bool);
+/// An entry of sidx: bytes, duration in units of the timescale, and whether it starts with a sync sample.
+pub type SidxReference = (u32, u32, bool);
 
-/// Spec 2.5: first_offset and the references of sidx; None if it is malformed.
-pub fn index(body: &[u8]) -> Option<(u64, Vec<Reference>)> {
+/// Spec 2.5: first_offset and the entries of sidx; None if it is malformed.
+pub fn sidx(body: &[u8]) -> Option<(u64, Vec<SidxReference>)> {
     let head = if body.first()? == &0 { 20 } else { 28 };
     let first_offset = match head {
         20 => u64::from(u32::from_be_bytes(body.get(16..20)?.try_into().ok()?)),
@@ -178,8 +179,8 @@ pub fn index(body: &[u8]) -> Option<(u64, Vec<Reference>)> {
     (references.len() == usize::from(count)).then(|| (first_offset, references.iter().map(words).collect()))
 }
 
-/// Spec 2.6: for each reference of sidx the bytes of the fragment that end with each layer; None if it is malformed.
-pub fn layer_index(body: &[u8]) -> Option<Vec<Vec<u64>>> {
+/// Spec 2.6: for each entry of sidx the bytes of the fragment up to the end of each layer; None if it is malformed.
+pub fn ssix(body: &[u8]) -> Option<Vec<Vec<u64>>> {
     let (words, rest) = body.get(4..)?.as_chunks::<4>();
     let mut words = words.iter().map(|w| u32::from_be_bytes(*w));
     let mut all = Vec::new();
@@ -202,21 +203,21 @@ pub fn layer_index(body: &[u8]) -> Option<Vec<Vec<u64>>> {
     (rest.is_empty() && words.next().is_none()).then_some(all)
 }
 
-/// Spec 2.4: the group that a moof announces, None if it has none of the track. `moof`: where the moof box starts.
-pub fn fragment(body: &[u8], track: &Track, moof: u64) -> Result<Option<Entry>> {
+/// Spec 2.4: the group of a moof; None if it has none of the track. `start`: offset of the moof box.
+pub fn moof(body: &[u8], track: &Track, start: u64) -> Result<Option<Entry>> {
     for b in boxes(body)?.into_iter().filter(|b| &b.kind == b"traf") {
-        if let Some(group) = traf(b.body, track, moof).map_err(|e| e.at(b.offset, "traf box"))? {
+        if let Some(group) = traf(b.body, track, start).map_err(|e| e.at(b.offset, "traf box"))? {
             return Ok(Some(group));
         }
     }
     Ok(None)
 }
 
-/// The group of a traf, None if it is of another track.
-fn traf(body: &[u8], track: &Track, moof: u64) -> Result<Option<Entry>> {
+/// The group of a traf; None if it belongs to another track.
+fn traf(body: &[u8], track: &Track, start: u64) -> Result<Option<Entry>> {
     let (tfhd, base) = find(body, &[b"tfhd"])?;
     let mut r = Reader::new(tfhd);
-    let Some((data, defaults)) = header(&mut r, track, moof).map_err(|e| e.at(base, ""))? else {
+    let Some((data, defaults)) = header(&mut r, track, start).map_err(|e| e.at(base, ""))? else {
         return Ok(None);
     };
     let (tfdt, base) = find(body, &[b"tfdt"])?;
@@ -241,9 +242,9 @@ fn traf(body: &[u8], track: &Track, moof: u64) -> Result<Option<Entry>> {
     }))
 }
 
-/// tfhd: base of data offsets and sample defaults, None for another track.
-fn header(r: &mut Reader, track: &Track, moof: u64) -> Result<Option<(u64, Defaults)>> {
-    let (mut flags, mut id, mut base, mut d) = (0, 0, moof, track.defaults);
+/// tfhd: base of the data offsets and sample defaults; None for another track.
+fn header(r: &mut Reader, track: &Track, start: u64) -> Result<Option<(u64, Defaults)>> {
+    let (mut flags, mut id, mut base, mut d) = (0, 0, start, track.defaults);
     r.u32(&mut flags)?;
     r.u32(&mut id)?;
     if flags & 0x01 != 0 {
@@ -271,7 +272,7 @@ fn decode_time(r: &mut Reader) -> Result<u64> {
     Ok(u64::from(short))
 }
 
-/// trun: data offset and the one sample.
+/// trun: data offset and the only sample.
 fn run(r: &mut Reader, mut d: Defaults) -> Result<(i32, Defaults)> {
     let (mut flags, mut count, mut offset) = (0, 0, 0);
     r.u32(&mut flags)?;

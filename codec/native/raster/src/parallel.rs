@@ -1,10 +1,11 @@
-//! Parallel work on pieces that own what they write: halves the range and the buffers that go with it until a piece has
-//! at most `grain` items. Pieces depend on the range only, never on the threads, and nothing is allocated.
+//! Parallel loop over pieces that own the memory they write. The range, and the buffers that belong to it, are halved until
+//! a piece has at most `grain` items. Pieces depend on the range only, never on the threads, and nothing is allocated.
 
 use std::ops::Range;
 
-/// `cut(work, range, middle)` splits the buffers of `range` at item `middle`.
-pub fn divide<W: Send>(
+/// Calls `run(piece, buffers)` for pieces of `range` of at most `grain` items. `cut(work, range, middle)` splits the buffers
+/// of `range` at item `middle`.
+pub fn parallel_for<W: Send>(
     range: Range<usize>,
     grain: usize,
     work: W,
@@ -21,8 +22,8 @@ pub fn divide<W: Send>(
     let (left, right) = cut(work, &range, middle);
     let (first, last) = (range.start..middle, middle..range.end);
     rayon::join(
-        || divide(first, grain, left, cut, run),
-        || divide(last, grain, right, cut, run),
+        || parallel_for(first, grain, left, cut, run),
+        || parallel_for(last, grain, right, cut, run),
     );
 }
 
@@ -34,7 +35,7 @@ mod tests {
     fn pieces_are_aligned_and_cover_the_range() {
         for n in [0, 1, 15, 16, 17, 1000] {
             let mut seen = vec![0usize; n];
-            divide(
+            parallel_for(
                 0..n,
                 16,
                 &mut seen[..],

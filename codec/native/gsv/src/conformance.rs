@@ -1,37 +1,38 @@
-//! What a group has against what its header announces (spec 3.1): every unit is there, and no other, or it is damaged.
+//! Conformance of a group to its header (spec 3.1): every announced unit is present, no other unit is, or it is reported as
+//! damaged.
 
 use crate::attributes::Attribute;
 use crate::error::{Error, Result};
 use crate::header::Header;
 use crate::unit::{Unit, UnitType};
 
-/// A unit that is not decoded.
+/// A unit that is damaged or missing, and so is not decoded.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Damage {
-    /// Index of the unit; None if it is missing where others are damaged.
+    /// Index of the unit; None: missing, in a group where other units are damaged.
     pub unit: Option<usize>,
-    /// What the unit claims to be, or what is missing; None: a type that this version skips.
+    /// Its type, as its bytes claim or as the header announces; None: a type that this version skips.
     pub kind: Option<UnitType>,
     pub layer: u8,
     pub attribute: Option<Attribute>,
     pub message: String,
 }
 
-/// What there is one of in a group.
-pub type Key = (UnitType, u8, Option<Attribute>);
+/// What identifies a unit in a group: type, layer, attribute.
+pub type UnitKey = (UnitType, u8, Option<Attribute>);
 
-/// The sound unit of a type, layer and attribute.
-pub fn find(units: &[Unit], (kind, layer, attribute): Key) -> Option<usize> {
+/// Index of the undamaged unit of a type, layer and attribute.
+pub fn find(units: &[Unit], (kind, layer, attribute): UnitKey) -> Option<usize> {
     let sought = |u: &Unit| (u.kind, u.layer, u.attribute) == (Some(kind), layer, attribute) && u.damage.is_none();
     units.iter().position(sought)
 }
 
-/// Compares units and header; what is damaged or missing. `reference`: the header of the group that a predicted one refers
-/// to; `layers`: how many of the layers are to be decoded.
+/// Compares the units with the header; returns the units that are damaged or missing. `reference`: the header of the group
+/// that a predicted one refers to; `layers`: number of layers to decode.
 ///
 /// # Errors
-/// A sound unit that the header does not announce, or without its dependencies; one that is missing although nothing is
-/// damaged; no sound positions of the first layer of an independent group.
+/// An undamaged unit that the header does not announce, or that lacks a dependency; a missing unit, although nothing is
+/// damaged; no undamaged positions of the first layer of an independent group.
 pub fn check(units: &[Unit], header: &Header, reference: Option<&Header>, layers: usize) -> Result<Vec<Damage>> {
     let mut damage: Vec<Damage> = units.iter().enumerate().filter_map(claimed).collect();
     let (mut announced, optional) = announced(header, reference, layers);
@@ -83,7 +84,7 @@ pub fn check(units: &[Unit], header: &Header, reference: Option<&Header>, layers
     Ok(damage)
 }
 
-fn missing((kind, layer, attribute): Key) -> String {
+fn missing((kind, layer, attribute): UnitKey) -> String {
     let attribute = attribute.map_or("", Attribute::name);
     let of = if layer > 0 {
         format!(" of layer {layer}")
@@ -103,8 +104,8 @@ fn claimed((i, u): (usize, &Unit)) -> Option<Damage> {
     })
 }
 
-/// Units that must be there, and those that may.
-fn announced(h: &Header, reference: Option<&Header>, layers: usize) -> (Vec<Key>, Vec<Key>) {
+/// Units that are required, and units that are optional.
+fn announced(h: &Header, reference: Option<&Header>, layers: usize) -> (Vec<UnitKey>, Vec<UnitKey>) {
     let mut required = vec![(UnitType::GroupHeader, 0, None)];
     let mut optional = Vec::new();
     if h.nodes.count > 0 {

@@ -1,0 +1,57 @@
+//! The errors of this crate: arguments that do not fit together, or more work than the limits allow.
+
+use std::fmt;
+
+use crate::region::Region;
+
+/// Why a call was refused; nothing was drawn or written then.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum RasterError {
+    Shape {
+        name: &'static str,
+        expected: usize,
+        got: usize,
+    },
+    Region {
+        region: Region,
+        width: usize,
+        height: usize,
+    },
+    TooMany {
+        what: &'static str,
+        limit: usize,
+    },
+    NothingRendered,
+}
+
+impl fmt::Display for RasterError {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self {
+            RasterError::Shape { name, expected, got } => write!(f, "{name} has {got} values, expected {expected}"),
+            RasterError::Region {
+                region: r,
+                width,
+                height,
+            } => write!(
+                f,
+                "region {}x{} at ({}, {}) is empty or not inside of the {width}x{height} image",
+                r.width, r.height, r.x, r.y
+            ),
+            RasterError::TooMany { what, limit } => write!(f, "more than {limit} {what}"),
+            RasterError::NothingRendered => {
+                write!(f, "backward without a forward pass of these Gaussians and this view")
+            }
+        }
+    }
+}
+
+impl std::error::Error for RasterError {}
+
+/// `Shape` unless the slice `name` has `expected` values.
+pub(crate) fn check_length(name: &'static str, got: usize, expected: usize) -> Result<(), RasterError> {
+    if got == expected {
+        Ok(())
+    } else {
+        Err(RasterError::Shape { name, expected, got })
+    }
+}

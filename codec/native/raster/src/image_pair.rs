@@ -1,0 +1,20 @@
+//! The two images that a loss compares.
+
+/// Two images [H, W, 3] and their weights.
+#[derive(Clone, Copy)]
+pub struct Pair<'a> {
+    pub image: &'a [f32],
+    pub target: &'a [f32],
+    pub width: usize,
+    /// [H, W]
+    pub weight: Option<&'a [f32]>,
+}
+
+impl Pair<'_> {
+    pub fn row_values(&self) -> usize {
+        3 * self.width
+    }
+    pub fn rows(&self) -> usize {
+        self.image.len() / self.row_values().max(1)
+    }
+}

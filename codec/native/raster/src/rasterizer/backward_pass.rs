@@ -1,0 +1,78 @@
+//! The backward pass of the rasterizer: gradient of the image -> sums over the pixels of each pair -> gradients of the Gaussians.
+
+use super::{Rasterizer, SHARE};
+use crate::adjoint::Pixels;
+use crate::backward::Sums;
+use crate::clock::Clock;
+use crate::error::{RasterError, check_length};
+use crate::ewa::Lens;
+use crate::parallel::parallel_for;
+use crate::project_backward::project_backward;
+use crate::scene::{Gradients, Splats};
+use crate::tile_passes::backward_tiles;
+
+impl Rasterizer {
+    /// Gradients of the last image rendered with `training`. `grad_image` [H, W, 3] and `grad_alpha` [H, W] of the region.
+    ///
+    /// # Errors
+    /// Wrong lengths; no forward pass with `training` before.
+    pub fn backward(
+        &mut self,
+        splats: &Splats,
+        grad_image: &[f32],
+        grad_alpha: &[f32],
+        out: &mut Gradients,
+    ) -> Result<(), RasterError> {
+        splats.check()?;
+        self.run(|s| s.backward_here(splats, grad_image, grad_alpha, out))
+    }
+
+    pub(crate) fn backward_here(
+        &mut self,
+        splats: &Splats,
+        grad_image: &[f32],
+        grad_alpha: &[f32],
+        out: &mut Gradients,
+    ) -> Result<(), RasterError> {
+        out.check(splats)?;
+        let Some((lens, region, background)) = self.drawn.take() else {
+            return Err(RasterError::NothingRendered);
+        };
+        check_length(
+            "gradient of the Gaussians rendered last",
+            splats.len(),
+            self.projected.len(),
+        )?;
+        check_length("gradient of the image", grad_image.len(), 3 * region.pixels())?;
+        check_length("gradient of alpha", grad_alpha.len(), region.pixels())?;
+        let start = Clock::start();
+        self.sums.resize(self.bins.pairs.len(), Sums::ZERO);
+        let pixels = Pixels {
+            image: &self.image,
+            alpha: &self.alpha,
+            grad_image,
+            grad_alpha,
+            width: region.width,
+        };
+        let (level, projected, seen) = (self.level, &self.projected, &self.seen);
+        backward_tiles(level, projected, &self.bins, &pixels, background, seen, &mut self.sums);
+        self.timings.backward_tiles = start.ms();
+        let start = Clock::start();
+        self.backward_gaussians(splats, &lens, out);
+        self.timings.backward_project = start.ms();
+        self.drawn = Some((lens, region, background));
+        Ok(())
+    }
+
+    fn backward_gaussians(&self, splats: &Splats, lens: &Lens, out: &mut Gradients) {
+        let n = splats.len();
+        let out = out.reborrow();
+        parallel_for(
+            0..n,
+            SHARE,
+            out,
+            &|g, range, middle| g.split_at(middle - range.start, splats.sh_k),
+            &|range, mut out| project_backward(self.level, splats, lens, &self.bins, &self.sums, range, &mut out),
+        );
+    }
+}
