@@ -13,15 +13,17 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch, before it is imported: a
 def gsv(tmp_path_factory) -> Path:
     """A stream of 5 groups of 6 frames."""
     from playing import FPS, LENGTH, cameras, sequence
+    from synthetic import encode_sequence
 
-    from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
+    from gscodec.encode.encode import stream_config
+    from gscodec.encode.settings import EncodeSettings
 
     path = tmp_path_factory.mktemp("player") / "a.gsv"
     s = sequence(sh_count=3)
     config = stream_config(
         fps=FPS, sh_degree=1, gaussians=400, frames=LENGTH, cameras=cameras(), background=(0.2, 0.3, 0.5)
     )
-    encode_groups(lambda done, frames: iter(s.groups[done:]), path, config, EncodeSettings(quality=80), fingerprint={})
+    encode_sequence(s, path, config, EncodeSettings(quality=80))
     return path
 
 

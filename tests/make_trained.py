@@ -8,12 +8,13 @@ import sys
 import tempfile
 from pathlib import Path
 
-from synthetic import from_npz, to_npz
+from synthetic import encode_sequence, from_npz, to_npz
 from test_cli import run
 
 from gscodec.capture import open_capture
 from gscodec.decode import open_stream
-from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
+from gscodec.encode.encode import stream_config
+from gscodec.encode.settings import EncodeSettings
 from gscodec.metrics.evaluate import evaluate_splats
 from gscodec.train.settings import train_settings
 from gscodec.train.train import train_groups
@@ -27,9 +28,7 @@ def codec(quality: int, folder: Path) -> dict:
     sequence = from_npz(DATA / "trained.npz")
     config = stream_config(fps=30, sh_degree=0, gaussians=4000, frames=4)
     out = folder / "a.gsv"
-    report = encode_groups(
-        lambda done, frames: iter(sequence.groups), out, config, EncodeSettings(quality=quality), fingerprint={}
-    )
+    report = encode_sequence(sequence, out, config, EncodeSettings(quality=quality))
     m = evaluate_splats(open_stream(out).frame, sequence, frames=[0, 3], size=report.bytes)
     return {k: round(m[k], 3) for k in ("kb_per_frame", "codec_psnr", "codec_psnr_fg")}
 

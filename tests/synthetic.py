@@ -2,8 +2,14 @@
 
 import numpy as np
 
+from gscodec import _native
+from gscodec.encode.coder import GroupCoder
+from gscodec.encode.encode import StreamOutput, encode_groups
+from gscodec.encode.settings import EncodeSettings
+from gscodec.fit import fit_groups
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.model.gaussians import Gaussians
+from gscodec.model.parametric_group import ParametricGroup
 from gscodec.model.rotations import quat_multiply, quat_to_matrix, rotvec_to_quat
 
 
@@ -64,9 +70,9 @@ def covariances(g: Gaussians) -> np.ndarray:
     return M @ M.transpose(0, 2, 1)
 
 
-def to_npz(path, group: DenseGroup) -> None:
+def to_npz(path, group: DenseGroup | ParametricGroup) -> None:
     """A group in half precision; what holds over the group is stored once."""
-    frames = [group.frames[t] for t in range(len(group))]
+    frames = [group.frame(t) for t in range(len(group))]
     np.savez_compressed(
         path,
         means=np.stack([f.means for f in frames]),
@@ -109,3 +115,22 @@ def assert_close(a, b, means=1e-6, log_scales=1e-6, angle=1e-5, opacity=1e-6, sh
     np.testing.assert_allclose(1 / (1 + np.exp(-b.logit_opacities)), 1 / (1 + np.exp(-a.logit_opacities)), atol=opacity)
     np.testing.assert_allclose(b.sh0, a.sh0, atol=sh0)
     np.testing.assert_allclose(b.shN, a.shN, atol=shN)
+
+
+def encode_sequence(sequence, path, config, settings=None, **options):
+    """A dense sequence -> a .gsv file; returns the report. `options` go to StreamOutput (fingerprint)."""
+    settings = settings or EncodeSettings()
+    groups = sequence.groups
+
+    def fitted(done, _):
+        return fit_groups(groups, start=done, random_access=settings.random_access, quality=settings.quality)
+
+    return encode_groups(fitted, StreamOutput(path, config, **options), settings)
+
+
+def coded(group: DenseGroup | ParametricGroup, quality: float, *, cameras=(), **settings):
+    """One independent group on its own, unrefined unless `settings` say so -> CodedGroup and its integers."""
+    coder = GroupCoder(EncodeSettings(**{"refine": 0, "random_access": 0, **settings}), cameras=lambda _: cameras)
+    fitted = next(fit_groups([group], quality=quality))
+    result, _ = coder.code(None, fitted, coder.measure(fitted, 0), quality, 0)
+    return result, _native.DecodedGroup(result.payload, len(_native.levels())).quantized()

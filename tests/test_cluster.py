@@ -7,7 +7,8 @@ import pytest
 from interrupting import write_capture
 
 from gscodec.capture import open_capture
-from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
+from gscodec.encode.encode import StreamOutput, encode_groups, stream_config
+from gscodec.encode.settings import EncodeSettings
 from gscodec.errors import CaptureError, UsageError
 from gscodec.train.ray_jobs import cluster_groups
 from gscodec.train.settings import TrainSettings
@@ -27,7 +28,7 @@ def folder(tmp_path_factory):
 
 def encoded(out, groups) -> bytes:
     config = stream_config(fps=25, sh_degree=0, gaussians=200, frames=2)
-    encode_groups(groups, out, config, EncodeSettings(random_access=ACCESS), fingerprint={})
+    encode_groups(groups, StreamOutput(out, config), EncodeSettings(random_access=ACCESS))
     return out.read_bytes()
 
 

@@ -6,35 +6,32 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import blob, covariances, turning
+from synthetic import assert_close, blob, coded, covariances, encode_sequence, turning
 
 from gscodec import _native
+from gscodec.atomic_write import read_arrays, write_arrays
 from gscodec.bitstream.color import correlate, decorrelate
 from gscodec.bitstream.quantization import steps_for, subject_radius
 from gscodec.decode import Stream, open_stream
-from gscodec.encode.channels import shifts_of
-from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
-from gscodec.encode.intra_group import code_group, group_integers
-from gscodec.encode.node_fit import carry, choose_nodes
-from gscodec.encode.rotation_residuals import LEVER_UNIT, SHARE, code_turns, fit_levers, in_form, widths
-from gscodec.encode.stack import stack_group
+from gscodec.encode.axis_order import sorted_axes
+from gscodec.encode.coder import CoderState, GroupCoder
+from gscodec.encode.encode import StreamOutput, encode_groups, stream_config
+from gscodec.encode.rdo import coded_layers
+from gscodec.encode.rotation_residuals import EXPONENT_UNIT, fit_scale_exponents, quantize_rotations, step_factors
+from gscodec.encode.settings import EncodeSettings, RdoSettings, ScaleExponentSettings
 from gscodec.encode.writer import StreamWriter
 from gscodec.errors import BitstreamError, CaptureError, UsageError
+from gscodec.fit import fit_groups
 from gscodec.model.gaussian_sequence import DenseGroup
 from gscodec.model.gaussians import Gaussians
+from gscodec.model.parametric_group import NodeMotion, ParametricGroup
 from gscodec.model.rotations import quat_conjugate, quat_multiply
 from gscodec.model.temporal_transform import dct_basis
 
 
 def write(sequence, out, quality=50.0, **settings):
     config = stream_config(fps=sequence.fps, sh_degree=sequence.frame(0).sh_degree, gaussians=400, frames=8)
-    return encode_groups(
-        lambda done, frames: iter(sequence.groups[done:]),
-        out,
-        config,
-        EncodeSettings(quality=quality, **settings),
-        fingerprint={"input": "test"},
-    )
+    return encode_sequence(sequence, out, config, EncodeSettings(quality=quality, **settings), fingerprint={"v": 1})
 
 
 def nearest(a: Gaussians, b: Gaussians) -> np.ndarray:
@@ -44,39 +41,47 @@ def nearest(a: Gaussians, b: Gaussians) -> np.ndarray:
 
 def test_canonical_form_keeps_the_covariance_and_sorts_the_axes():
     g = blob(500)
-    turn, order = canonical_axes(g.log_scales)
-    q = quat_multiply(g.quats.astype(float), turn)
+    order, rotation = sorted_axes(g.log_scales)
+    q = quat_multiply(g.quats.astype(float), rotation)
     scales = np.take_along_axis(g.log_scales, order, 1)
     assert (np.diff(scales, axis=1) <= 0).all()
     same = Gaussians(g.means, q.astype(np.float32), scales, g.logit_opacities, g.sh0, g.shN)
     np.testing.assert_allclose(covariances(same), covariances(g), atol=1e-7)
 
 
-def test_turns_come_back_and_errors_do_not_add_up():
-    group = code_group(DenseGroup([blob(3000)]), 60, keep_all=True, layers=2)
-    step = np.array([2e-3, 1e-3, 3e-3])
-    channel = {"steps": step, "levers": np.zeros((3, 3))}
-    ends = np.cumsum([0, *group.integers["layers"]])
-    layers = [(slice(a, b), None) for a, b in itertools.pairwise(ends)]
-    positions, still = group.integers["positions"], np.zeros((3000, 3))
-    turns, forms = code_turns(group.rotations, still, positions, channel, layers, np.zeros(3000, int))
-    group.integers["channels"]["quats"] |= {"values": turns, "steps": step.tolist(), "levers": still[:3].astype(int)}
-    group.integers["shifts"] = None
-    decoded = _native.DecodedGroup(_native.encode_group(group.integers)[0], 1).frame(0)["quats"]
-    off = quat_multiply(quat_conjugate(decoded.astype(float)), in_form(group.rotations, forms).astype(float))
-    assert (np.abs(off[:, 1:]) < step.sum()).all(), "of three turns, none off by more than half a step"
-    assert np.abs(turns * step[:, None]).max() < 0.95, "the form that turns least"
+def test_rotations_come_back_and_errors_do_not_add_up():
+    g, step = blob(3000), np.array([2e-3, 1e-3, 3e-3], np.float32)
+    grid = np.rint(1000 * (g.means + 2)).astype(np.uint32)
+    order = _native.morton_order(grid)
+    quats, grid = g.quats[order], grid[order]
+    layers = coded_layers(grid, [1000, 2000], [1000, 2000])
+    plain = np.zeros((3000, 3)), 1.0, RdoSettings(floor=0.0)  # bits cost nothing
+    integers, forms = quantize_rotations(
+        quats, np.tile(step, (3000, 1)), grid, layers, np.full((3000, 3), 1e9), *plain[1:]
+    )
+    _, q = coded(DenseGroup([g]), 60, keep_all=True, layers=1)
+    channels = {n: replace(c, values=np.zeros_like(c.values)) for n, c in q.channels.items()}
+    channels["quats"] = replace(channels["quats"], values=np.ascontiguousarray(integers.T), steps=step)
+    still = {"positions": grid, "layers": (1000, 2000), "shifts": None, "corrections": None, "grid_bits": 13}
+    q = replace(q, channels=channels, scale_exponents=np.zeros((3, 3), np.int32), **still)
+    decoded = _native.DecodedGroup(_native.encode_group(q)[0], 1).frame(0)["quats"]
+    inverse = quat_conjugate(np.eye(4))[forms]
+    off = quat_multiply(quat_conjugate(decoded.astype(float)), quat_multiply(quats.astype(float), inverse))
+    assert (np.abs(off[:, 1:]) < step.sum()).all(), "of three rotations, none off by more than half a step"
+    assert np.abs(integers * step).max() < 0.95, "the form that rotates least"
 
 
-def test_levers_follow_the_sizes():
+def test_scale_exponents_follow_the_sizes():
+    settings = ScaleExponentSettings()
     log_scales = np.random.default_rng(0).normal(-4, 0.3, (5000, 3))
     weights = np.exp(2 * log_scales[:, [1, 0, 0]])
     wanted = np.zeros((3, 3))
-    wanted[[0, 1, 2], [1, 0, 0]] = LEVER_UNIT * SHARE * 2 / np.log(2)
-    np.testing.assert_allclose(fit_levers(log_scales, weights), wanted, atol=0.15 * wanted.max())
-    equal = weights * widths(log_scales, fit_levers(log_scales, weights)) ** 2
+    wanted[[0, 1, 2], [1, 0, 0]] = EXPONENT_UNIT * settings.share * 2 / np.log(2)
+    exponents = fit_scale_exponents(log_scales, weights, settings)
+    np.testing.assert_allclose(exponents, wanted, atol=0.15 * wanted.max())
+    equal = weights * step_factors(log_scales, exponents) ** 2
     assert np.log(equal).std() < 0.2 * np.log(weights).std()
-    assert not fit_levers(log_scales[:50], weights[:50]).any(), "too few to tell"
+    assert not fit_scale_exponents(log_scales[:50], weights[:50], settings).any(), "too few to tell"
 
 
 def test_dct_is_orthonormal_for_every_length():
@@ -90,20 +95,29 @@ def test_colour_transform_inverts():
 
 
 def test_nodes_carry_a_rigid_motion():
-    sequence = turning(400, frames=8)
-    means = stack_group(sequence.groups[0]).means.astype(float)
-    steps = steps_for(60, 1.0)
-    positions = np.rint((means[4] + 3) / steps.means).astype(np.uint32)
-    order = _native.morton_order(positions)
-    positions, means = positions[order], means[:, order]
-    to_world = lambda p: p * steps.means - 3.0  # noqa: E731
-    x = to_world(positions)
-    nodes = choose_nodes(positions, x, means, steps.means, steps.node_translation, to_world)
-    assert len(nodes.positions) == 1, "a rigid body needs one node"
-    motion = carry(nodes, positions, x, 8)
-    moved = np.abs(means - means[4]).max()
-    left = np.abs(means - motion.carried).max()
-    assert left < 3 * steps.means < 0.1 * moved
+    group = turning(400, frames=8).groups[0]
+    fitted = next(fit_groups([group], quality=60))
+    assert len(fitted.nodes.positions) == 1, "a rigid body needs one node"
+    means = np.stack([g.means for g in group.frames])
+    left, moved = np.abs(means - fitted.carried()[0]).max(), np.abs(means - means[4]).max()
+    assert left < 3 * steps_for(60, 1.0).means < 0.1 * moved
+
+
+def test_a_fit_loses_nothing():
+    for sequence in (turning(100, frames=5, sh_count=3), turning(100, frames=4, lifetimes=True)):
+        fitted = next(fit_groups(sequence.groups))
+        for t in range(len(fitted)):
+            assert_close(
+                sequence.groups[0].visible(t), fitted.visible(t), means=1e-5, log_scales=1e-5, sh0=1e-5, shN=1e-5
+            )
+
+
+def test_a_fitted_group_rests_where_the_group_before_does():
+    first, second = fit_groups(changing(), random_access=60)
+    known = second.parents >= 0
+    np.testing.assert_array_equal(second.canonical.means[known], first.canonical.means[second.parents[known]])
+    alone = list(fit_groups(changing(), random_access=60, start=1))
+    np.testing.assert_array_equal(alone[0].canonical.means, second.canonical.means)
 
 
 @pytest.mark.parametrize("sh_count", [0, 3, 8, 15])
@@ -157,8 +171,8 @@ def test_what_nobody_sees_is_dropped_unless_all_is_to_be_kept(tmp_path):
     faint[:30] = -9
     g = Gaussians(g.means, g.quats, g.log_scales, faint, g.sh0, g.shN)
     group = DenseGroup([g])
-    assert len(group_integers(group, 50)["positions"]) <= 70
-    assert len(group_integers(group, 50, keep_all=True)["positions"]) == 100
+    assert coded(group, 50)[0].gaussians <= 70
+    assert coded(group, 50, keep_all=True)[0].gaussians == 100
 
 
 def test_lifetimes_survive(tmp_path):
@@ -181,10 +195,13 @@ def test_a_trainers_nodes_carry_newcomers_from_where_these_rest():
     moves[:, 12:] = np.where(np.arange(frames)[:, None, None] < 3, moves[3:4, 12:], moves[:, 12:])  # wait at birth
     turn[:3, 12:] = turn[3, 12:]
     lifetimes = np.stack([np.where(young, 3, 0), np.full(n, frames)], 1).astype(np.int32)
-    nodes = Nodes(*(a.astype(np.float32) for a in (rest[seeds], turn, moves, rest)))
-    with_nodes = group_integers(DenseGroup(group.frames, lifetimes, nodes), 50, keep_all=True)
-    assert (with_nodes["positions"][:, 0].max() * with_nodes["grid_step"]) > 4, "at their place of rest"
-    left = {n: t["coefficients"] for n, t in with_nodes["trajectories"].items()}
+    own = np.where(young, 12, 0)[:, None] + np.arange(4)
+    weights = np.full((n, 4), 0.25, np.float32)
+    nodes = NodeMotion(*(a.astype(np.float32) for a in (rest[seeds], turn, moves)), own.astype(np.int32), weights)
+    trained = ParametricGroup(frames, replace(group.frames[0], means=rest), nodes, {}, lifetimes)
+    _, q = coded(trained, 50, keep_all=True)
+    assert q.positions[:, 0].max() * q.grid_step > 4, "at their place of rest"
+    left = {n: t.coefficients for n, t in q.trajectories.items()}
     assert all(len(c) == 1 for c in left.values()), "only what rounding has left of the canonical, nothing over time"
     assert (left.get("means", np.zeros(1)) != 0).mean() < 0.03
 
@@ -252,14 +269,15 @@ def test_layers_have_the_steps_of_their_sensitivity():
     g = blob(3000)
     faint = replace(g, logit_opacities=(g.logit_opacities - 4 * (np.arange(3000) % 2)).astype(np.float32))
     group = DenseGroup([faint])
-    integers = group_integers(group, 80, keep_all=True, layers=3)
-    shifts, layer = shifts_of(integers), np.repeat(np.arange(3), integers["layers"])
+    _, q = coded(group, 80, keep_all=True, layers=3)
+    shifts = dict(zip(("means", *q.channels), q.shifts.T.astype(int), strict=True))
+    layer = np.repeat(np.arange(3), q.layers)
     assert all(s.min() == 0 for s in shifts.values())
     assert any(s[2] > s[0] for s in shifts.values())
-    for name, c in integers["channels"].items():
-        assert (c["values"] % 2 ** shifts[name][layer] == 0).all()
-    assert (integers["positions"] % 2 ** shifts["means"][layer, None] == 0).all()
-    sizes = [len(_native.encode_group(group_integers(group, 80, keep_all=True, layers=n))[0]) for n in (1, 3)]
+    for name, c in q.channels.items():
+        assert (c.values % 2 ** shifts[name][layer] == 0).all()
+    assert (q.positions % 2 ** shifts["means"][layer, None] == 0).all()
+    sizes = [len(coded(group, 80, keep_all=True, layers=n)[0].payload) for n in (1, 3)]
     assert sizes[1] < sizes[0]
 
 
@@ -292,7 +310,7 @@ def test_parents_that_do_not_fit_are_refused(tmp_path, parents):
 
 def test_ctrl_c_leaves_a_playable_file_and_a_second_run_goes_on(tmp_path):
     sequence = turning(60, frames=3)
-    groups = [sequence.groups[0]] * 4
+    groups = list(fit_groups([sequence.groups[0]])) * 4
     config = stream_config(fps=25, sh_degree=0, gaussians=100, frames=6)
     out = tmp_path / "a.gsv"
 
@@ -301,7 +319,7 @@ def test_ctrl_c_leaves_a_playable_file_and_a_second_run_goes_on(tmp_path):
         yield from groups[:2]
         raise KeyboardInterrupt
 
-    first = encode_groups(interrupted, out, config, EncodeSettings(), fingerprint={"v": 1})
+    first = encode_groups(interrupted, StreamOutput(out, config, {"v": 1}), EncodeSettings())
     assert first.interrupted
     assert open_stream(out).frame_count == 6
     started = []
@@ -310,19 +328,19 @@ def test_ctrl_c_leaves_a_playable_file_and_a_second_run_goes_on(tmp_path):
         started.append(done)
         yield from groups[done:]
 
-    second = encode_groups(rest, out, config, EncodeSettings(), fingerprint={"v": 1})
+    second = encode_groups(rest, StreamOutput(out, config, {"v": 1}), EncodeSettings())
     assert started == [2]
     assert not second.interrupted
     assert open_stream(out).frame_count == 12
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.gsv"]
     whole = tmp_path / "b.gsv"
-    encode_groups(lambda done, frames: iter(groups), whole, config, EncodeSettings(), fingerprint={})
+    encode_groups(lambda done, frames: iter(groups), StreamOutput(whole, config), EncodeSettings())
     assert whole.read_bytes() == out.read_bytes()
 
 
 def test_other_settings_do_not_resume(tmp_path):
     config = stream_config(fps=25, sh_degree=0, gaussians=100, frames=6)
-    payload, _ = _native.encode_group(group_integers(DenseGroup([blob(5)]), 50))
+    payload = coded(DenseGroup([blob(5)]), 50)[0].payload
     for fingerprint, found in (({"q": 1}, 0), ({"q": 1}, 1), ({"q": 2}, 0)):
         writer = StreamWriter(tmp_path / "a.gsv", config, fingerprint)
         assert writer.groups == found
@@ -335,7 +353,7 @@ def test_a_part_cut_anywhere_keeps_its_whole_groups(tmp_path):
     sequence = turning(20, frames=2)
     out = tmp_path / "a.gsv"
     config = stream_config(fps=25, sh_degree=0, gaussians=100, frames=6)
-    payload, _ = _native.encode_group(group_integers(sequence.groups[0], 50))
+    payload = coded(sequence.groups[0], 50)[0].payload
     writer = StreamWriter(out, config, {})
     ends = [writer.bytes]
     for _ in range(3):
@@ -352,6 +370,29 @@ def test_a_part_cut_anywhere_keeps_its_whole_groups(tmp_path):
         assert again.groups == len(stream.groups)
         again.close()
         assert writer.part.stat().st_size == ends[again.groups]
+
+
+def test_a_changed_input_is_named(tmp_path):
+    config = stream_config(fps=25, sh_degree=0, gaussians=100, frames=6)
+    StreamWriter(
+        tmp_path / "a.gsv", config, {"settings": {"quality": 50}, "input": {"files": {"a.png": [1, 2]}}}
+    ).close()
+    with pytest.warns(UserWarning, match=r"made anew: a\.png has changed, settings\.quality was 50, is 60"):
+        StreamWriter(
+            tmp_path / "a.gsv", config, {"settings": {"quality": 60}, "input": {"files": {"a.png": [1, 3]}}}
+        ).close()
+
+
+def test_the_state_of_the_coder_survives_a_file(tmp_path):
+    """What a resumed run predicts from is what an undisturbed one has."""
+    first, second = fit_groups(changing(), random_access=60)
+    coder = GroupCoder(EncodeSettings(refine=0, keep_all=True))
+    _, state = coder.code(None, first, coder.measure(first, 0), 60, 0)
+    write_arrays(tmp_path / "state.npz", state.to_arrays())
+    again = CoderState.from_arrays(read_arrays(tmp_path / "state.npz"))
+    payloads = [coder.code(s, second, coder.measure(second, 6), 60, 6)[0].payload for s in (state, again)]
+    assert payloads[0] == payloads[1]
+    assert CoderState.from_arrays({"quality": np.array(50.0)}) is None
 
 
 def test_settings_out_of_range_are_refused():

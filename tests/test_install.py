@@ -7,7 +7,7 @@ import venv
 from pathlib import Path
 
 import pytest
-from synthetic import turning
+from synthetic import encode_sequence, turning
 
 from gscodec.splats import write_sequence
 
@@ -17,7 +17,7 @@ ROOT = Path(__file__).parent.parent
 @pytest.fixture(scope="module")
 def player(tmp_path_factory):
     """Folder with a venv that has the wheel, and a stream."""
-    from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
+    from gscodec.encode.encode import stream_config
 
     path = tmp_path_factory.mktemp("player")
     subprocess.run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", path, ROOT], check=True)
@@ -26,13 +26,7 @@ def player(tmp_path_factory):
     subprocess.run([path / "env/bin/python", "-m", "pip", "install", "-q", wheel], check=True)
     sequence = turning(100, frames=3)
     write_sequence(sequence, path / "plys")
-    encode_groups(
-        lambda done, frames: iter(sequence.groups),
-        path / "a.gsv",
-        stream_config(fps=25, sh_degree=0, gaussians=100, frames=6),
-        EncodeSettings(),
-        fingerprint={},
-    )
+    encode_sequence(sequence, path / "a.gsv", stream_config(fps=25, sh_degree=0, gaussians=100, frames=6))
     return path
 
 

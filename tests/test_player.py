@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 from playing import FPS, GROUPS, LENGTH, PLAYER, canvas, load, part, psnr, screenshot, sequence, show
+from synthetic import encode_sequence
 
 from gscodec import _native
 from gscodec.decode import open_stream
-from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
+from gscodec.encode.encode import stream_config
+from gscodec.encode.settings import EncodeSettings
 from gscodec.encode.writer import layer_ends
 from gscodec.render.image import render_image
 
@@ -165,7 +167,7 @@ def test_predicted_groups_and_their_layers(browser, server, other, tmp_path):
     path = tmp_path / "layers.gsv"
     config = stream_config(fps=FPS, sh_degree=0, gaussians=4000, frames=LENGTH)
     settings = EncodeSettings(quality=90, layers=3, random_access=3 * LENGTH)
-    encode_groups(lambda done, frames: iter(s.groups[done:]), path, config, settings, fingerprint={})
+    encode_sequence(s, path, config, settings)
     stream = open_stream(path)
     assert [g["sync"] for g in stream.groups] == [True, False, False, True, False]
     url, handler = other(path.read_bytes())

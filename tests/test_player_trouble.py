@@ -20,9 +20,11 @@ from playing import (
     serving,
     show,
 )
+from synthetic import encode_sequence
 
 from gscodec.decode import open_stream
-from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
+from gscodec.encode.encode import stream_config
+from gscodec.encode.settings import EncodeSettings
 from gscodec.player.server import PAGE, Server
 from gscodec.render.image import render_image
 
@@ -62,9 +64,7 @@ def test_a_ladder_is_played_at_the_rate_of_the_link(browser, server, gsv, other,
     small = gsv.with_name("small.gsv")
     if not small.exists():
         config = stream_config(fps=FPS, sh_degree=0, gaussians=400, frames=LENGTH)
-        encode_groups(
-            lambda done, frames: iter(s.groups[done:]), small, config, EncodeSettings(quality=10), fingerprint={}
-        )
+        encode_sequence(s, small, config, EncodeSettings(quality=10))
     rungs = []
     for path in (gsv, small):
         url, _ = other(path.read_bytes(), rate=rate)
@@ -84,7 +84,7 @@ def test_layers_are_left_out_where_the_link_is_slow(browser, server, other, tmp_
     path = tmp_path / "layers.gsv"
     config = stream_config(fps=15, sh_degree=0, gaussians=4000, frames=LENGTH)
     settings = EncodeSettings(quality=90, layers=3)
-    encode_groups(lambda done, frames: iter(s.groups[done:]), path, config, settings, fingerprint={})
+    encode_sequence(s, path, config, settings)
     url, handler = other(path.read_bytes(), rate=path.stat().st_size // GROUPS)  # a group takes 1 s, and plays 0.4 s
     load(browser, server.url, src=url, size="64x64", loop="off")
     text = browser.wait(f"{part('.notes')}.innerText")
@@ -109,7 +109,7 @@ def test_a_seek_fetches_what_it_needs(browser, server, other, tmp_path):
     s = sequence(8000)
     path = tmp_path / "large.gsv"
     config = stream_config(fps=1, sh_degree=0, gaussians=8000, frames=LENGTH)
-    encode_groups(lambda done, frames: iter(s.groups[done:]), path, config, EncodeSettings(quality=95), fingerprint={})
+    encode_sequence(s, path, config, EncodeSettings(quality=95))
     groups = open_stream(path).groups
     assert groups[0]["size"] > 70_000
     url, handler = other(path.read_bytes())

@@ -4,29 +4,32 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import blob, moved
+from synthetic import blob, coded, moved
 
 from gscodec import _native
 from gscodec.capture import Capture, View
-from gscodec.encode.adaptive_rounding import Moving
 from gscodec.encode.coder import GroupCoder
-from gscodec.encode.intra_group import group_integers
+from gscodec.encode.rounding_variables import Latents
+from gscodec.encode.settings import CompandingSettings, EncodeSettings, RoundingSettings
+from gscodec.fit import fit_groups
 from gscodec.metrics.codec_cameras import codec_cameras
 from gscodec.metrics.evaluate import evaluate_splats
 from gscodec.model.camera import Calibration
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.model.gaussians import Gaussians
+from gscodec.render.cpu import CpuBackend
+from gscodec.render.optimizer import Adam
 from gscodec.render.sensitivity import arrays_of
 from gscodec.render.workspace import Workspace
+from gscodec.train.refinement import PictureRefinement
 
 
-def test_a_refined_frame_is_nearer(monkeypatch):
-    monkeypatch.setattr("gscodec.encode.curves.LEAST", 1000)
+def test_a_refined_frame_is_nearer():
     group = DenseGroup([blob(1500, sh_count=3)])
     sequence = GaussianSequence(30.0, [group])
     found = []
     for views in (0, 20):
-        payload, _ = _native.encode_group(group_integers(group, 60, views=views))
+        payload = coded(group, 60, refine=views, companding=CompandingSettings(least=1000))[0].payload
         decoded = Gaussians(**_native.DecodedGroup(payload, 1).frame(0))
         found.append((len(payload), evaluate_splats(lambda _, g=decoded: g, sequence)["codec_psnr"]))
     (plain, before), (refined, after) = found
@@ -36,26 +39,26 @@ def test_a_refined_frame_is_nearer(monkeypatch):
 
 def test_what_no_view_shows_does_not_move():
     """Squares of such derivatives are 0 in single precision, where Adam would divide by nothing."""
-    latents = np.full((1, 1), 0.4)
-    part = Moving("sh0", latents, np.zeros((1, 1)), (np.zeros((1, 1)), np.zeros((1, 1))))
-    for step, derivative in enumerate((-1e-24, 1e-24, -1e-24), 1):
-        part.follow(np.full((1, 1), derivative, np.float32), 0.1, step)
-    assert part.change == 0
-    part.follow(np.full((1, 1), -1e-2, np.float32), 0.2, 4)
-    assert part.change == 1
+    zero, settings = np.zeros((1, 1)), RoundingSettings()
+    latents = Latents(np.full((1, 1), 0.4), zero, (zero, zero), settings)
+    adam = Adam(CpuBackend(), settings.adam)
+    for derivative, rate, change in ((-1e-24, 0.1, 0), (1e-24, 0.1, 0), (-1e-24, 0.1, 0), (-1e-2, 0.2, 1)):
+        adam.step({"sh0": latents.values}, {"sh0": np.full((1, 1), derivative, np.float32)}, {"sh0": rate})
+        latents.round()
+        assert latents.change == change
 
 
 def test_positions_and_order_stay():
     group = DenseGroup([blob(1200)])
-    plain, refined = (group_integers(group, 70, views=n) for n in (0, 3))
-    assert np.array_equal(plain["positions"], refined["positions"])
-    assert plain["shifts"] == refined["shifts"]
+    plain, refined = (coded(group, 70, refine=n)[1] for n in (0, 3))
+    np.testing.assert_array_equal(plain.positions, refined.positions)
+    np.testing.assert_array_equal(plain.shifts, refined.shifts)
+    assert (plain.channels["sh0"].values != refined.channels["sh0"].values).any()
 
 
 @pytest.mark.parametrize("curves_from", [1000, 10_000])
-def test_refined_groups_are_nearer(monkeypatch, curves_from):
+def test_refined_groups_are_nearer(curves_from):
     """An independent group and one predicted from it, in which colours change and some Gaussians are not shown."""
-    monkeypatch.setattr("gscodec.encode.curves.LEAST", curves_from)
     groups, still, life = [], blob(1500), np.tile(np.array([0, 5], np.int32), (1500, 1))
     life[:300, 1] = 3
     for start in (0, 5):
@@ -64,8 +67,13 @@ def test_refined_groups_are_nearer(monkeypatch, curves_from):
         groups.append(DenseGroup(frames, life, parents=np.arange(1500) if start else None))
     found = []
     for views in (0, 40):
-        coder = GroupCoder(keep_all=True, layers=2, random_access=60, refine=views)
-        first, second = (coder.code(g, 40, 5 * i) for i, g in enumerate(groups))
+        companding = CompandingSettings(least=curves_from)
+        coder = GroupCoder(EncodeSettings(keep_all=True, layers=2, refine=views, companding=companding))
+        done, state = [], None
+        for i, g in enumerate(fit_groups(groups, random_access=60)):
+            result, state = coder.code(state, g, coder.measure(g, 5 * i), 40, 5 * i)
+            done.append(result)
+        first, second = done
         assert not second.independent
         reference = _native.DecodedGroup(first.payload, 1)
         decoded = [reference, _native.DecodedGroup(second.payload, 1, reference=reference)]
@@ -102,12 +110,14 @@ def test_a_trained_group_comes_nearer_to_its_pictures(frames):
     capture, calibration = pictures_of(truth, cameras, gains), Calibration(np.tile(np.eye(4), (16, 1, 1)), gains)
     found = []
     for told in (None, calibration):
-        coder = GroupCoder(keep_all=True, layers=1, random_access=60, refine=80, capture=capture)
-        coded = coder.code(DenseGroup(model, calibration=told), 50, 0)
-        decoded = _native.DecodedGroup(coded.payload, 1)
+        settings = EncodeSettings(keep_all=True, layers=1, refine=80)
+        coder = GroupCoder(settings, refine_by_pictures=PictureRefinement(capture, views=80))
+        group = replace(next(fit_groups([DenseGroup(model)])), calibration=told)
+        result, _ = coder.code(None, group, coder.measure(group, 0), 50, 0)
+        decoded = _native.DecodedGroup(result.payload, 1)
         shown = lambda t, d=decoded: Gaussians(**d.frame(t))  # noqa: E731
         near = evaluate_splats(shown, GaussianSequence(30.0, [DenseGroup(truth)]))["codec_psnr"]
-        found.append((len(coded.payload), near))
+        found.append((len(result.payload), near))
     (plain, before), (refined, after) = found
     assert after > before + 0.5
     assert refined < 1.1 * plain

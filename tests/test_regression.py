@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic import from_npz
+from synthetic import encode_sequence, from_npz
 from test_cli import run
 
 from gscodec.decode import open_stream
-from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
+from gscodec.encode.encode import stream_config
+from gscodec.encode.settings import EncodeSettings
 from gscodec.metrics.evaluate import evaluate_splats
 
 HERE = Path(__file__).parent
@@ -25,9 +26,7 @@ def test_codec_alone(tmp_path, quality):
     sequence = from_npz(HERE / "data" / "trained.npz")
     out = tmp_path / "a.gsv"
     config = stream_config(fps=30, sh_degree=0, gaussians=4000, frames=4)
-    report = encode_groups(
-        lambda done, frames: iter(sequence.groups), out, config, EncodeSettings(quality=quality), fingerprint={}
-    )
+    report = encode_sequence(sequence, out, config, EncodeSettings(quality=quality))
     measured = evaluate_splats(open_stream(out).frame, sequence, frames=[0, 3], size=report.bytes)
     recorded = RECORDED["codec"][str(quality)]
     assert measured["kb_per_frame"] <= 1.02 * recorded["kb_per_frame"]

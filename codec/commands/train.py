@@ -50,7 +50,8 @@ def train_to_folder(
     """
     require("torch", "training a capture")
     from ..splats import SequenceWriter
-    from ..train.checkpoint import Checkpoint, train_groups
+    from ..train.checkpoint import Checkpoint
+    from ..train.train import train_groups
     from ..train.settings import train_settings
     from .sources import limit_torch_threads
 

@@ -153,7 +153,7 @@ def _appearance(group: ParametricGroup, order: np.ndarray) -> tuple[dict, dict]:
         elif BY_NAME[name].decorrelated:
             v = decorrelate(v)
             c = None if c is None else _decorrelated(c)
-        v = v.reshape(len(g), -1)
+        v = v.reshape(len(g), int(np.prod(v.shape[1:])))
         if c is not None:
             v = v + c[0].T / np.sqrt(group.frame_count)
             c = np.concatenate([np.zeros_like(c[:1]), c[1:]])

@@ -14,9 +14,8 @@ import numpy as np
 
 from .. import _native
 from ..bitstream.quantized_group import QuantizedGroup
-from ..errors import CaptureError
 from ..model.camera import Camera
-from ..model.parametric_group import ParametricGroup
+from ..model.parametric_group import ParametricGroup, checked_parents
 from ..render.sensitivity import Importance, sensitivity_cameras
 from .adaptive_rounding import AdaptiveRounding
 from .coded_form import CodedForm, coded_form
@@ -224,11 +223,6 @@ def _lineage(group: ParametricGroup, state: CoderState | None) -> np.ndarray | N
     """
     if group.parents is None or state is None:
         return None
-    parents, before, count = np.asarray(group.parents), state.lineage, len(group.canonical)
-    known = parents[parents >= 0] if parents.shape == (count,) else parents
-    if parents.shape != (count,) or len(np.unique(known)) < len(known) or known.max(initial=-1) >= len(before):
-        raise CaptureError(
-            f"parents of a group: expected, for each of its {count} Gaussians, another one of the {len(before)} "
-            f"of the group before, or -1"
-        )
+    before = state.lineage
+    parents = checked_parents(group.parents, len(group.canonical), len(before))
     return np.where(parents >= 0, before[np.maximum(parents, 0)] if len(before) else -1, -1)

@@ -14,7 +14,7 @@ import numpy as np
 from ..bitstream.quantization import steps_for, subject_radius
 from ..model.gaussian_sequence import DenseGroup
 from ..model.gaussians import Gaussians
-from ..model.parametric_group import NodeMotion, ParametricGroup
+from ..model.parametric_group import NodeMotion, ParametricGroup, checked_parents
 from ..model.rotations import quat_conjugate, quat_multiply, quat_normalize, rotate
 from ..model.temporal_transform import dct_basis
 from .dense_stack import DenseStack
@@ -84,7 +84,7 @@ def _motion(stack, middle: Gaussians, parents, rest, quality) -> tuple[NodeMotio
     step = steps_for(quality, subject_radius(middle.means)).means
     if parents is None:
         return fit_nodes(middle.means, stack.frames.means, step), middle.means
-    known = np.flatnonzero(parents >= 0)
+    known = np.flatnonzero(checked_parents(parents, len(middle), len(rest)) >= 0)
     if not len(known):
         return None, middle.means
     places = rest[parents[known]]

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from .. import _native
+from ..errors import CaptureError
 from .camera import Calibration
 from .gaussians import Gaussians
 from .temporal_transform import dct_basis
@@ -40,6 +41,22 @@ class NodeMotion:
         """The same nodes for the Gaussians at `index` ([n] int)."""
         own = self.neighbors[index], self.weights[index]
         return NodeMotion(self.positions, self.rotations, self.translations, *own)
+
+
+def checked_parents(parents: np.ndarray, count: int, before: int) -> np.ndarray:
+    """The parents of a group of `count` Gaussians, if they fit the `before` Gaussians of the group before.
+
+    Raises:
+        CaptureError: two Gaussians have the same parent, or one that is not there.
+    """
+    parents = np.asarray(parents)
+    known = parents[parents >= 0]
+    if parents.shape != (count,) or len(np.unique(known)) < len(known) or known.max(initial=-1) >= before:
+        raise CaptureError(
+            f"parents of a group: expected, for each of its {count} Gaussians, another one of the {before} of the group "
+            f"before, or -1"
+        )
+    return parents
 
 
 @dataclass(frozen=True)
