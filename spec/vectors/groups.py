@@ -5,12 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from gscodec import _native
-from gscodec.bitstream.quantized_group import (
-    QuantizedChannels,
-    QuantizedGroup,
-    QuantizedNodes,
-    QuantizedTrajectories,
-)
+from gscodec.bitstream.quantized_group import QuantizedChannels, QuantizedGroup, QuantizedNodes, QuantizedTrajectories
 
 CHANNELS = {"log_scales": 3, "quats": 3, "logit_opacities": 1, "sh0": 3}
 
