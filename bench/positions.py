@@ -15,6 +15,7 @@ import DracoPy
 import numpy as np
 
 from gscodec import _native
+from gscodec.bitstream.quantized_group import QuantizedChannels, QuantizedGroup
 from gscodec.splats import open_sequence
 
 from .data import data_folder
@@ -26,22 +27,18 @@ SCENES = {"statue": "splats/statue.ply", "playbot": "splats/playbot.ply", "fruit
 
 def ours(positions: np.ndarray) -> int:
     """Bytes of the positions unit."""
-    empty = {"steps": [1.0], "offsets": [0.0]}
-    channels = {
-        name: {k: v * count for k, v in empty.items()} | {"values": np.zeros((count, len(positions)), np.int32)}
-        for name, count in (("log_scales", 3), ("quats", 3), ("logit_opacities", 1), ("sh0", 3))
-    }
-    order = _native.morton_order(positions)
-    group = {
-        "frames": 1,
-        "origin": [0.0, 0.0, 0.0],
-        "grid_step": 1.0,
-        "grid_bits": max(1, int(positions.max()).bit_length()),
-        "layers": [len(positions)],
-        "positions": positions[order],
-        "channels": channels,
-        "trajectories": {},
-    }
+    channels = {}
+    for name, count in (("log_scales", 3), ("quats", 3), ("logit_opacities", 1), ("sh0", 3)):
+        values = np.zeros((count, len(positions)), np.int32)
+        channels[name] = QuantizedChannels(values, np.ones(count, np.float32), np.zeros(count, np.float32))
+    group = QuantizedGroup(
+        frames=1,
+        origin=np.zeros(3, np.float32),
+        grid_step=1.0,
+        grid_bits=max(1, int(positions.max()).bit_length()),
+        positions=positions[_native.morton_order(positions)],
+        channels=channels,
+    )
     _, units = _native.encode_group(group)
     return next(u["bytes"] for u in units if u["type"] == "positions")
 

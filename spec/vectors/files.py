@@ -53,7 +53,7 @@ def make_file(payloads, *, finish=True, **config):
 
 
 def groups_file(*groups, **options):
-    return make_file([(encode(group), group["frames"]) for group in groups], **options)
+    return make_file([(encode(group), group.frames) for group in groups], **options)
 
 
 def box(kind, body):

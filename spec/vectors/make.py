@@ -8,6 +8,7 @@ gsv.md) are those of the reference decoder.
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
@@ -161,7 +162,7 @@ VALID = {  # name: (what it is about, bytes)
     ),
     "predicted_same": (
         "predicted groups without deaths and births, one of them two groups from its reference",
-        lambda: predicted_file(REFERENCE, UNCHANGED, UNCHANGED | {"reference": 2}),
+        lambda: predicted_file(REFERENCE, UNCHANGED, replace(UNCHANGED, reference=2)),
     ),
     "predicted_births_only": (
         "every Gaussian of the reference dies",

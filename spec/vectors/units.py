@@ -18,12 +18,12 @@ import reference_decoder as reference
 def predicted_file(first, *others, edit=lambda units: None, sync=False, **options):
     """An independent group and groups that are predicted from it; `edit` changes the units of the last one."""
     known = encode(first)
-    payloads = [(known, first["frames"])]
+    payloads = [(known, first.frames)]
     for group in others:
         units = split_units(encode(group, known))
         if group is others[-1]:
             edit(units)
-        payloads.append((join_units(units), group["frames"], sync))
+        payloads.append((join_units(units), group.frames, sync))
     return make_file(payloads, **options)
 
 
