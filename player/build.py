@@ -24,7 +24,7 @@ SPARK, SPARK_HASH = PLAYER / "spark.js", PLAYER / "spark.sha256"
 
 
 def source_hash() -> str:
-    """SHA-256 over everything that native.wasm is made of."""
+    """SHA-256 over the sources of native.wasm."""
     files = [NATIVE / "Cargo.toml", NATIVE / "Cargo.lock", NATIVE / "bindings" / "src" / "lib.rs"]
     files += [NATIVE / crate / "Cargo.toml" for crate in ("gsv", "raster", "bindings")]
     for folder in ("gsv/src", "raster/src", "bindings/src/wasm"):
@@ -70,14 +70,14 @@ def _has_target() -> bool:
 
 
 def _remaps() -> list[str]:
-    """Keeps the builder's folders out of the messages in the module."""
+    """Compiler flags that keep the folders of this machine out of the module."""
     home = Path(os.environ.get("CARGO_HOME", Path.home() / ".cargo"))
     folders = [*(home / "registry" / "src").glob("*"), NATIVE]
     return [f"--remap-path-prefix={f}={'crates' if f != NATIVE else 'native'}" for f in folders]
 
 
 def spark_hashes() -> str:
-    """SHA-256 over what spark.js is made of, and of spark.js."""
+    """SHA-256 over the sources of spark.js, and of spark.js."""
     digest = hashlib.sha256()
     for f in sorted((PLAYER / "spark").iterdir()):
         digest.update(f.name.encode() + b"\n" + f.read_bytes())
@@ -85,7 +85,7 @@ def spark_hashes() -> str:
 
 
 def build_spark() -> None:
-    """Builds spark.js, with the licences of what is in it on top.
+    """Builds spark.js, with the licences of its parts at the top.
 
     Raises:
         SystemExit: npm is missing or fails.

@@ -72,7 +72,7 @@ export class Camera {
     return [x, cross(z, x), z];
   }
 
-  // Drags, in shares of the picture's shorter side.
+  // Drags, in shares of the shorter side of the image.
   orbit(dx, dy) {
     this.#leave();
     this.yaw -= 4 * dx;
@@ -101,7 +101,7 @@ export class Camera {
     return view;
   }
 
-  // What an eye that may look anywhere around has before it: the target and far to the sides of it.
+  // A wide view from `eye` towards the target, for a head that may turn.
   wide(eye) {
     const z = scale(add(this.target, eye, -1), 1 / length(add(this.target, eye, -1)));
     let x = cross(z, this.up);
@@ -110,7 +110,7 @@ export class Camera {
     return new Float32Array([1000, 1000, 200, 200, 500, 500, ...rows]);
   }
 
-  // width, height, fx, fy, cx, cy, 12 of world-to-camera: what the rasterizer takes.
+  // width, height, fx, fy, cx, cy, 12 of world-to-camera: the input of the rasterizer.
   view(width, height) {
     const c = this.reference;
     if (c) {

@@ -1,4 +1,4 @@
-// What the viewer sees around the picture, and how fingers, mouse and keys move the camera. Knows nothing of streams.
+// The controls around the image; fingers, mouse and keys. Independent of streams.
 
 const ICONS = {
   play: "M8 5v14l11-7z",
@@ -69,7 +69,7 @@ export function onKeys(host, act) {
   });
 }
 
-// Drags and wheel on the picture; calls orbit(dx, dy), pan(dx, dy) in shares of the shorter side, zoom(factor).
+// Drags and wheel on the image; calls orbit(dx, dy), pan(dx, dy) in shares of the shorter side, zoom(factor).
 export function onDrag(view, { orbit, pan, zoom }) {
   const fingers = new Map();
   const unit = () => Math.max(Math.min(view.clientWidth, view.clientHeight), 1);

@@ -1,5 +1,5 @@
-// Draws pictures on the GPU with Spark (three.js), whose constants are set to those of the picture (spec, clause 14). spark.js
-// is larger than all of the rest, so it is loaded only where it is used; without it or without a GPU the CPU draws.
+// Draws images on the GPU with Spark (three.js), with the constants of the spec (clause 14). spark.js is larger than the rest
+// of the player, so it is loaded only when it is used; without it or without a GPU the CPU draws.
 
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i; // slower than the wasm rasterizer
 const ALPHA_MIN = 1 / 255;
@@ -53,7 +53,7 @@ export class Gpu {
     this.#sorter = new spark.SparkRenderer({
       renderer: this.#renderer,
       autoUpdate: false,
-      preBlurAmount: LOW_PASS, // opacity is not made up for it
+      preBlurAmount: LOW_PASS, // without compensation of the opacity
       blurAmount: 0,
       minAlpha: ALPHA_MIN,
       maxStdDev: Math.sqrt(-2 * Math.log(ALPHA_MIN)),
@@ -72,7 +72,7 @@ export class Gpu {
   }
 
   // Shows the scene in a headset until the session ends: from where the view (18 numbers) looks, `metres` for a unit of it.
-  // Calls tick() for each picture of the session: meanwhile the window's own clock may stand still.
+  // Calls tick() for each image of the session: meanwhile the window's own clock may stand still.
   async enter(session, view, metres, tick) {
     const { xr } = this.#renderer;
     xr.enabled = true;

@@ -1,19 +1,19 @@
-// How many layers of a stream are fetched and drawn where the viewer leaves that to the player: what link and device carry.
+// Chooses the number of layers to fetch and draw: as many as link and device sustain.
 
 const SHARE = 0.8; // of the measured link that a group may take
-const [HIGH, LOW] = [1, 0.5]; // shares of the time that drawing may take: fewer layers above, more below
-const SLOW = 3; // looks in a row above HIGH after which a layer is given up
-const PATIENCE = 8000; // ms until it is tried again; twice as long after each attempt that did not last
+const [HIGH, LOW] = [1, 0.5]; // load of the device: fewer layers above, more below
+const SLOW = 3; // measurements in a row above HIGH after which a layer is dropped
+const PATIENCE = 8000; // ms until it is tried again; doubled after each failed attempt
 
 export class LayerChoice {
-  reason = null; // for people: what carries no more
+  reason = null; // what limits the layers, for the viewer
   #device = Infinity; // layers that this device draws in time
   #chosen = Infinity;
   #slow = 0;
   #wait = PATIENCE;
   #next = 0;
 
-  // For the group to come. rates: Mbit/s of its first 1, 2, .. layers; link: Mbit/s, 0 if unknown.
+  // For the next group. rates: Mbit/s of its first 1, 2, .. layers; link: Mbit/s, 0 if unknown.
   choose(rates, link) {
     const fit = link ? Math.max(rates.filter((r) => r < SHARE * link).length, 1) : rates.length;
     this.#chosen = Math.min(fit, this.#device, this.#chosen + 1, rates.length);
@@ -21,7 +21,7 @@ export class LayerChoice {
     return this.#chosen;
   }
 
-  // A look at the device: `load` is the share of the time that the slowest stage of a picture takes.
+  // A measurement: `load` is the share of the time that the slowest stage takes.
   look(load, count, now) {
     this.#slow = load > HIGH ? this.#slow + 1 : 0;
     const drawn = Math.min(this.#device, count);

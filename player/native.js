@@ -1,13 +1,13 @@
 // The wasm decoder and rasterizer: one instance per worker, and one on the page for the container. The exports are those of
-// codec/native/bindings/src/wasm.rs; addresses hold until the next call, so everything is copied here.
+// codec/native/bindings/src/wasm.rs; addresses are valid until the next call, so data is copied here.
 
 // A module whose only function uses i8x16.splat: does this browser have simd128?
 const SIMD = [0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 10, 10, 1, 8, 0, 65, 0, 253, 15, 253, 98, 11];
 
-const HEADER = 1 << 14; // bytes that have the header of a group
+const HEADER = 1 << 14; // bytes that hold the header of a group
 export const NONE = 255; // no slot
 export const ALL = 255; // layers
-export const AUTO = 0; // as many layers as link and device carry
+export const AUTO = 0; // as many layers as link and device sustain
 
 export async function load(url) {
   if (typeof WebAssembly !== "object" || !WebAssembly.validate(new Uint8Array(SIMD))) {
@@ -61,14 +61,14 @@ export class Native {
 
   // Groups
 
-  // `reference`: the slot of the group that a predicted one refers to; `layers`: how many are decoded.
+  // `reference`: the slot of the reference of a predicted group; `layers`: number to decode.
   decode(slot, payload, level, reference = NONE, layers = ALL) {
     this.put(payload);
     this.check(this.x.decode(slot, level, reference, layers));
     return JSON.parse(this.text());
   }
 
-  // How many groups back the group of a payload refers, 0: it is independent.
+  // How many groups back a payload refers; 0: it is independent.
   reference(payload) {
     this.put(payload.subarray(0, HEADER));
     const back = this.x.reference();
@@ -89,7 +89,7 @@ export class Native {
     return Array.from(this.floats());
   }
 
-  // Picture
+  // Image
 
   // view: 18 floats, see wasm.rs. Calls take(band) for each band; `splats` is a view into the memory of the instance.
   project(view, count, take) {
@@ -103,7 +103,7 @@ export class Native {
     return bands;
   }
 
-  // What the view shows, as Spark takes it (see pack.rs), relative to an origin: a view into the memory of the instance.
+  // The visible Gaussians for Spark (see pack.rs), relative to an origin: a view into the memory of the instance.
   pack(view, origin) {
     this.put(new Uint8Array(view.buffer, view.byteOffset, view.byteLength));
     this.check(this.x.pack(...origin));

@@ -18,14 +18,14 @@ def play_stream(path: Path, *, host: str, port: int, browser: bool, say: Callabl
         say: prints the address.
 
     Raises:
-        OSError, BitstreamError: it is not there or not a .gsv file.
+        OSError, BitstreamError: the file does not exist or is not a .gsv file.
         UsageError: the address cannot be used.
     """
     path = Path(path)
     part = path.with_name(path.name + ".part")
     if not path.exists() and part.exists():
         path = part
-    open_stream(path)  # what is wrong with the file is better said here than in the page
+    open_stream(path)  # reports a bad file here instead of in the page
     server = Server(path, host=host, port=port)
     say(f"{path} plays at {server.url} (Ctrl-C ends it)")
     if browser:
@@ -33,6 +33,6 @@ def play_stream(path: Path, *, host: str, port: int, browser: bool, say: Callabl
     try:
         server.serve_forever()
     except KeyboardInterrupt:
-        pass  # the way to end it
+        pass  # Ctrl-C ends the command
     finally:
         server.server_close()

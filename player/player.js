@@ -1,8 +1,8 @@
-// <gsv-player src="URL"> plays a .gsv file: the clock, the size of the picture, and what the viewer is told.
+// <gsv-player src="URL"> plays a .gsv file: the clock, the resolution, and the messages to the viewer.
 //
-// Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the picture fills the
-// element); quality="auto" or 0.1 to 1; layers="2" or "all", else as many as link and device carry; renderer="cpu" or "gpu", else the GPU
-// if there is a real one.
+// Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the image fills the
+// element); quality="auto" or 0.1 to 1; layers="2" or "all", else as many as link and device sustain; renderer="cpu" or "gpu",
+// else the GPU if it is hardware.
 // Properties: paused, frame, frameCount, fps, camera, stats. Methods: play(), pause(), show(frame). Events: ready, picture,
 // ended, error.
 
@@ -12,12 +12,12 @@ import { Engine } from "./engine.js";
 import { ALL, AUTO } from "./native.js";
 
 const BASE = new URL(".", import.meta.url);
-const PIXELS_MAX = 4e6; // of a still picture
-const PIXELS_START = 420_000; // of a moving one, before anything has been measured
-const PIXELS_MIN = 180_000; // below that, fewer pixels save little: the Gaussians stay
-const STILL = 250; // ms without a movement after which the picture is drawn sharp
-const TALL = 2; // metres, of a scene in a headset
-const STALL = 300; // ms without a picture after which the viewer is told to wait
+const PIXELS_MAX = 4e6; // of a still image
+const PIXELS_START = 420_000; // of a moving one, before any measurement
+const PIXELS_MIN = 180_000; // fewer save little: the cost of the Gaussians stays
+const STILL = 250; // ms without camera motion until the image is sharp
+const TALL = 2; // metres, height of the scene in a headset
+const STALL = 300; // ms without an image until the busy sign appears
 
 export class GsvPlayer extends HTMLElement {
   static observedAttributes = ["src", "loop", "speed", "quality", "size", "layers", "renderer"];
@@ -27,11 +27,11 @@ export class GsvPlayer extends HTMLElement {
   renderer = "auto";
   #position = 0; // frames, with a fraction
   #last = 0; // time of the last tick
-  #moved = 0; // of the last change of the camera
-  #drawn = ""; // what was asked for last
-  #scale = null; // of a moving picture, found by measuring
+  #moved = 0; // time of the last camera motion
+  #drawn = ""; // the last request
+  #scale = null; // of a moving image per side, measured
   #adapted = 0;
-  #times = []; // of the pictures of the last second
+  #times = []; // of the images of the last second
   #busySince = 0;
 
   constructor() {
@@ -94,7 +94,7 @@ export class GsvPlayer extends HTMLElement {
     return this.hasAttribute("loop");
   }
 
-  // Live, the end is where one waits.
+  // A live stream does not loop: it waits for more.
   get #loops() {
     const { source } = this.engine;
     return this.loop && (source.complete || source.settled);
@@ -126,7 +126,7 @@ export class GsvPlayer extends HTMLElement {
     this.paused = true;
   }
 
-  // Stops at frame t and resolves with {t, view} when its sharp picture is on the canvas.
+  // Stops at frame t and resolves with {t, view} when its sharp image is on the canvas.
   show(t) {
     this.pause();
     this.#seek(t);
@@ -195,7 +195,7 @@ export class GsvPlayer extends HTMLElement {
     this.#note("live", source.complete ? null : unfinished);
   }
 
-  // The first group is decoded: there is something to look at.
+  // The first group is decoded.
   #begin(engine, header) {
     this.header = header;
     if (this.camera) return;
@@ -233,7 +233,7 @@ export class GsvPlayer extends HTMLElement {
     const ready = engine.ready(group) && this.camera;
     if (ready && !this.paused) this.#advance(passed);
     const shown = engine.groupOf(this.frame);
-    if (ready && engine.ready(shown) && engine.free) this.#draw(now);
+    if (ready && engine.ready(shown) && engine.renderer.free) this.#draw(now);
     this.#wait(now, ready && engine.ready(shown));
     this.#follow(now);
   }
@@ -251,7 +251,7 @@ export class GsvPlayer extends HTMLElement {
     }
   }
 
-  // Past a damaged group; null if there is no other.
+  // Moves past a damaged group; null if there is no other.
   #passOver(group) {
     const { engine } = this;
     const { groups } = engine.source;
@@ -272,9 +272,9 @@ export class GsvPlayer extends HTMLElement {
     this.#position = Math.min(Math.max(t, 0), Math.max(this.frameCount - 1, 0));
   }
 
-  // The picture
+  // The image
 
-  // View of a picture that fills the element; a moving one may be coarser.
+  // The view; `sharp`: at full resolution.
   #view(sharp) {
     const head = this.engine.gpu?.head;
     if (head) return this.camera.wide(head.map((v) => this.#near(v)));
@@ -289,7 +289,7 @@ export class GsvPlayer extends HTMLElement {
     return this.camera.view(Math.round(w * scale), Math.round(h * scale));
   }
 
-  // To a hundredth of the size of the scene: what the head does within that needs no other Gaussians.
+  // Rounds to a hundredth of the scene: smaller motions of the head need no other Gaussians.
   #near(v) {
     const step = this.camera.radius / 50;
     return Math.round(v / step) * step;
@@ -305,7 +305,7 @@ export class GsvPlayer extends HTMLElement {
 
   #pictured(detail) {
     const now = performance.now();
-    if (!this.shown) this.#render(); // not before: the first picture does not wait for it
+    if (!this.shown) this.#render(); // not before: the first image does not wait for it
     this.shown = detail;
     this.#times.push(now);
     this.#busySince = 0;
@@ -313,7 +313,7 @@ export class GsvPlayer extends HTMLElement {
     if (!this.paused) this.#adapt(now);
   }
 
-  // The GPU, or the CPU.
+  // Switches to the renderer of the attribute.
   async #render() {
     const { engine } = this;
     this.#note("gpu", null);
@@ -324,7 +324,7 @@ export class GsvPlayer extends HTMLElement {
     }
   }
 
-  // Into a headset: the scene becomes as large as a person, and is drawn on the GPU.
+  // Enters virtual reality: a scene as tall as a person, drawn on the GPU.
   async #enter() {
     const { engine, camera } = this;
     try {
@@ -338,7 +338,7 @@ export class GsvPlayer extends HTMLElement {
     }
   }
 
-  // Finds the size at which this device keeps up, from how long the slowest stage of a picture takes.
+  // Adapts the resolution and the layers to the time of the slowest stage.
   #adapt(now) {
     if (now - this.#adapted < 500) return;
     this.#adapted = now;
@@ -354,7 +354,7 @@ export class GsvPlayer extends HTMLElement {
     this.engine.choice.look(load, this.header.layers, now);
   }
 
-  // What the viewer is told
+  // Messages
 
   #wait(now, ready) {
     if (ready) this.#busySince = 0;
@@ -377,7 +377,7 @@ export class GsvPlayer extends HTMLElement {
     if (!this.$(".stats").hidden) this.$(".stats").textContent = this.#figures();
   }
 
-  // Lights up what has been fetched.
+  // Colours the time bar: fetched, not fetched, damaged.
   #track() {
     const { source, failed } = this.engine;
     const at = (t) => `${((100 * t) / Math.max(this.frameCount, 1)).toFixed(2)}%`;
@@ -400,8 +400,8 @@ export class GsvPlayer extends HTMLElement {
     const shown = groups.get(this.engine.groupOf(this.frame));
     const fewer = layers === AUTO && choice.reason && shown?.layers < shown?.header?.layers;
     this.#note("layers", fewer ? `${shown.layers} of ${shown.header.layers} layers: ${choice.reason} no more just now.` : null);
-    const lower = source.quality && source.rung < source.rungs - 1;
-    this.#note("rung", lower ? `Quality ${source.quality}: the link or this device carries no more just now.` : null);
+    const lower = source.quality && source.representation < source.representations - 1;
+    this.#note("quality", lower ? `Quality ${source.quality}: the link or this device carries no more just now.` : null);
   }
 
   #figures() {
@@ -413,7 +413,7 @@ export class GsvPlayer extends HTMLElement {
       ["fps", `${s.fps} of ${this.fps.toFixed(1)}`],
       ["frame", `${this.frame} of ${this.frameCount}`],
       ["picture", `${width} x ${height}`],
-      ["drawn by", this.engine.drawnBy],
+      ["drawn by", this.engine.renderer.name],
       ["Gaussians", s.gaussians.toLocaleString("en")],
       ["decode", `${s.decode.toFixed(1)} ms/frame`],
       ["project", `${s.project.toFixed(1)} ms`],
@@ -425,7 +425,7 @@ export class GsvPlayer extends HTMLElement {
     ].map(([name, value]) => `${name.padEnd(10)}${value}`).join("\n");
   }
 
-  // A line in the corner; null takes it away.
+  // A line in the corner; null removes it.
   #note(id, text, warn = false) {
     const notes = this.$(".notes");
     let note = notes.querySelector(`[data-id="${id}"]`);
@@ -454,7 +454,7 @@ export class GsvPlayer extends HTMLElement {
     this.dispatchEvent(new CustomEvent("error", { detail: `${title}: ${message}` }));
   }
 
-  // What the viewer does
+  // Actions
 
   #set({ dataset, value }) {
     if (dataset.set === "view") {

@@ -22,10 +22,11 @@ FILES = {
     "index.html": "text/html; charset=utf-8",
     "player.js": "text/javascript; charset=utf-8",
     "engine.js": "text/javascript; charset=utf-8",
+    "renderer.js": "text/javascript; charset=utf-8",
     "gpu.js": "text/javascript; charset=utf-8",
     "spark.js": "text/javascript; charset=utf-8",
     "source.js": "text/javascript; charset=utf-8",
-    "ladder.js": "text/javascript; charset=utf-8",
+    "abr.js": "text/javascript; charset=utf-8",
     "layers.js": "text/javascript; charset=utf-8",
     "worker.js": "text/javascript; charset=utf-8",
     "native.js": "text/javascript; charset=utf-8",
@@ -39,10 +40,10 @@ PIECE = 1 << 18  # bytes read and sent at a time
 
 
 def parse_range(value: str | None, size: int) -> tuple[int, int] | None:
-    """The bytes [start, end) that a Range header asks for; None where it is to be ignored.
+    """The bytes [start, end) that a Range header asks for; None: the header is ignored (RFC 9110).
 
     Raises:
-        ValueError: nothing of it is in a file of `size` bytes.
+        ValueError: no byte of the range is in a file of `size` bytes.
     """
     m = re.fullmatch(r"\s*bytes\s*=\s*(\d*)\s*-\s*(\d*)\s*", value or "", re.IGNORECASE)
     if m is None or m.group(0).strip().endswith("=-"):
@@ -110,7 +111,7 @@ class Handler(BaseHTTPRequestHandler):
             else:
                 self._refuse(HTTPStatus.NOT_FOUND)
         except (BrokenPipeError, ConnectionError, TimeoutError):
-            self.close_connection = True  # the browser went away, as it does when it seeks
+            self.close_connection = True  # the browser closed the connection, for instance after a seek
         except FileNotFoundError:
             self._refuse(HTTPStatus.NOT_FOUND)
 
@@ -126,7 +127,7 @@ class Handler(BaseHTTPRequestHandler):
         size = facts.st_size
         tag = f'"{facts.st_ino:x}-{facts.st_mtime_ns:x}-{size:x}"'
         status, start, end = HTTPStatus.OK, 0, size
-        # RFC 9110: a range is for GET, and only if the file is still the one that If-Range speaks of
+        # RFC 9110: a range is for GET, and only if the file is still the one named by If-Range
         if self.command == "GET" and self._unchanged(tag, facts.st_mtime):
             try:
                 found = parse_range(self.headers.get("Range"), size)
@@ -165,7 +166,7 @@ class Handler(BaseHTTPRequestHandler):
         f.seek(start)
         while start < end:
             piece = f.read(min(PIECE, end - start))
-            if not piece:  # the file was cut meanwhile; the length that was promised cannot be kept
+            if not piece:  # the file became shorter meanwhile: Content-Length cannot be met
                 self.close_connection = True
                 return
             self.wfile.write(piece)
@@ -204,4 +205,4 @@ class Server(ThreadingHTTPServer):
         return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
     def handle_error(self, request, client_address) -> None:
-        """A connection that breaks is no news."""
+        """Ignores errors of a connection; they concern one request only."""

@@ -1,10 +1,9 @@
-// A .gsv file behind a URL: where its groups are, and their bytes, by HTTP Range. Of a file whose index tells where layers end
-// (ssix), only the first layers are fetched where no more are wanted.
+// A .gsv file behind a URL: the places of its groups, and their bytes by HTTP Range. With an index of layers (ssix) only the
+// requested layers are fetched.
 //
-// A finished file has an index (sidx), so one small request tells everything; without it the headers of the fragments are
-// walked, and a file that still grows is asked for more. A server that ignores Range sends the whole file, which is then kept.
-// Only headers that need no CORS preflight are sent, so any static host will do. A connection that breaks is taken up again
-// where it broke.
+// A finished file has an index (sidx), so one small request finds all groups; without it the headers of the fragments are
+// walked, and a growing file is polled. A server that ignores Range sends the whole file, which is then kept. All request
+// headers work without a CORS preflight, so any static host will do. A broken connection is resumed where it broke.
 
 import { ALL } from "./native.js";
 
@@ -12,8 +11,8 @@ const HEAD = 1 << 16; // first request
 const STEP = 1 << 12; // a moof and the header of its mdat
 const CACHE = 48 << 20; // bytes of payloads that are kept
 const SILENCE = 15_000; // ms without a byte after which a connection counts as broken
-const PATIENCE = 60_000; // ms of trying before the viewer is told that it is over
-const SETTLE = 8000; // ms without growth after which a file counts as all there is
+const PATIENCE = 60_000; // ms of retries before the connection counts as lost
+const SETTLE = 8000; // ms without growth after which a file counts as unfinished
 const POLL = [500, 5000]; // ms between looks at a growing file: first, longest
 
 const sleep = (ms, signal) =>
@@ -29,8 +28,8 @@ export class Source extends EventTarget {
   // ends: bytes of it that end with each layer, if that is known
   config = null;
   total = null; // bytes of the file, null if unknown
-  complete = false; // nothing will be added
-  settled = false; // not complete, and nothing has been added for a while
+  complete = false; // no more groups will come
+  settled = false; // not complete, but it has not grown for a while
   received = 0;
   #cache = new Map(); // group -> {bytes, whole}
   #whole = null; // all bytes so far, from a server without Range
@@ -46,7 +45,7 @@ export class Source extends EventTarget {
     return last ? last.start_frame + last.frames : 0;
   }
 
-  // Frames that the index promises and the file does not have.
+  // Frames of the index that the file does not have.
   missing = 0;
 
   // Resolves when the first group is known.
@@ -81,7 +80,7 @@ export class Source extends EventTarget {
     this.#closing.abort(new StreamError("closed"));
   }
 
-  // Names the bytes that `payload` gives: equal for equal ones.
+  // A name for the bytes of group i.
   key(i) {
     return String(i);
   }
@@ -93,7 +92,7 @@ export class Source extends EventTarget {
     const kept = this.#cache.get(i);
     if (kept && kept.size >= size) {
       this.#cache.delete(i);
-      this.#cache.set(i, kept); // the one that was used last is dropped last
+      this.#cache.set(i, kept); // least recently used ones are dropped first
       return kept.bytes;
     }
     let bytes = await this.#read(g.offset, g.offset + size, signal);
@@ -128,7 +127,7 @@ export class Source extends EventTarget {
     this.#say("groups");
   }
 
-  // The payload within a fragment that the index named, or within the start of one.
+  // The payload in a fragment of the index, or in the start of one.
   #unwrap(g, fragment) {
     const known = this.native.describe().groups.length;
     this.native.x.seek(g.offset);
@@ -158,14 +157,14 @@ export class Source extends EventTarget {
       return true;
     }
     const at = x.position() + left;
-    const bytes = await this.#read(left > 0 ? at - 1 : at, at + STEP); // past a body of unknown presence: its last byte too
+    const bytes = await this.#read(left > 0 ? at - 1 : at, at + STEP); // the last byte of a body that may be missing shows that it is there
     if (left > 0 && bytes.length) x.skip(left);
     const rest = left > 0 ? bytes.subarray(1) : bytes;
     if (rest.length) this.native.push(rest);
     return bytes.length > 0;
   }
 
-  // Along a file without index, and after it while it grows.
+  // Walks a file without an index, and polls it while it grows.
   async #walk() {
     let [wait, since] = [POLL[0], performance.now()];
     for (let seen = -1; !this.complete; ) {
@@ -178,7 +177,7 @@ export class Source extends EventTarget {
         continue;
       }
       if (this.#whole) {
-        this.complete = true; // it was sent to its end
+        this.complete = true; // the server has sent all of it
         this.#say("groups");
         return;
       }
@@ -221,7 +220,7 @@ export class Source extends EventTarget {
     return out;
   }
 
-  // Asked where no answer to a range has told it; null if this does not either.
+  // The size, if no answer to a range has had it; null if unknown.
   async #size() {
     const response = await fetch(this.url, { method: "HEAD", signal: this.#closing.signal, cache: "no-store" }).catch(() => null);
     return (response?.ok && Number(response.headers.get("content-length"))) || null;
@@ -280,7 +279,7 @@ export class Source extends EventTarget {
     }
     const bytes = Number(response.headers.get("content-length") ?? 0);
     this.#say("received", { bytes, ms: performance.now() - began });
-    // another origin hides Content-Range, but not the length of what it sent
+    // another origin hides Content-Range, but not Content-Length
     if (status === 206 && !range && bytes && bytes < end - start) {
       this.total = start + bytes;
       return true;
@@ -290,6 +289,6 @@ export class Source extends EventTarget {
       this.total = this.#whole.length;
       return true;
     }
-    return range !== null && Number(range[2]) + 1 < end; // less than was asked for: the file ends there
+    return range !== null && Number(range[2]) + 1 < end; // fewer bytes than requested: the file ends there
   }
 }

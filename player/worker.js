@@ -1,11 +1,11 @@
 // A worker of the player, in one of two roles.
 //
-// group:  payloads in, decoded groups held; frame t + view -> ellipses of each band of rows, straight to the band's worker, or
-//         what the view shows packed for the GPU, to the page.
-// raster: ellipses of a band -> its pixels, to the page.
+// group:  decodes and keeps groups; frame t + view -> projected Gaussians of each band of rows, to the worker of the band, or
+//         the visible ones packed for the GPU, to the page.
+// raster: projected Gaussians of a band -> its pixels, to the page.
 //
-// Two group workers take turns: one shows its group while the other decodes the next, so nothing decoded ever has to travel.
-// Each keeps the last group that others referred to, since more of these will follow.
+// Two group workers alternate: one shows its group while the other decodes the next, so decoded groups are never copied. Each
+// keeps the last reference, since more predicted groups will follow.
 
 import { NONE, Native } from "./native.js";
 
@@ -30,7 +30,7 @@ function groupWorker(native, { ports }) {
     return slot;
   }
 
-  // The slot of the group that `key` and `payload` are of.
+  // The slot of a reference, decoded if it is not the last one.
   function keep({ key, payload }, level, layers) {
     if (kept.key !== key) {
       if (kept.slot !== NONE) native.x.release(kept.slot);
@@ -93,12 +93,11 @@ function groupWorker(native, { ports }) {
         shown = "";
       }
     } catch (e) {
-      // a trap leaves the instance in no known state: the page starts another worker
+      // a trap leaves the instance in an unknown state
       const fatal = e instanceof WebAssembly.RuntimeError || e instanceof RangeError;
       self.postMessage({ type: "failed", group: data.group, id: data.id, message: e.message, fatal });
     }
   };
-  self.postMessage({ type: "ready" });
 }
 
 function rasterWorker(native, { ports }) {
@@ -122,5 +121,4 @@ function rasterWorker(native, { ports }) {
     };
   }
   self.onmessage = ({ data }) => spare.length < 3 && spare.push(data);
-  self.postMessage({ type: "ready" });
 }

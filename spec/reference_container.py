@@ -85,7 +85,7 @@ HEADER_BOXES = (b"ftyp", b"moov", b"sidx", b"moof")  # of the top level
 
 
 def boxes(data, position, end, top_level=False):
-    """Yields (type, offset, body, end) of each box. A top-level box that the file ends in is left out but for mdat."""
+    """Yields (type, offset, body, end) of each box. A truncated top-level box is left out, unless it is an mdat."""
     while position < end:
         offset, header = position, 8
         if end - offset < header:
@@ -100,7 +100,7 @@ def boxes(data, position, end, top_level=False):
             size = struct.unpack_from(">Q", data, offset + 8)[0]
         elif size == 0:
             require(kind == b"mdat" and top_level, f"box {kind!r} at byte {offset}: size 0 is for mdat only")
-            size = 2**64  # to the end, which may be still to come
+            size = 2**64  # to the end of the file, which may still grow
         require(size >= header, f"box {kind!r} at byte {offset}: size {size} is less than its header")
         if top_level and kind in HEADER_BOXES and size - header > 2**24:
             raise LimitError(f"box {kind!r} at byte {offset}: {size} bytes, at most 16 MiB are allowed")
@@ -131,7 +131,7 @@ def open_box(data, box, path):
 
 @dataclass
 class Config:
-    """gsvC (clause 2.3), and of the track what the fragments need."""
+    """gsvC (clause 2.3), and the fields of the track that the fragments need."""
 
     level: int
     frame_duration: int
@@ -149,7 +149,7 @@ class Config:
 
 @dataclass
 class Sample:
-    """One group as the container tells of it (clause 2.4)."""
+    """One group in the container (clause 2.4)."""
 
     start_frame: int
     frames: int

@@ -1,7 +1,7 @@
 """Reference decoder of the gsv bitstream: the second implementation, written from gsv.md alone and in its order.
 
 In: the bytes of a .gsv file. Out: for each group the decoded integers, exactly, and any frame of it in float64.
-It imports numpy and the standard library only, keeps the names of gsv.md, and prefers being read to being fast:
+It imports numpy and the standard library only, uses the names of gsv.md, and is written to be read, not to be fast:
 entropy decoding works on Python integers, bin after bin. Strict: one damaged unit makes the group a BitstreamError.
 
     reference_container.py  clauses 1, 2      reference_units.py     clauses 3 to 5
@@ -69,7 +69,7 @@ class Group:
     counts: list  # Gaussians of each decoded layer
     positions: np.ndarray  # [N, 3]
     channels: dict  # attribute -> [C, N]
-    quats0: np.ndarray  # [N, 4] wxyz, what channels of quats and log_scales say (clause 13.1)
+    quats0: np.ndarray  # [N, 4] wxyz, from the channels of quats and log_scales (clause 13.1)
     lifetimes: np.ndarray | None  # [N, 2]
     node_positions: np.ndarray | None  # [M, 3]
     node_trajectories: np.ndarray | None  # [K, 6, M]
@@ -249,7 +249,7 @@ def canonical(header, attribute, integers):
 
 
 def rotations(header, channels, near):
-    """Clause 13.1: quats0 [N, 4] of what a layer codes itself; `near`: the neighbours of each."""
+    """Clause 13.1: quats0 [N, 4] of the births of a layer; `near`: the neighbours of each."""
     steps, offsets = (np.array(v) for v in header.channels[QUATS])
     octaves = -canonical(header, LOG_SCALES, channels[LOG_SCALES]) @ np.array(header.scale_exponents).T
     own_steps = np.minimum(1, steps * 2.0 ** np.clip(octaves, -64, 64))
@@ -279,7 +279,7 @@ def rgb(v):
 
 
 def evaluate(group, t):
-    """Clause 13: frame t in float64, all Gaussians, and which of them are shown.
+    """Clause 13: frame t in float64: all Gaussians, and a mask of those that are shown.
 
     means [N, 3], quats [N, 4] wxyz, log_scales [N, 3], logit_opacities [N], sh0 [N, 3] and shN [N, K, 3] RGB,
     shown [N] bool.

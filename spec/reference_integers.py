@@ -208,7 +208,7 @@ def decode_lifetimes(payload, frames, near, what):
 
 
 def decode_deaths(payload, near, survivors, what):
-    """Clause 10.1: -> list of the i that live on."""
+    """Clause 10.1: -> list of the indices that survive."""
     model = Model(RangeDecoder(payload, what))
     dead = []
     for neighbors in near:
@@ -246,10 +246,10 @@ def class_trajectories(k, c):
 
 
 def decode_trajectories(payload, coefficients, channels, near, class_of, spend, what):
-    """Clauses 11 and 12: -> for each i a list, as long as it has coefficients, of [C] values; spend(C) before each."""
+    """Clauses 11 and 12: -> for each i the list of its coefficients, [C] values each; calls spend(C) before each."""
     decoder = RangeDecoder(payload, what)
     lengths, values = Model(decoder), ValueModel(decoder)
-    q, zeros, any_of = [], [0] * channels, [0, 0]  # whether blocks have any, after two that are not there
+    q, zeros, any_of = [], [0] * channels, [0, 0]  # any(g) of clause 12 for all blocks, after two zeros
     for i, j in enumerate(near):
         if i % 16 == 0:
             last, other = any_of[-1], any_of[-2]

@@ -71,7 +71,7 @@ def read_units(payload, layers=256):
 
 
 def check_units(units, header, layers):
-    """Clause 3.1: all that the header announces is there, and nothing else -> {(type, layer, attribute): payload}."""
+    """Clause 3.1: the units are those that the header announces -> {(type, layer, attribute): payload}."""
     required, optional = {(GROUP_HEADER, 0, 0)}, set()
     required |= {(NODE_POSITIONS, 0, 0), (NODE_TRAJECTORIES, 0, 0)} if header.node_count else set()
     for k, layer in enumerate(header.layers[:layers]):
@@ -104,8 +104,8 @@ def check_units(units, header, layers):
 @dataclass
 class Layer:
     count: int
-    births: int  # those that the group codes itself
-    candidates: int = 0  # Gaussians of the reference that a deaths unit speaks about
+    births: int  # Gaussians that are not in the reference
+    candidates: int = 0  # Gaussians of the reference that a deaths unit codes
 
 
 @dataclass
@@ -130,7 +130,7 @@ class Header:
 
 
 def read_opening(r):
-    """Clause 4: frames, flags, reference (0: independent) and the sizes of the units behind the header, if it tells."""
+    """Clause 4: frames, flags, reference (0: independent) and the unit_sizes, if present."""
     frames, flags = r.u16(), r.u8()
     require(frames >= 1, "group_header: frames is 0")
     wanted = "bits 4 to 7 must be 0, and bits 1 and 3 in a predicted group"
@@ -156,7 +156,7 @@ def read_grid(r):
 
 
 def read_layers(r, reference):
-    """Clause 4: the layers; of a predicted group, whose reference has the Header `reference`, too."""
+    """Clause 4: the layers. `reference`: the Header of the reference of a predicted group, else None."""
     layer_count = r.u8()
     require(1 <= layer_count <= 16, f"group_header: layer_count is {layer_count}, expected 1 to 16")
     if reference:
@@ -223,7 +223,7 @@ def expected_map_width_log2(count):
 
 
 def read_group_header(payload, reference=None):
-    """Clause 4. `reference`: the Header of the group that a predicted one refers to."""
+    """Clause 4. `reference`: the Header of the reference of a predicted group."""
     r = Reader(payload, 0, len(payload), "group_header")
     frames, flags, back, _ = read_opening(r)
     if back:
@@ -280,7 +280,7 @@ def limit(value, cap, name, level):
 
 
 def check_limits(header, level):
-    """Clause 5, all that follows from the header; returns the budget for the coefficient values."""
+    """Clause 5: checks the caps that follow from the header; returns the budget for the coefficient values."""
     count = sum(layer.count for layer in header.layers)
     facts = (count, "Gaussians"), (header.frames, "frames"), (header.node_count, "nodes")
     for (value, name), cap in zip(facts, LEVELS[level], strict=False):

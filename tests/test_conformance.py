@@ -149,9 +149,9 @@ def test_reference_command(tmp_path):
     assert bad.stderr.startswith("BitstreamError: ")
 
 
-def test_picture_is_as_written():
+def test_rendering_is_as_written():
     """Clause 14 has the constants of the rasterizer and its spherical harmonics."""
-    text = (SPEC / "gsv.md").read_text().split("## 14. Picture")[1].split("## 15.")[0]
+    text = (SPEC / "gsv.md").read_text().split("## 14. ")[1].split("## 15.")[0]
     code = (SPEC.parent / "codec/native/raster/src/constants.rs").read_text()
     constants = dict(re.findall(r"pub const (\w+): f32 = ([^;]+);", code))
     constants.pop("LOG2_ALPHA_MIN")

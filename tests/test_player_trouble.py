@@ -56,8 +56,8 @@ def test_the_element_on_another_page(browser, gsv, other, tmp_path):
     host.shutdown()
 
 
-@pytest.mark.parametrize(("rate", "told", "rung"), [(20_000, 1, 1), (None, 0.05, 2)])
-def test_a_ladder_is_played_at_the_rate_of_the_link(browser, server, gsv, other, rate, told, rung):
+@pytest.mark.parametrize(("rate", "told", "quality"), [(20_000, 1, 1), (None, 0.05, 2)])
+def test_the_representation_follows_the_rate_of_the_link(browser, server, gsv, other, rate, told, quality):
     """Two qualities of one capture; `rate` in bytes a second, None: unlimited. The manifest tells `told` of the true
     bandwidths: a link without a limit is more than enough on a busy machine, too."""
     s = sequence()
@@ -65,18 +65,18 @@ def test_a_ladder_is_played_at_the_rate_of_the_link(browser, server, gsv, other,
     if not small.exists():
         config = stream_config(fps=FPS, sh_degree=0, gaussians=400, frames=LENGTH)
         encode_sequence(s, small, config, EncodeSettings(quality=10))
-    rungs = []
+    representations = []
     for path in (gsv, small):
         url, _ = other(path.read_bytes(), rate=rate)
         bandwidth = round(told * 8 * path.stat().st_size * FPS / (GROUPS * LENGTH))
-        rungs.append(f'<Representation bandwidth="{bandwidth}"><BaseURL>{url}</BaseURL></Representation>')
+        representations.append(f'<Representation bandwidth="{bandwidth}"><BaseURL>{url}</BaseURL></Representation>')
     manifest = f"""<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011" type="static"><Period>
-        <AdaptationSet mimeType="video/mp4">{"".join(rungs)}</AdaptationSet></Period></MPD>"""
+        <AdaptationSet mimeType="video/mp4">{"".join(representations)}</AdaptationSet></Period></MPD>"""
     url, _ = other(manifest.encode(), kind="application/dash+xml", path="/a.mpd")
     load(browser, server.url, src=url, size="64x64", loop="off")
     browser.wait(f"{PLAYER}.frame > {2 * LENGTH}")
     show(browser, GROUPS * LENGTH - 1)
-    assert browser.eval(f"{PLAYER}.engine.source.quality") == f"{rung} of 2"
+    assert browser.eval(f"{PLAYER}.engine.source.quality") == f"{quality} of 2"
 
 
 def test_layers_are_left_out_where_the_link_is_slow(browser, server, other, tmp_path):

@@ -1,4 +1,4 @@
-"""Files of payloads, by the package's muxer, and files taken apart to change one thing about their boxes."""
+"""Writes files of payloads with the package's muxer, and changes single boxes of files."""
 
 import struct
 import sys
@@ -38,7 +38,7 @@ def u32(value):
 
 
 def make_file(payloads, *, finish=True, **config):
-    """payloads: [(bytes, frames)], with a third item of False for no sync sample -> bytes of a .gsv file."""
+    """payloads: [(bytes, frames)], a third item of False: not a sync sample -> bytes of a .gsv file."""
     config = CONFIG | config
     init = bytes(_native.init_segment(config))
     fragments, start = [], 0
@@ -66,7 +66,7 @@ def split_boxes(data):
 
 
 def shift_data(moof, by):
-    """The moof when `by` bytes come between it and the sample."""
+    """The moof with its data offset increased by `by`, for bytes between it and the sample."""
     at = moof.index(b"trun") + 12
     return poke(moof, at, struct.pack(">i", struct.unpack_from(">i", moof, at)[0] + by))
 

@@ -162,7 +162,7 @@ def companded(group):
 
 
 def predicted(reference, group, *, back=1, deaths=lambda i: i % 5 == 0, births=9):
-    """A predicted group: of `reference` those that do not die, and in each layer `births` Gaussians of `group`.
+    """A predicted group: the survivors of `reference`, and in each layer `births` Gaussians of `group`.
 
     Nodes, trajectories and lifetimes are those of `group`, which must have enough Gaussians.
     """

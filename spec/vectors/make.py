@@ -398,7 +398,7 @@ INVALID = {  # name: (error, part of the package's message, bytes)
 
 
 def describe(data):
-    """What the manifest tells of a valid file, by the reference decoder."""
+    """The manifest entry of a valid file, by the reference decoder."""
     _, groups = reference.decode(data)
     facts = [
         {

@@ -1,4 +1,4 @@
-"""Groups taken apart to change one thing about their units.
+"""Changes single units of groups.
 
 The edits work on the bytes, with the reference decoder's parser, since an encoder would never write what they make.
 """
@@ -82,7 +82,7 @@ def change_predicted(edit):
 
 
 def deaths_of_others():
-    """A deaths unit of the base group that says otherwise."""
+    """A deaths unit of the base group with other contents."""
     known, group = encode(base_group()), make_group(60, 4, seed=6)
     units = split_units(encode(predicted(base_group(), group, deaths=lambda i: i % 2), known))
     return find_unit(units, 8)["payload"]
@@ -135,7 +135,7 @@ def change_unit(unit_type, attribute=0, /, **fields):
 
 
 def change_first_tree(size):
-    """Positions of two trees that tell another size of the first one."""
+    """Positions of two trees with another first_size."""
     units = split_units(encode(two_trees()))
     positions = find_unit(units, 1)
     positions["payload"] = size + positions["payload"][4:]

@@ -10,7 +10,7 @@ mod split;
 
 use crate::range_coder::{Bins, Decoder, Encoder};
 use octree::{Children, Node, link};
-use split::{Coder, Seen, Split, seen};
+use split::{Seen, Split, SplitCoder, seen};
 
 const LONELY: usize = 2; // most face neighbours of a point that leaves the tree
 const SPLIT_FROM: u32 = 1 << 14; // from this many points on there are two trees
@@ -60,7 +60,7 @@ fn halves_of(count: u32) -> Option<u32> {
 /// Returns the codes.
 fn code<C: Bins>(c: &mut C, points: &[u64], count: u32, bits: u32) -> Vec<u64> {
     let mut out = Vec::with_capacity(count as usize);
-    let mut coder = Coder::new(c);
+    let mut coder = SplitCoder::new(c);
     let mut level = if count > 0 {
         vec![Node::new(0, count, 0)]
     } else {
@@ -76,7 +76,7 @@ fn code<C: Bins>(c: &mut C, points: &[u64], count: u32, bits: u32) -> Vec<u64> {
     out
 }
 
-impl<C: Bins> Coder<'_, C> {
+impl<C: Bins> SplitCoder<'_, C> {
     /// Splits the nodes of one level, of which `rest` bits per axis are unknown; returns the next level.
     fn level(&mut self, level: &[Node], points: &[u64], rest: u32, out: &mut Vec<u64>) -> Vec<Node> {
         let mut known: Vec<Seen> = Vec::with_capacity(level.len());

@@ -141,7 +141,7 @@ pub fn code<C: Bins>(
     budget: u64,
 ) -> Result<Trajectories, Stop> {
     let channels = source.channels;
-    let mut coder = Coder {
+    let mut model = TrajectoryModel {
         kind,
         lengths: Model::new(16 * LENGTHS + 4, 16 * LENGTHS + 2, LENGTHS + 1),
         values: ValueModel::new(if kind == Kind::Node { 24 } else { 12 }),
@@ -150,19 +150,19 @@ pub fn code<C: Bins>(
     let mut before = [false; 2]; // whether the two blocks before have coefficients, the last one first
     for (block, near) in near.chunks(BLOCK).enumerate() {
         let own = block * BLOCK..block * BLOCK + near.len();
-        let any = coder.any(c, own.clone().any(|i| !source.get(i).is_empty()), before);
+        let any = model.any(c, own.clone().any(|i| !source.get(i).is_empty()), before);
         before = [any, before[0]];
         for (i, near) in own.zip(near) {
             if !any {
                 out.push(&[]);
                 continue;
             }
-            let length = coder.length(c, near, &out, source.get(i).len() / channels.max(1), k_max);
+            let length = model.length(c, near, &out, source.get(i).len() / channels.max(1), k_max);
             if (out.values.len() + length * channels) as u64 > budget {
                 return Err(Stop::Symbols);
             }
-            coder.coefficients(c, near, &mut out, source.get(i), length);
-            if coder.values.broken {
+            model.coefficients(c, near, &mut out, source.get(i), length);
+            if model.values.broken {
                 return Err(Stop::Broken);
             }
         }
@@ -173,13 +173,13 @@ pub fn code<C: Bins>(
     Ok(out)
 }
 
-struct Coder {
+struct TrajectoryModel {
     kind: Kind,
     lengths: Model,
     values: ValueModel,
 }
 
-impl Coder {
+impl TrajectoryModel {
     /// Codes whether any Gaussian of a block has coefficients.
     fn any<C: Bins>(&mut self, c: &mut C, want: bool, before: [bool; 2]) -> bool {
         let [last, other] = before.map(usize::from);

@@ -1,4 +1,5 @@
-//! The demuxer gives the same result however its input is split, keeps whole groups of what was cut, and never panics.
+//! The demuxer: the result does not depend on how the input is split, a truncated file keeps its whole groups, and nothing
+//! panics.
 
 mod common;
 
@@ -31,7 +32,7 @@ fn config() -> Config {
     }
 }
 
-/// A finished file of three groups, and where its samples are.
+/// A finished file of three groups, and the entries of its samples.
 fn file() -> (Vec<u8>, Vec<Entry>) {
     let config = config();
     let init = init_segment(&config).unwrap();
@@ -208,7 +209,7 @@ fn frame_rates() {
     assert!(rate(f64::NAN).is_err() && rate(0.0).is_err());
 }
 
-/// Spec 2.4: the sample of a moof lies in an mdat, nowhere else.
+/// Spec 2.4: the sample of a moof must lie in the next mdat.
 #[test]
 fn a_sample_needs_its_mdat() {
     let config = config();
@@ -226,7 +227,7 @@ fn a_sample_needs_its_mdat() {
     assert_eq!(parsed(&[&init, &empty]).groups().len(), 1);
 }
 
-/// Where layers end, as the file says (spec 2.6); a ssix that does not fit is ignored.
+/// The ends of the layers in ssix (spec 2.6); a ssix that does not match is ignored.
 #[test]
 fn layers_can_be_found() {
     let config = config();

@@ -1,4 +1,4 @@
-//! Damaged bytes end in an error or, below the checksum, in some group; never in a panic, a hang or too much memory.
+//! Damaged bytes give an error or, below the checksum, some group; never a panic, an endless loop or too much memory.
 
 mod common;
 
@@ -41,7 +41,7 @@ fn any_truncation_is_noticed() {
     }
 }
 
-/// Mutates unit payloads and repairs the checksums: what the entropy decoders see from a hostile writer.
+/// Mutates unit payloads and repairs the checksums, as a hostile writer would, to test the entropy decoders.
 #[test]
 fn mutated_units_never_panic() {
     let mut r = Random(99);
@@ -96,7 +96,7 @@ fn mutate(bytes: &mut Vec<u8>, r: &mut Random) {
     }
 }
 
-/// A header of a hundred bytes that announces the largest group must not get its memory.
+/// A header of a hundred bytes that announces the largest group must not allocate its memory.
 #[test]
 fn limits_come_before_memory() {
     let mut g = small();
@@ -126,7 +126,7 @@ fn header_only(g: &gsv::group::Group) -> Vec<u8> {
     out
 }
 
-/// Many trajectories from a few bytes: the cap on symbols holds while they are decoded.
+/// Many trajectories from a few bytes: the cap on symbols is enforced during decoding.
 #[test]
 fn symbols_are_counted_while_they_grow() {
     let mut g = small();
@@ -170,7 +170,7 @@ fn later_versions() {
     }
 }
 
-/// The rules on units, one by one.
+/// Each rule on units.
 #[test]
 fn broken_units() {
     let payload = encode_group(&small(), None).unwrap();

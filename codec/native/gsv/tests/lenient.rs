@@ -1,4 +1,4 @@
-//! Decoding what is left of a damaged group (spec 3).
+//! Decoding the undamaged units of a damaged group (spec 3).
 
 mod common;
 
@@ -33,7 +33,7 @@ fn damaged(kind: UnitType, attribute: Option<Attribute>) -> (Vec<u8>, usize) {
     (payload, i)
 }
 
-/// What is told of a group in integers; its quaternions follow from them.
+/// The integers of a group, without the quaternions that follow from them.
 fn integers(mut group: Group) -> Group {
     group.rotations = small().rotations;
     group
@@ -167,7 +167,7 @@ fn damage_where_there_are_no_gaussians() {
     group.validate(None).unwrap();
 }
 
-/// A sound unit that breaks a rule is not damage.
+/// An undamaged unit that breaks a rule is an error, not damage.
 #[test]
 fn broken_rules_stay_errors() {
     let mut payload = encode_group(&small(), None).unwrap();
@@ -176,7 +176,7 @@ fn broken_rules_stay_errors() {
     assert!(message.contains("announces"), "{message}");
 }
 
-/// What a unit holds, as it is in a group.
+/// The content of a unit in the decoded group.
 fn content(g: &Group, u: &Unit) -> Option<Vec<i32>> {
     let k = usize::from(u.layer);
     if u.kind == Some(UnitType::LayerCorrection) {
@@ -210,7 +210,7 @@ fn content(g: &Group, u: &Unit) -> Option<Vec<i32>> {
     })
 }
 
-/// Damaged byte by byte: everything stays but the unit and those that name it, and it is said.
+/// Every byte damaged in turn: only that unit and those that depend on it are replaced, and the damage is reported.
 #[test]
 fn a_damaged_byte_costs_its_unit_and_those_that_name_it() {
     let reference = common::group(&common::layered());
@@ -248,7 +248,7 @@ fn a_damaged_byte_costs_its_unit_and_those_that_name_it() {
     }
 }
 
-/// What a reference has lost is lost in the groups that refer to it, which decode all the same.
+/// Damage of a reference also affects the groups that refer to it, which are decoded.
 #[test]
 fn damage_of_the_reference_is_that_of_its_followers() {
     let reference = common::group(&common::layered());
@@ -272,7 +272,7 @@ fn damage_of_the_reference_is_that_of_its_followers() {
     }
 }
 
-/// Whatever comes out is a group.
+/// Every result is a valid group.
 #[test]
 fn random_damage() {
     let sound = encode_group(&small(), None).unwrap();

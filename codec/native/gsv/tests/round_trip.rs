@@ -1,4 +1,4 @@
-//! decode(encode(x)) = x for every group that can be expressed; what cannot is refused by name.
+//! decode(encode(x)) = x for every valid group; an invalid one is refused with a message that names the error.
 
 mod common;
 
@@ -24,7 +24,7 @@ fn decoded(g: &Group) -> Group {
     out
 }
 
-/// Trajectories hold the channels even where they are empty.
+/// Trajectories keep their number of channels even when empty.
 fn same(a: &Group, b: &Group) {
     assert_eq!(a.header, b.header);
     assert_eq!(
@@ -85,7 +85,7 @@ proptest! {
             prop_assert_eq!(&prefix, &decode_group(&payload[..end], &how).unwrap());
             let mut cut = payload.clone();
             if end < cut.len() {
-                cut[end + 4] ^= 1; // damage behind the prefix is nobody's business
+                cut[end + 4] ^= 1; // damage behind the prefix does not matter
                 prop_assert_eq!(&prefix, &decode_group(&cut, &how).unwrap());
                 cut.truncate(end + 9);
                 prop_assert_eq!(&prefix, &decode_group(&cut, &how).unwrap());
@@ -168,7 +168,7 @@ fn tiny() -> Shape {
     }
 }
 
-/// Every input error has one sentence that names what is wrong.
+/// Every input error has a message that names what is wrong.
 #[test]
 fn impossible_groups_are_refused() {
     let refused = |change: fn(&mut Group), part: &str| {
@@ -194,7 +194,7 @@ fn impossible_groups_are_refused() {
     refused(|g| g.header.frames = 300, "frames, level 4");
 }
 
-/// What a predicted group must have of its reference.
+/// The properties that a predicted group must share with its reference.
 #[test]
 fn impossible_predictions_are_refused() {
     let reference = group(&layered());

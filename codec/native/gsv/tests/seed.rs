@@ -1,4 +1,4 @@
-//! The sound groups that the targets in fuzz/ start from.
+//! Writes the valid groups that the fuzz targets start from.
 
 mod common;
 

@@ -17,15 +17,15 @@ pub fn seen(k: usize, count: u32) -> Seen {
     u64::from(count.min(255)) << (8 * k)
 }
 
-pub struct Coder<'a, C> {
+pub struct SplitCoder<'a, C> {
     pub c: &'a mut C,
     model: Model,
 }
 
-impl<'a, C: Bins> Coder<'a, C> {
+impl<'a, C: Bins> SplitCoder<'a, C> {
     pub fn new(c: &'a mut C) -> Self {
         let model = Model::new(BUCKETS * TREE * EVIDENCE, BUCKETS * TREE * 3 * 7 * 8, BUCKETS * TREE);
-        Coder { c, model }
+        SplitCoder { c, model }
     }
 }
 
@@ -61,7 +61,7 @@ impl Split {
     }
 
     /// Codes the number of points per child: splits along x, then y, then z.
-    pub fn children<C: Bins>(mut self, coder: &mut Coder<C>) -> [u32; 8] {
+    pub fn children<C: Bins>(mut self, coder: &mut SplitCoder<C>) -> [u32; 8] {
         let mut counts = [0; 8];
         let [lx, ly, lz] = self.lower;
         let c = context(halves(ly, 4, 0), halves(lz, 4, 0), sum(lx, 4, 4), self.upper[0]);
@@ -97,7 +97,7 @@ impl Split {
 
     /// Codes the child of a single point. Equal to `children`, which most nodes do not need, but without branches that
     /// cannot be predicted.
-    pub fn child<C: Bins>(self, coder: &mut Coder<C>) -> usize {
+    pub fn child<C: Bins>(self, coder: &mut SplitCoder<C>) -> usize {
         let [lx, ly, lz] = self.lower;
         let c = context(halves(ly, 4, 0), halves(lz, 4, 0), sum(lx, 4, 4), self.upper[0]);
         let x = 4 * self.upper_half(coder, 4, 0, c, 0);
@@ -113,13 +113,21 @@ impl Split {
 
     /// Codes in which half the only point is: 0 or 1.
     #[inline(always)]
-    fn upper_half<C: Bins>(&self, coder: &mut Coder<C>, mask: usize, half: usize, c: usize, axis: usize) -> usize {
+    fn upper_half<C: Bins>(&self, coder: &mut SplitCoder<C>, mask: usize, half: usize, c: usize, axis: usize) -> usize {
         1 - self.split(coder, mask, half, 1, c, axis) as usize
     }
 
     /// Codes how many of `n` points lie in the lower half: in the children k with k & mask = half.
     #[inline(always)]
-    fn split<C: Bins>(&self, coder: &mut Coder<C>, mask: usize, half: usize, n: u32, c: usize, axis: usize) -> u32 {
+    fn split<C: Bins>(
+        &self,
+        coder: &mut SplitCoder<C>,
+        mask: usize,
+        half: usize,
+        n: u32,
+        c: usize,
+        axis: usize,
+    ) -> u32 {
         let want = if C::DECODES {
             0
         } else {

@@ -11,10 +11,10 @@ use gsv::morton;
 use gsv::trajectories::Trajectories;
 use proptest::prelude::*;
 
-/// What shapes a random group.
+/// The parameters of a random group.
 #[derive(Debug, Clone)]
 pub struct Shape {
-    /// Of each layer.
+    /// Gaussians of each layer.
     pub counts: Vec<usize>,
     pub frames: u16,
     pub bits: u8,
@@ -161,7 +161,7 @@ fn layer(count: usize, births: usize) -> LayerHeader {
     }
 }
 
-/// What is its own in every group: trajectories, nodes and lifetimes of its Gaussians.
+/// Trajectories, nodes and lifetimes, which every group has of its own.
 fn motion(g: &mut Group, header: &mut Header, s: &Shape, r: &mut Random) {
     let count = g.positions.len();
     for attribute in Attribute::ALL {
@@ -199,7 +199,7 @@ fn motion(g: &mut Group, header: &mut Header, s: &Shape, r: &mut Random) {
     }
 }
 
-/// A group that is predicted from `reference`: some of its Gaussians, others before them and some new ones.
+/// A group predicted from `reference`: some of its Gaussians survive, births follow.
 pub fn predicted(reference: &Group, s: &Shape) -> Group {
     let mut r = Random(s.seed ^ 0xABCD);
     let before = &reference.header;
@@ -268,7 +268,7 @@ pub fn layered() -> Shape {
     }
 }
 
-/// A group with a bit of everything, small enough to damage byte by byte.
+/// A group with every kind of unit, small enough to damage byte by byte.
 pub fn small() -> Group {
     group(&Shape {
         counts: vec![12],

@@ -1,20 +1,20 @@
-// Several qualities of one capture behind a DASH manifest (.mpd): a Source whose groups come from the file that the link and
-// the device can carry just now.
+// Adaptive bitrate: a Source over the representations of a DASH manifest (.mpd). Each group comes from the best one that link
+// and device sustain.
 //
-// Read of the manifest: Representation with @bandwidth and BaseURL, as in the on-demand profile, where each representation
-// is one indexed file. The quality may change at every sync group that all files cut alike: predicted groups stay with theirs.
+// Read are @bandwidth and BaseURL of each Representation (on-demand profile: one indexed file each). The representation changes
+// at sync groups only, and all files must have the same ones.
 
 import { Source, StreamError } from "./source.js";
 
-const SHARE = 0.7; // of the measured link that a quality may take
-const BUSY = 0.8; // of the time that may go into decoding
+const SHARE = 0.7; // of the measured link that a representation may use
+const BUSY = 0.8; // share of the time that decoding may take
 
-export class Ladder extends EventTarget {
-  rung = 0; // of the last group that was fetched
+export class AdaptiveSource extends EventTarget {
+  representation = 0; // of the last group that was fetched
   link = 0; // Mbit/s, measured
-  decode = new Map(); // rung -> ms a frame
-  #rungs = []; // {bandwidth, source, opened}, cheapest first
-  #chosen = new Map(); // group -> rung
+  decode = new Map(); // representation -> decoding time, ms per frame
+  #files = []; // {bandwidth, source, opened}, lowest bandwidth first
+  #chosen = new Map(); // group -> representation
 
   constructor(url) {
     super();
@@ -28,10 +28,10 @@ export class Ladder extends EventTarget {
     const xml = new DOMParser().parseFromString(await answer.text(), "text/xml");
     for (const r of xml.querySelectorAll("Representation")) {
       const path = r.querySelector("BaseURL")?.textContent.trim();
-      if (path) this.#rungs.push({ bandwidth: Number(r.getAttribute("bandwidth")) / 1e6, source: this.#source(new URL(path, answer.url)) });
+      if (path) this.#files.push({ bandwidth: Number(r.getAttribute("bandwidth")) / 1e6, source: this.#source(new URL(path, answer.url)) });
     }
-    if (!this.#rungs.length) throw new StreamError("The manifest names no files: expected Representation elements with BaseURL.");
-    this.#rungs.sort((a, b) => a.bandwidth - b.bandwidth);
+    if (!this.#files.length) throw new StreamError("The manifest names no files: expected Representation elements with BaseURL.");
+    this.#files.sort((a, b) => a.bandwidth - b.bandwidth);
     await this.#open(0);
   }
 
@@ -47,15 +47,15 @@ export class Ladder extends EventTarget {
   }
 
   async #open(i) {
-    const r = this.#rungs[i];
+    const r = this.#files[i];
     r.opened ??= r.source.open(this.create);
     await r.opened;
     return r.source;
   }
 
-  // What the cheapest file says holds for all.
+  // Config and groups are those of the representation with the lowest bandwidth.
   get #base() {
-    return this.#rungs[0]?.source;
+    return this.#files[0]?.source;
   }
   get groups() {
     return this.#base?.groups ?? [];
@@ -79,41 +79,41 @@ export class Ladder extends EventTarget {
     return this.#base?.missing ?? 0;
   }
   get received() {
-    return this.#rungs.reduce((n, r) => n + r.source.received, 0);
+    return this.#files.reduce((n, r) => n + r.source.received, 0);
   }
 
-  get rungs() {
-    return this.#rungs.length;
+  get representations() {
+    return this.#files.length;
   }
 
-  // For people.
+  // For the statistics.
   get quality() {
-    return `${this.rung + 1} of ${this.rungs}`;
+    return `${this.representation + 1} of ${this.representations}`;
   }
 
   has(i) {
-    return this.#rungs[this.#chosen.get(i)]?.source.has(i) ?? false;
+    return this.#files[this.#chosen.get(i)]?.source.has(i) ?? false;
   }
 
   level(i) {
-    return this.#rungs[this.#chosen.get(i) ?? 0].source.config.level;
+    return this.#files[this.#chosen.get(i) ?? 0].source.config.level;
   }
 
-  // ms a frame that the decoding of group i took.
+  // Group i was decoded in `ms` per frame.
   decoded(i, ms) {
     this.decode.set(this.#chosen.get(i), ms);
   }
 
-  // The best rung that link and device carry; one step up at a time, down at once.
+  // The best representation to sustain: up by one step at a time, down at once.
   #choose() {
     const [n, d] = this.config.fps;
-    const fits = (k) => this.#rungs[k].bandwidth < SHARE * this.link && ((this.decode.get(k) ?? 0) * n) / d < 1000 * BUSY;
+    const fits = (k) => this.#files[k].bandwidth < SHARE * this.link && ((this.decode.get(k) ?? 0) * n) / d < 1000 * BUSY;
     let best = 0;
-    while (best < Math.min(this.rung + 1, this.#rungs.length - 1) && fits(best + 1)) best++;
+    while (best < Math.min(this.representation + 1, this.#files.length - 1) && fits(best + 1)) best++;
     return best;
   }
 
-  // The sync group that group i is, or that those before it start with.
+  // The last sync group up to group i.
   #start(i) {
     while (i > 0 && !this.groups[i].sync) i--;
     return i;
@@ -125,10 +125,10 @@ export class Ladder extends EventTarget {
 
   async payload(i, signal, layers) {
     const start = this.#start(i);
-    if (this.has(i)) return this.#rungs[this.#chosen.get(i)].source.payload(i, signal, layers);
-    const rung = this.#chosen.get(start) ?? (this.#chosen.size ? this.#choose() : 0);
+    if (this.has(i)) return this.#files[this.#chosen.get(i)].source.payload(i, signal, layers);
+    const first = this.#chosen.get(start) ?? (this.#chosen.size ? this.#choose() : 0);
     const told = this.groups[i];
-    for (const k of [rung, 0]) {
+    for (const k of [first, 0]) {
       try {
         const source = await this.#open(k);
         const g = source.groups[i];
@@ -136,7 +136,7 @@ export class Ladder extends EventTarget {
         const bytes = await source.payload(i, signal, layers);
         this.#chosen.set(i, k);
         this.#chosen.set(start, k);
-        this.rung = k;
+        this.representation = k;
         return bytes;
       } catch (e) {
         if (k === 0 || signal?.aborted) throw e;
@@ -145,6 +145,6 @@ export class Ladder extends EventTarget {
   }
 
   close() {
-    for (const r of this.#rungs) r.source.close();
+    for (const r of this.#files) r.source.close();
   }
 }
