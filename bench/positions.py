@@ -16,7 +16,6 @@ import numpy as np
 
 from gscodec import _native
 from gscodec.bitstream.quantized_group import QuantizedChannels, QuantizedGroup
-from gscodec.model.attributes import BY_NAME, CANONICAL
 from gscodec.splats import open_sequence
 
 from .data import data_folder
@@ -28,17 +27,20 @@ SCENES = {"statue": "splats/statue.ply", "playbot": "splats/playbot.ply", "fruit
 
 def ours(positions: np.ndarray) -> int:
     """Bytes of the positions unit."""
-    ordered = positions[_native.morton_order(positions)]
-    channels = {name: _zeros(BY_NAME[name].channels, len(positions)) for name in CANONICAL if name != "shN"}
-    bits = max(1, int(positions.max()).bit_length())
-    _, units = _native.encode_group(QuantizedGroup(1, np.zeros(3, np.float32), 1.0, bits, ordered, channels))
+    channels = {}
+    for name, count in (("log_scales", 3), ("quats", 3), ("logit_opacities", 1), ("sh0", 3)):
+        values = np.zeros((count, len(positions)), np.int32)
+        channels[name] = QuantizedChannels(values, np.ones(count, np.float32), np.zeros(count, np.float32))
+    group = QuantizedGroup(
+        frames=1,
+        origin=np.zeros(3, np.float32),
+        grid_step=1.0,
+        grid_bits=max(1, int(positions.max()).bit_length()),
+        positions=positions[_native.morton_order(positions)],
+        channels=channels,
+    )
+    _, units = _native.encode_group(group)
     return next(u["bytes"] for u in units if u["type"] == "positions")
-
-
-def _zeros(channels: int, count: int) -> QuantizedChannels:
-    """An attribute that is 0 everywhere."""
-    one = np.ones(channels, np.float32)
-    return QuantizedChannels(np.zeros((channels, count), np.int32), one, 0 * one)
 
 
 def compare(name: str, means: np.ndarray, bits: int) -> dict:
