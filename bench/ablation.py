@@ -1,4 +1,4 @@
-"""Ablation: two captures are trained without one loss or tool at a time.
+"""Ablation: two captures are trained without one loss or tool at a time, and with other cut ratios.
 
 lumberjack is the bundled capture, a subject with masks; stage (in the data folder, at half its size) is a full room
 into which a ball drops. bench/results/ablation.json has one entry per capture and variant, all from the same seed and
@@ -16,7 +16,7 @@ from pathlib import Path
 
 from gscodec.capture import Capture
 from gscodec.errors import UsageError
-from gscodec.train.settings import TrainSettings, train_settings
+from gscodec.train.settings import TrackingSettings, TrainSettings, train_settings
 
 from . import train
 from .machine import ROOT, update_entries
@@ -34,16 +34,42 @@ class Variant:
     captures: tuple[str, ...] = (LUMBERJACK, STAGE)
 
 
+def run_with(**values) -> Callable[[TrainSettings], TrainSettings]:
+    """Other values of the settings of the whole run."""
+    return lambda settings: replace(settings, **values)
+
+
+def stage_with(stage: str, **values) -> Callable[[TrainSettings], TrainSettings]:
+    """Other values of the settings of one stage."""
+    return lambda settings: replace(settings, **{stage: replace(getattr(settings, stage), **values)})
+
+
+TRACKING = TrackingSettings()
 VARIANTS = {
-    WHOLE: Variant(lambda s: s),
-    "no D-SSIM": Variant(lambda s: replace(s, ssim_lambda=0.0)),
-    "no mask term": Variant(lambda s: replace(s, mask_lambda=0.0), captures=(LUMBERJACK,)),
-    "no rigidity": Variant(lambda s: replace(s, rigidity=0.0)),
-    "no rate term": Variant(lambda s: replace(s, rate_lambda=0.0)),
-    "no fine-tuning": Variant(lambda s: replace(s, finetune_steps=0)),
-    "no cuts": Variant(lambda s: replace(s, cut_ratio=math.inf)),
-    "cut ratio 1.5": Variant(lambda s: replace(s, cut_ratio=1.5)),
-    "cut ratio 3": Variant(lambda s: replace(s, cut_ratio=3.0)),
+    WHOLE: Variant(run_with()),
+    "no D-SSIM": Variant(run_with(ssim_lambda=0.0)),
+    "no mask term": Variant(run_with(mask_lambda=0.0), (LUMBERJACK,)),
+    "no rigidity": Variant(run_with(rigidity=0.0)),
+    "no rate term": Variant(run_with(rate_lambda=0.0)),
+    "no fine-tuning": Variant(run_with(finetune_steps=0)),
+    "no cuts": Variant(run_with(cut_ratio=math.inf)),
+    "cut ratio 1.5": Variant(run_with(cut_ratio=1.5)),
+    "cut ratio 3": Variant(run_with(cut_ratio=3.0)),
+    "colours held in tracking": Variant(stage_with("tracking", rates=replace(TRACKING.rates, sh0=0.0, shN=0.0))),
+    "full-size pictures only": Variant(stage_with("tracking", small_scale=1.0)),
+    "nothing held still": Variant(stage_with("change_detection", threshold=-1.0)),
+    "no noise on canonical values": Variant(stage_with("finetune", canonical_noise=False)),
+    "no births": Variant(stage_with("densification", max_share=0.0), (STAGE,)),
+    "no plane sweep": Variant(stage_with("initialization", use_plane_sweep=False), (STAGE,)),
+    "no shell of far points": Variant(stage_with("plane_sweep", shell_points=0), (STAGE,)),
+    "no node graph": Variant(  # every Gaussian for itself, at the rate of a node
+        stage_with(
+            "tracking",
+            node_rotation_rate=0.0,
+            node_translation_rate=0.0,
+            rates=replace(TRACKING.rates, means=TRACKING.node_translation_rate),
+        )
+    ),
 }
 
 
@@ -76,7 +102,6 @@ def _open(capture: str, data: Path | None) -> Capture:
 
 
 def _entry(capture: Capture, name: str, preset: str, quality: float) -> dict:
-
     variant = VARIANTS[name]
     settings = variant.change(train_settings(preset, quality=quality))
     groups, seconds = train.sequence(capture, settings)

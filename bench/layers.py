@@ -15,11 +15,12 @@ from itertools import product
 import numpy as np
 
 from gscodec import _native
-from gscodec.encode.intra_group import code_group
+from gscodec.encode.coder import GroupCoder
+from gscodec.encode.settings import EncodeSettings
 from gscodec.metrics.codec_cameras import codec_cameras
 from gscodec.metrics.image import psnr
-from gscodec.model.gaussian_sequence import DenseGroup
 from gscodec.model.gaussians import Gaussians
+from gscodec.model.parametric_group import ParametricGroup
 from gscodec.render.image import render_image
 from gscodec.splats import read_splat
 
@@ -27,7 +28,7 @@ from .data import data_folder
 from .machine import RESULTS, write_result
 
 SCALES, OPACITIES = (0.0, 0.15, 0.3), (0.0, 0.3, 0.7)
-LEVEL = 4
+LEVEL, QUALITY = 4, 50
 
 
 def main() -> None:
@@ -40,12 +41,14 @@ def main() -> None:
     def quality(g: Gaussians) -> float:
         return round(float(np.mean([psnr(i, render_image(g, c)) for i, c in zip(images, cameras, strict=True)])), 2)
 
-    rows = []
+    rows, group = [], ParametricGroup(1, original)
+    importance = GroupCoder(EncodeSettings()).measure(group, 0)
     for layers in range(1, 5):
-        payload, units = _native.encode_group(code_group(DenseGroup([original]), 50, layers=layers).integers)
+        coder = GroupCoder(EncodeSettings(layers=layers, refine=0))
+        coded, _ = coder.code(None, group, importance, QUALITY, 0)
         for k in range(1, layers + 1):
-            g = Gaussians(**_native.DecodedGroup(payload, LEVEL, layers=k).frame(0))
-            size = sum(u["bytes"] for u in units if u["layer"] < k)
+            g = Gaussians(**_native.DecodedGroup(coded.payload, LEVEL, layers=k).frame(0))
+            size = sum(u["bytes"] for u in coded.units if u["layer"] < k)
             row = {"layers": layers, "prefix": k, "gaussians": len(g), "bytes": size, "codec_psnr": quality(g)}
             if k < layers:
                 tried = {}
@@ -56,7 +59,7 @@ def main() -> None:
                 row["with_best_correction"] = {"codec_psnr": max(tried), **tried[max(tried)]}
             rows.append(row)
             print(row, flush=True)
-    write_result(RESULTS / "layers.json", {"scene": "statue, 101,275 Gaussians, quality 50", "rows": rows})
+    write_result(RESULTS / "layers.json", {"scene": f"statue, 101,275 Gaussians, quality {QUALITY}", "rows": rows})
 
 
 if __name__ == "__main__":

@@ -34,7 +34,8 @@ def main() -> None:
     rows = []
     for t in frames:
         reference = composite(capture.view(camera, t), BACKGROUND)
-        rows.append(np.concatenate([reference, render_image(stream.frame(t), capture.cameras[camera], BACKGROUND)], 1))
+        decoded = render_image(stream.frame(t), capture.camera(camera, t), BACKGROUND)
+        rows.append(np.concatenate([reference, decoded], 1))
     write_png(a.picture, np.concatenate(rows, 0))
 
 

@@ -15,10 +15,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gscodec import _native
 from gscodec.bitstream.quantization import steps_for, subject_radius
 from gscodec.capture import open_capture
-from gscodec.encode.intra_group import group_integers
+from gscodec.encode.coder import GroupCoder
+from gscodec.encode.settings import EncodeSettings
 from gscodec.train.entropy_model import CanonicalRate
 from gscodec.train.model import from_gaussians
 from gscodec.train.settings import train_settings
@@ -35,21 +35,21 @@ def rows(capture, weight: float) -> list[dict]:
     """A row per attribute of a group trained with this weight of the rate term."""
     settings = train_settings("fast", gop=FRAMES, rate_lambda=weight, quality=QUALITY)
     group = next(train_groups(capture, settings))
-    model = from_gaussians(group.frames[0])
-    steps = steps_for(QUALITY, subject_radius(group.frames[0].means))
+    model = from_gaussians(group.canonical)
+    steps = steps_for(QUALITY, subject_radius(group.canonical.means))
     rate = CanonicalRate(model.params["means"], steps, settings.entropy_model)
     estimated = rate.bits(model.params, torch.Generator().manual_seed(0))
     cameras = [capture.cameras[i] for i in capture.indices("train")]
-    integers = group_integers(group, QUALITY, cameras=cameras)
-    count = len(integers["positions"])
+    coder = GroupCoder(EncodeSettings(QUALITY, refine=0), cameras=lambda _: cameras)
+    coded, _ = coder.code(None, group, coder.measure(group, 0), QUALITY, 0)
     return [
         {
             "rate_lambda": weight,
             "attribute": unit["attribute"],
             "estimated": round(estimated[unit["attribute"]].item() / len(model), 2),
-            "coded": round(8 * unit["bytes"] / count, 2),
+            "coded": round(8 * unit["bytes"] / coded.gaussians, 2),
         }
-        for unit in _native.encode_group(integers)[1]
+        for unit in coded.units
         if unit["type"] == "channels"
     ]
 

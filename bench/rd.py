@@ -17,12 +17,15 @@ from pathlib import Path
 import numpy as np
 
 from gscodec.decode import open_stream
-from gscodec.encode.encode import REFINE, EncodeSettings, encode_groups, stream_config
+from gscodec.encode.encode import StreamOutput, encode_groups, stream_config
+from gscodec.encode.settings import EncodeSettings
 from gscodec.errors import UsageError
+from gscodec.fit import fit_groups
 from gscodec.metrics import bd_rate, evaluate_splats, rising
 from gscodec.metrics.bd_rate import shared_psnr
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.model.gaussians import Gaussians
+from gscodec.model.parametric_group import ParametricGroup
 
 from .baselines import BASELINES, Baseline
 from .machine import commit, update_entries
@@ -36,6 +39,7 @@ EVERY = 5  # PSNR is measured on every 5th frame
 ANCHORS = {"videogs": (39, 45), "videogs-raw": (39, 45), "x265": (39, 52)}  # anchor -> range of PSNR of the BD-rate
 ONE_POINT = ("sog", "spz")
 VIDEO = ("videogs", "videogs-raw", "x265", "svt-av1", "gsav")  # SH degree 0 and more than one frame
+Group = DenseGroup | ParametricGroup
 
 
 @dataclass(frozen=True)
@@ -85,10 +89,10 @@ def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[
     if sequence_name in SINGLE and codec in VIDEO:
         return
     sequence = open_case(sequence_name, data, work)
-    groups = [replace(group, frames=list(group.frames)) for group in sequence.groups]
+    groups = [_loaded(group) for group in sequence.groups]
     picked = list(range(0, sequence.frame_count, EVERY))
     settings = {f"quality {q}": {"quality": q} for q in QUALITIES} if codec == OURS else BASELINES[codec].settings
-    alone = {"refine": REFINE} if sequence_name in SINGLE and codec == OURS else {}
+    alone = {"refine": EncodeSettings().rounding.still_views} if sequence_name in SINGLE and codec == OURS else {}
     for name, setting in settings.items():
         if codec == OURS:
             coded = _ours(sequence, groups, setting | alone)
@@ -108,17 +112,22 @@ def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[
         }
 
 
-def _ours(sequence: GaussianSequence, groups: list[DenseGroup], setting: dict) -> Coded:
-    """The sequence through gscodec."""
-    first, longest = groups[0].frames[0], max(map(len, groups))
+def _loaded(group: Group) -> Group:
+    """The group with its frames in memory."""
+    return replace(group, frames=list(group.frames)) if isinstance(group, DenseGroup) else group
+
+
+def _ours(sequence: GaussianSequence, groups: list[Group], setting: dict) -> Coded:
+    """The sequence through gscodec; motion is fitted to dense groups, which counts as encoding."""
+    settings, first = EncodeSettings(**setting), [group.frame(0) for group in groups]
+    fitting = {"random_access": settings.random_access, "quality": settings.quality}
+    most, longest = max(map(len, first)), max(map(len, groups))
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder, "rd.gsv")
-        config = stream_config(
-            fps=sequence.fps, sh_degree=first.sh_degree, gaussians=max(len(g.frames[0]) for g in groups), frames=longest
-        )
+        config = stream_config(fps=sequence.fps, sh_degree=first[0].sh_degree, gaussians=most, frames=longest)
         start = time.perf_counter()
-        inputs = lambda done, _: iter(groups[done:])  # noqa: E731
-        report = encode_groups(inputs, out, config, EncodeSettings(**setting), fingerprint={})
+        fitted = lambda done, _: fit_groups(groups, start=done, **fitting)  # noqa: E731
+        report = encode_groups(fitted, StreamOutput(out, config), settings)
         encode_s = time.perf_counter() - start
         decoded, decode_s = _timed_decoding(lambda: _frames(out))
     return Coded(report.bytes, len(decoded), encode_s, decode_s, decoded.__getitem__)
@@ -138,7 +147,7 @@ def _timed_decoding(decode: Callable[[], list[Gaussians]]) -> tuple[list[Gaussia
     return decoded, float(np.median(seconds))
 
 
-def _peer(baseline: Baseline, groups: list[DenseGroup], picked: list[int], setting: dict) -> Coded:
+def _peer(baseline: Baseline, groups: list[Group], picked: list[int], setting: dict) -> Coded:
     """The sequence through a peer; one that codes frames alone gets only the frames `picked`."""
     shown = [[group.visible(t) for t in range(len(group))] for group in groups]
     numbers = range(sum(map(len, shown)))

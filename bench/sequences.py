@@ -9,12 +9,15 @@ statue-0, playbot, fruit   single frames of SH degree 0, 2 and 3
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from gscodec.errors import UsageError
-from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.model.gaussian_sequence import GaussianSequence
+from gscodec.model.parametric_group import ParametricGroup
 from gscodec.splats import open_sequence
 
 from .animate_splat import animate_splat
@@ -55,14 +58,19 @@ def _lumberjack(data: Path, folder: Path) -> None:
 
     capture = open_capture(existing(data / "lumberjack"))
     writer = SequenceWriter(folder, capture.fps, capture.cameras)
-    for group in train_groups(capture, train_settings("medium", sh_degree=0)):
-        writer.add(_lasting(group))
+    for group in lasting(train_groups(capture, train_settings("medium", sh_degree=0))):
+        writer.add(group)
 
 
-def _lasting(group: DenseGroup) -> DenseGroup:
-    """The group without the Gaussians that do not live in all of its frames."""
-    if group.lifetimes is None:
-        return group
-    lasts = (group.lifetimes == [0, len(group)]).all(1)
-    nodes = group.nodes and replace(group.nodes, rest=group.nodes.rest[lasts])
-    return replace(group, frames=[g.take(lasts) for g in group.frames], lifetimes=None, nodes=nodes)
+def lasting(groups: Iterable[ParametricGroup]) -> Iterator[ParametricGroup]:
+    """Each group without the Gaussians that do not live in all of its frames. A Gaussian whose parent is left out has
+    none."""
+    place = np.full(1, -1, np.int32)  # [N + 1] index among the kept Gaussians of the group before; -1: left out, last
+    for group in groups:
+        count = len(group.canonical)
+        lasts = np.ones(count, bool) if group.lifetimes is None else (group.lifetimes == [0, len(group)]).all(1)
+        index = np.flatnonzero(lasts)
+        kept = group.take(index)
+        yield replace(kept, lifetimes=None, parents=None if kept.parents is None else place[kept.parents])
+        place = np.full(count + 1, -1, np.int32)
+        place[index] = np.arange(len(index))

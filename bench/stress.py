@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.model.gaussian_sequence import DenseGroup
 from gscodec.model.gaussians import Gaussians
+from gscodec.model.parametric_group import ParametricGroup
 
 from . import train
 from .machine import update_entries
@@ -85,7 +85,7 @@ def compare(name: str, scene: Scene, **budget) -> dict:
     alone, alone_seconds = train.every_frame_alone(capture, chosen, settings)
     part = train.part(capture, chosen)
     theirs = train.evaluate(part, alone)
-    alone_size, _, _ = train.coded(part, [DenseGroup([g]) for g in alone], settings)
+    alone_size, _, _ = train.coded(part, [ParametricGroup(1, g) for g in alone], settings)
     there = [t for t in range(capture.frame_count) if _subject(capture, t)]
     both = [(t, i) for i, t in enumerate(chosen) if t in there]
     loss = [theirs["per_frame"][i]["psnr_fg"] - ours["per_frame"][t]["psnr_fg"] for t, i in both]

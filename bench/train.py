@@ -24,8 +24,9 @@ import numpy as np
 
 from gscodec.capture import Capture
 from gscodec.errors import UsageError
-from gscodec.model.gaussian_sequence import DenseGroup
+from gscodec.model.camera import Camera
 from gscodec.model.gaussians import Gaussians
+from gscodec.model.parametric_group import ParametricGroup
 
 from .machine import update_entries
 from .still import still_share
@@ -146,10 +147,11 @@ def measure(run: Run, data: Path) -> Iterator[dict]:
 def _ours(capture: Capture, frames: range, settings) -> Iterator[tuple]:
     if frames.step != 1:
         raise UsageError("gscodec follows what moves: it needs every frame, expected a range without a step")
-    groups, trained = sequence(part(capture, frames), settings)
+    own = part(capture, frames)
+    groups, trained = sequence(own, settings)
     yield "model", trained, None, shown(groups)
-    size, decoded, seconds = coded(part(capture, frames), groups, settings)
-    share, bits = still_share(groups[0], settings.quality, [c for c in capture.cameras if c.split == "train"])
+    size, decoded, seconds = coded(own, groups, settings)
+    share, bits = still_share(groups[0], settings.quality, training_cameras(own, len(groups[0]) // 2))
     still = {"still_gaussians": round(share, 3), "still_bits": round(bits, 4)}
     yield "gscodec", trained + seconds, size, decoded, still
 
@@ -157,7 +159,7 @@ def _ours(capture: Capture, frames: range, settings) -> Iterator[tuple]:
 def _alone(capture: Capture, frames: range, settings) -> Iterator[tuple]:
     models, seconds = every_frame_alone(capture, frames, settings)
     yield "alone", seconds, None, models
-    size, decoded, more = coded(part(capture, frames), [DenseGroup([g]) for g in models], settings)
+    size, decoded, more = coded(part(capture, frames), [ParametricGroup(1, g) for g in models], settings)
     yield "alone-coded", seconds + more, size, decoded
 
 
@@ -176,7 +178,7 @@ def _v3(capture: Capture, frames: range, settings) -> Iterator[tuple]:
     yield "v3-coded", time.perf_counter() - start, size, decoded
 
 
-def sequence(capture: Capture, settings) -> tuple[list[DenseGroup], float]:
+def sequence(capture: Capture, settings) -> tuple[list[ParametricGroup], float]:
     """Trains the capture; returns the groups and the seconds."""
     from gscodec.train.train import train_groups
 
@@ -184,22 +186,38 @@ def sequence(capture: Capture, settings) -> tuple[list[DenseGroup], float]:
     return list(train_groups(capture, settings)), time.perf_counter() - start
 
 
-def shown(groups: list[DenseGroup]) -> list[Gaussians]:
+def shown(groups: list[ParametricGroup]) -> list[Gaussians]:
     """The Gaussians of each frame that live in it."""
     return [group.visible(t) for group in groups for t in range(len(group))]
 
 
-def coded(capture: Capture, groups: list[DenseGroup], settings) -> tuple[int, list[Gaussians], float]:
-    """Codes the groups; returns the bytes of the stream, its decoded frames and the seconds of coding."""
+def training_cameras(capture: Capture, t: int) -> list[Camera]:
+    """The cameras for training, as they stand at frame `t`."""
+    return [capture.camera(i, t) for i in capture.indices("train")]
+
+
+def coded(capture: Capture, groups: list[ParametricGroup], settings) -> tuple[int, list[Gaussians], float]:
+    """Codes the groups, refined by the pictures of the capture where training has calibrated its cameras.
+
+    Returns:
+        Bytes of the stream, its decoded frames, seconds of coding.
+    """
     from gscodec.decode import open_stream
-    from gscodec.encode.encode import EncodeSettings, encode_groups, stream_config
+    from gscodec.encode.encode import StreamOutput, encode_groups, stream_config
+    from gscodec.encode.settings import EncodeSettings
+    from gscodec.train.refinement import PictureRefinement
 
     degree, most = settings.sh_degree, settings.gaussians_max
     config = stream_config(fps=capture.fps, sh_degree=degree, gaussians=most, frames=settings.gop)
     with tempfile.TemporaryDirectory() as folder:
         out, start = Path(folder) / "out.gsv", time.perf_counter()
-        quality = EncodeSettings(settings.quality)
-        encode_groups(lambda *_: iter(groups), out, config, quality, fingerprint={}, capture=capture)
+        encode_groups(
+            lambda done, _: iter(groups[done:]),
+            StreamOutput(out, config),
+            EncodeSettings(settings.quality),
+            cameras=lambda t: training_cameras(capture, t),
+            refine_by_pictures=PictureRefinement(capture, settings.refinement),
+        )
         seconds, stream = time.perf_counter() - start, open_stream(out)
         return out.stat().st_size, [stream.frame(t) for t in range(stream.frame_count)], seconds
 

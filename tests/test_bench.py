@@ -3,22 +3,29 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import turning
+from synthetic import blob, turning
 
 pytest.importorskip("torch")
 
 from bench.ablation import FRAMES, VARIANTS, WHOLE
 from bench.animate_splat import Motion, animate_splat, animated
-from bench.machine import ROOT, write_result
+from bench.machine import RESULTS, ROOT, write_result
 from bench.plots.charts import draw_charts
 from bench.raster import measure, run
 from bench.scenes import capsule, capsule_camera
+from bench.sequences import lasting
+from bench.still import still_share
 from bench.train import held_out
 from gscodec.capture import open_capture
 from gscodec.errors import CaptureError, UsageError
+from gscodec.fit import fit_groups
+from gscodec.model.gaussian_sequence import DenseGroup
+from gscodec.model.parametric_group import ParametricGroup
+from gscodec.render import sensitivity
 from gscodec.splats import write_splat
 from gscodec.splats.ply_table import read_table
 from gscodec.train.settings import train_settings
@@ -96,6 +103,35 @@ def test_each_variant_of_the_ablation_changes_the_settings():
     assert len(set(map(repr, changed.values()))) == len(changed), "two variants are the same"
     assert all(v.captures for v in VARIANTS.values())
     assert {c for v in VARIANTS.values() for c in v.captures} == set(FRAMES)
+
+
+def test_each_entry_of_the_ablation_can_be_measured_again():
+    entries = json.loads((RESULTS / "ablation.json").read_text())["entries"]
+    assert all(e["capture"] in VARIANTS[e["variant"]].captures for e in entries)
+
+
+def test_still_gaussians_cost_less_than_moving_ones(monkeypatch):
+    monkeypatch.setattr(sensitivity, "SIZE", 128)
+    g = blob(400)
+    shift = np.where(np.arange(400) < 100, 0.1, 0.0)[:, None] * np.random.default_rng(0).standard_normal((400, 3))
+    moving = DenseGroup([replace(g, means=(g.means + t * shift).astype(np.float32)) for t in range(4)])
+    share, bits = still_share(next(fit_groups([moving])), 50.0, [])
+    assert share == pytest.approx(0.75, abs=0.02)
+    assert 0 < bits < 0.5
+    assert still_share(next(fit_groups([DenseGroup([g] * 4)])), 50.0, [])[0] == 1
+
+
+def test_what_lasts_keeps_its_parents():
+    whole, short = [0, 2], [0, 1]
+    lives = [np.array([whole, short, whole]), np.array([whole, whole, short, whole])]
+    parents = [None, np.array([2, 1, 0, -1])]
+    groups = [
+        ParametricGroup(2, blob(len(life)), lifetimes=life, parents=p) for life, p in zip(lives, parents, strict=True)
+    ]
+    first, second = lasting(groups)
+    assert first.lifetimes is second.lifetimes is first.parents is None
+    np.testing.assert_array_equal(first.canonical.means, blob(3).means[[0, 2]])
+    assert second.parents.tolist() == [1, -1, -1], "of one that was left out, and of none"
 
 
 @pytest.mark.parametrize("script", [p for p in BENCH.glob("*.py") if "__main__" in p.read_text()], ids=lambda p: p.stem)
