@@ -56,7 +56,7 @@ FREE = """async ([count]) => {
     const next = () => new Promise((done) => engine.addEventListener("picture", done, { once: true }));
     const ask = () => {
         engine.want(engine.groupOf(t), true);
-        while (engine.free && engine.ready(engine.groupOf(t))) {
+        while (engine.renderer.free && engine.ready(engine.groupOf(t))) {
             engine.draw(t, view);
             t = (t + 1) % player.frameCount;
         }
