@@ -18,6 +18,8 @@ from bench.stress_scenes import walking
 from gscodec import _native, progress
 from gscodec import atomic_write as part_file
 from gscodec.cli import main
+from gscodec.commands import encode as encode_command
+from gscodec.commands import train as train_command
 from gscodec.encode import encode, writer
 from gscodec.render import sensitivity
 from gscodec.splats import sequence_writer
@@ -89,7 +91,7 @@ def _arm(where: str, n: int, stop) -> None:
                 stop()
             super().finish(**k)
 
-    progress.Bar = Stopping
+    encode_command.Bar = train_command.Bar = Stopping
     writer.write_arrays = half("state", part_file.write_arrays)
     checkpoint.write_arrays = half("checkpoint", part_file.write_arrays)
     sequence_writer.write_ply = half("sequence", sequence_writer.write_ply)

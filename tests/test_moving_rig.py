@@ -98,7 +98,7 @@ def test_wrong_poses_stay_as_wrong_as_they_are():
 
 def psnr_of_second(capture: Capture, truth: Capture) -> float:
     """psnr_fg on the test camera of `truth` after a short training on `capture`, in frame 1."""
-    frames = [g for group in train_groups(capture, TINY) for g in group.frames]
+    frames = [g for group in train_groups(capture, TINY) for g in map(group.frame, range(len(group)))]
     return evaluate_capture(lambda t: frames[t], truth, with_vmaf=False)["per_frame"][1]["psnr_fg"]
 
 

@@ -7,18 +7,25 @@ import numpy as np
 import pytest
 import torch
 from synthetic import blob, turning
+from synthetic import coded as one_group
 
 from bench.train import coded
 from gscodec import _native
 from gscodec.bitstream.quantization import steps_for, subject_radius
+from gscodec.bitstream.quantized_group import QuantizedTrajectories
 from gscodec.capture.capture import Capture
 from gscodec.capture.images import View
-from gscodec.encode.intra_group import code_group, group_integers
+from gscodec.encode.coded_form import coded_form
+from gscodec.encode.measure import measure_group
+from gscodec.encode.quantization_plan import plan_group
+from gscodec.encode.quantize import quantize
+from gscodec.encode.settings import EncodeSettings
 from gscodec.errors import CaptureError, UsageError
 from gscodec.metrics.image import psnr
 from gscodec.model.camera import Camera, look_at
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.model.gaussians import concatenate
+from gscodec.model.parametric_group import ParametricGroup
 from gscodec.model.rotations import quat_to_matrix, rotvec_to_quat
 from gscodec.render.cpu import CpuBackend
 from gscodec.render.image import render_image, render_rgba
@@ -235,13 +242,13 @@ def test_harmonics_stay_where_colours_depend_on_the_view(gloss, kept):
     capture = capture_of(glossy(gloss))
     settings = dataclasses.replace(TINY, gop=2, keyframe_steps=500)
     (group,) = train_groups(capture, settings)
-    assert [g.shN.shape[1] for g in group.frames] == [kept] * 2
+    assert [g.shN.shape[1] for g in map(group.frame, range(2))] == [kept] * 2
     if kept:
-        plain = dataclasses.replace(group.frames[1], shN=group.frames[1].shN[:, :0])
-        assert psnr_of(group.frames[1], capture, 1) > psnr_of(plain, capture, 1) + 0.5
+        plain = dataclasses.replace(group.frame(1), shN=group.frame(1).shN[:, :0])
+        assert psnr_of(group.frame(1), capture, 1) > psnr_of(plain, capture, 1) + 0.5
     _, decoded, _ = coded(capture, [group], settings)
     assert decoded[1].shN.shape[1] == kept
-    assert psnr_of(decoded[1], capture, 1) > psnr_of(group.frames[1], capture, 1) - 1
+    assert psnr_of(decoded[1], capture, 1) > psnr_of(map(group.frame, range(2))[1], capture, 1) - 1
 
 
 def test_tracking_finds_the_turn(capture):
@@ -262,7 +269,7 @@ def test_tracking_finds_the_turn(capture):
     group = GroupModel(
         tracker.graph, None, models, poses, steps_for(50, 1.0), torch.ones(len(key), dtype=torch.bool), TINY
     )
-    assert psnr_of(group.gaussians(2), capture, 2) > psnr_of(truth.frame(0), capture, 2) + 4
+    assert psnr_of(group.group(None).frame(2), capture, 2) > psnr_of(truth.frame(0), capture, 2) + 4
     carried = np.abs(truth.frame(2).means - group.means[2].numpy()).mean()
     assert carried < 0.3 * still, "the nodes have found it, not the Gaussians each for itself"
 
@@ -354,8 +361,8 @@ def test_light_that_comes_on_ends_a_group_and_not_the_subject():
     first, second = train_groups(capture, dataclasses.replace(TINY, gop=8))
     assert (len(first), len(second)) == (5, 2)
     assert second.parents is not None
-    np.testing.assert_array_equal(first.frames[0].sh0, first.frames[4].sh0)
-    still = psnr_of(first.frames[0], capture, 0)
+    np.testing.assert_array_equal(first.frame(0).sh0, first.frame(4).sh0)
+    still = psnr_of(first.frame(0), capture, 0)
     assert min(psnr_of(g, capture, 5) for g in second.frames) > still - 2
 
 
@@ -376,14 +383,14 @@ def test_laplace_bits_are_code_lengths():
 def test_rate_term_tracks_the_coders_bits():
     """The loss and the coder agree on what a set of residual trajectories costs, up to 20 %."""
     sequence = turning(6000, frames=4)
-    integers = group_integers(sequence.groups[0], 50, keep_all=True)
-    n = len(integers["positions"])
+    _, integers = one_group(sequence.groups[0], 50, keep_all=True)
+    n = len(integers)
     rng = np.random.default_rng(0)
     predicted, coded = [], []
     for scale in (0.15, 0.4, 1.0, 3.0):
         c = np.rint(rng.laplace(0, scale, (2, 3, n))).astype(np.int32)
-        trajectories = {"means": {"coefficients": c, "step": 0.01}}
-        units = _native.encode_group({**integers, "trajectories": trajectories})[1]
+        trajectories = {"means": QuantizedTrajectories(c, 0.01)}
+        units = _native.encode_group(dataclasses.replace(integers, trajectories=trajectories))[1]
         coded.append(8 * sum(u["bytes"] for u in units if u["type"] == "trajectories"))
         x = torch.from_numpy(c).float()
         log_scale = torch.zeros(2, 1, 1, requires_grad=True)
@@ -424,11 +431,16 @@ def test_rate_of_one_gaussian_is_finite():
 
 def coded_bits(rate, model, quality):
     """Bits of each attribute's channels at the steps of `rate`."""
-    group = code_group(DenseGroup([model.gaussians()]), quality, keep_all=True, layers=1)
+    group, settings = ParametricGroup(1, model.gaussians()), EncodeSettings(keep_all=True, layers=1)
+    form = coded_form(group, np.full(len(model), -1))
+    importance = measure_group(group, [], settings.plan).with_axes(form.axis_order)
+    q = quantize(form, plan_group(form, importance, quality, settings), settings.rdo)
+    channels = dict(q.integers.channels)
     for name, x in rate.channels(model.params).items():
-        integers = np.rint(x.numpy()[group.source].T).astype(np.int32)
-        group.integers["channels"][name]["values"] = integers - np.median(integers, 1, keepdims=True).astype(np.int32)
-    units = _native.encode_group(group.integers)[1]
+        values = np.rint(x.numpy()[q.form.index].T).astype(np.int32)
+        values -= np.median(values, 1, keepdims=True).astype(np.int32)
+        channels[name] = dataclasses.replace(channels[name], values=np.ascontiguousarray(values))
+    units = _native.encode_group(dataclasses.replace(q.integers, channels=channels))[1]
     return {u["attribute"]: 8 * u["bytes"] for u in units if u["type"] == "channels"}
 
 
@@ -464,14 +476,14 @@ def test_groups_come_out_whole_and_a_stopped_run_goes_on(capture, tmp_path):
         if len(groups) == 1:
             assert Checkpoint(tmp_path).load(3) is not None
     assert [len(g) for g in groups] == [3, 2]
-    np.testing.assert_array_equal(groups[1].parents, np.arange(len(groups[0].frames[0])))
+    np.testing.assert_array_equal(groups[1].parents, np.arange(len(groups[0].frame(0))))
     assert done[-1][0] == done[-1][1], "progress ends at its total"
-    assert psnr_of(groups[1].frames[1], capture, 4) > 21
+    assert psnr_of(groups[1].frame(1), capture, 4) > 21
     # The first group again from nothing, the second from the checkpoint of the first.
     first = next(iter(train_groups(capture, TINY, checkpoints=tmp_path / "again")))
-    np.testing.assert_array_equal(first.frames[2].means, groups[0].frames[2].means)
+    np.testing.assert_array_equal(first.frame(2).means, groups[0].frame(2).means)
     (rest,) = train_groups(capture, TINY, first_frame=3, checkpoints=tmp_path / "again")
-    np.testing.assert_array_equal(rest.frames[1].means, groups[1].frames[1].means)
+    np.testing.assert_array_equal(rest.frame(1).means, groups[1].frame(1).means)
 
 
 def test_segments_are_trained_without_a_look_at_others(capture):
@@ -482,7 +494,7 @@ def test_segments_are_trained_without_a_look_at_others(capture):
     assert [len(g) for g in whole] == [2, 1, 2]
     assert [g.parents is None for g in whole] == [True, False, True]
     (alone,) = train_segment(lambda: capture, settings, 3, range(3, 5))
-    np.testing.assert_array_equal(alone.frames[1].means, whole[2].frames[1].means)
+    np.testing.assert_array_equal(alone.frame(1).means, whole[2].frame(1).means)
     np.testing.assert_array_equal(alone.nodes.translations, whole[2].nodes.translations)
 
 

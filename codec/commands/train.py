@@ -51,8 +51,8 @@ def train_to_folder(
     require("torch", "training a capture")
     from ..splats import SequenceWriter
     from ..train.checkpoint import Checkpoint
-    from ..train.train import train_groups
     from ..train.settings import train_settings
+    from ..train.train import train_groups
     from .sources import limit_torch_threads
 
     limit_torch_threads()

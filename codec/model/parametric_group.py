@@ -53,8 +53,8 @@ def checked_parents(parents: np.ndarray, count: int, before: int) -> np.ndarray:
     known = parents[parents >= 0]
     if parents.shape != (count,) or len(np.unique(known)) < len(known) or known.max(initial=-1) >= before:
         raise CaptureError(
-            f"parents of a group: expected, for each of its {count} Gaussians, another one of the {before} of the group "
-            f"before, or -1"
+            f"parents of a group: expected, for each of its {count} Gaussians, another one of the {before} of the "
+            f"group before, or -1"
         )
     return parents
 
@@ -100,6 +100,8 @@ class ParametricGroup:
         Raises:
             IndexError: `t` is not in the group.
         """
+        if not 0 <= t < self.frame_count:
+            raise IndexError(f"frame {t} of a group of {self.frame_count}")
         return Gaussians(**self._evaluator.frame(t))
 
     def visible(self, t: int) -> Gaussians:

@@ -65,6 +65,8 @@ def quat_to_rotvec(q, near=None):
     axis = q[..., 1:] / sine.clip(1e-12, None)
     angle = 2 * xp.arctan2(sine, q[..., :1])
     if near is not None:
+        length = xp.sqrt((near * near).sum(-1))[..., None]
+        axis = xp.where(sine < 1e-7, near / length.clip(1e-12, None), axis)  # a whole turn has no axis of its own
         off = (near * axis).sum(-1)[..., None] - angle
         angle = angle + 2 * np.pi * xp.round(off / (2 * np.pi))
     return axis * angle

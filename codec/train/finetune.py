@@ -15,9 +15,9 @@ import torch
 
 from ..bitstream.color import STEP_WEIGHTS
 from ..bitstream.quantization import Steps, trajectory_step
-from ..model.temporal_transform import dct_basis
 from ..model.parametric_group import NodeMotion, ParametricGroup
 from ..model.rotations import quat_conjugate, quat_multiply, quat_to_rotvec
+from ..model.temporal_transform import dct_basis
 from .deformation_graph import NodeGraph, Pose
 from .entropy_model import CanonicalRate, laplace_bits
 from .model import NAMES, REMOVED_LOGIT, Model

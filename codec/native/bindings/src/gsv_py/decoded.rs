@@ -3,6 +3,7 @@
 use super::group_from::group_from;
 use super::parametric::{carried, frame};
 use super::values::{bytes_of, raise};
+use gsv::attributes::sh_coefficients;
 use gsv::companding::{Companding, PIECES};
 use gsv::conformance::Damage;
 use gsv::decode::{Decoding, decode_damaged, decode_group};
@@ -136,7 +137,7 @@ impl DecodedGroup {
     /// Attributes of frame `t` of all Gaussians, f32: views of one array, since few large pages are had faster than many small ones.
     fn frame<'py>(&self, py: Python<'py>, t: u16) -> PyResult<Bound<'py, PyDict>> {
         self.check(t)?;
-        frame(py, &self.evaluator.parametric(), t)
+        frame(py, &self.evaluator.parametric(), t, sh_coefficients(self.sh_degree()))
     }
 
     /// [N] bool: which Gaussians frame `t` shows; None: all.

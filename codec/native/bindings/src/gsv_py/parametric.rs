@@ -33,6 +33,7 @@ type Nodes<'py> = (
 pub struct ParametricEvaluator {
     frames: u16,
     rest: Frame,
+    sh_coefficients: usize,
     blend: Blend,
     nodes: Vec<[f32; 3]>,
     node_motion: Trajectories<f32>,
@@ -51,6 +52,21 @@ impl ParametricEvaluator {
         trajectories: Vec<(String, PyReadonlyArray3<f32>)>,
     ) -> PyResult<Self> {
         let n = canonical.0.shape()[0];
+        let k = canonical.5.shape()[1];
+        let widths = [
+            ("means", canonical.0.shape(), vec![n, 3]),
+            ("quats", canonical.1.shape(), vec![n, 4]),
+            ("log_scales", canonical.2.shape(), vec![n, 3]),
+            ("logit_opacities", canonical.3.shape(), vec![n]),
+            ("sh0", canonical.4.shape(), vec![n, 3]),
+            ("shN", canonical.5.shape(), vec![n, k, 3]),
+        ];
+        if let Some((name, found, expected)) = widths.iter().find(|(_, found, expected)| *found != &expected[..]) {
+            return invalid(format!("{name}: expected shape {expected:?}, got {found:?}"));
+        }
+        if !(0..=3).map(sh_coefficients).any(|c| c == k) {
+            return invalid(format!("shN: expected 0, 3, 8 or 15 coefficients, got {k}"));
+        }
         let rest = Frame {
             means: canonical.0.as_slice()?.as_chunks().0.to_vec(),
             quats: canonical.1.as_slice()?.as_chunks().0.to_vec(),
@@ -61,9 +77,9 @@ impl ParametricEvaluator {
         };
         let (mut blend, mut places, mut node_motion) = (Blend::default(), Vec::new(), Trajectories::new(6));
         if let Some((positions, coefficients, index, weight)) = nodes {
-            blend = blend_of(&index, &weight, n)?;
             places = positions.as_slice()?.as_chunks().0.to_vec();
             node_motion = sparse(py, &coefficients, 6, places.len(), "nodes")?;
+            blend = blend_of(&index, &weight, n, places.len())?;
         }
         let mut motions = Vec::new();
         for (name, values) in trajectories {
@@ -80,6 +96,7 @@ impl ParametricEvaluator {
         Ok(ParametricEvaluator {
             frames,
             rest,
+            sh_coefficients: k,
             blend,
             nodes: places,
             node_motion,
@@ -95,7 +112,7 @@ impl ParametricEvaluator {
                 self.frames
             )));
         }
-        frame(py, &self.parametric(), t)
+        frame(py, &self.parametric(), t, self.sh_coefficients)
     }
 
     /// Means [T, N, 3] and quaternions [T, N, 4] wxyz of all frames.
@@ -126,13 +143,21 @@ impl ParametricEvaluator {
     }
 }
 
-fn blend_of(index: &PyReadonlyArray2<u32>, weight: &PyReadonlyArray2<f32>, count: usize) -> PyResult<Blend> {
+fn blend_of(
+    index: &PyReadonlyArray2<u32>,
+    weight: &PyReadonlyArray2<f32>,
+    count: usize,
+    nodes: usize,
+) -> PyResult<Blend> {
     if index.shape() != weight.shape() || index.shape()[0] != count {
         return invalid(format!(
             "neighbors and weights: expected shape [{count}, k] of both, got {:?} and {:?}",
             index.shape(),
             weight.shape()
         ));
+    }
+    if index.as_slice()?.iter().any(|j| *j as usize >= nodes) {
+        return invalid(format!("neighbors: expected indices of {nodes} nodes"));
     }
     Ok(Blend {
         per: index.shape()[1],
@@ -186,11 +211,14 @@ fn sparse(
 /// Gaussians whose coefficients are transposed together: what fits a cache.
 const BLOCK: usize = 256;
 
-/// Attributes of a frame: views of one array, since few large pages are had faster than many small ones.
-pub fn frame<'py, V: Coefficient>(py: Python<'py>, p: &Parametric<V>, t: u16) -> PyResult<Bound<'py, PyDict>> {
+/// Attributes of a frame, with `k` coefficients of the higher bands: views of one array, since few large pages are had faster than many small ones.
+pub fn frame<'py, V: Coefficient>(
+    py: Python<'py>,
+    p: &Parametric<V>,
+    t: u16,
+    k: usize,
+) -> PyResult<Bound<'py, PyDict>> {
     let n = p.rest.means.len();
-    let k = p.rest.sh_n.len() / (3 * n.max(1));
-    let k = (0..=3).map(sh_coefficients).find(|c| *c == k).unwrap_or(0);
     let shapes = [
         ("means", vec![n, 3]),
         ("quats", vec![n, 4]),
@@ -284,8 +312,12 @@ pub fn blend_rigid<'py>(
     neighbors: PyReadonlyArray2<'py, u32>,
     weights: PyReadonlyArray2<'py, f32>,
 ) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
-    let (x, nodes) = (rest.as_slice()?.as_chunks::<3>().0, self::poses(&poses)?);
-    let blend = blend_of(&neighbors, &weights, x.len())?;
+    let (x, nodes, poses_len) = (
+        rest.as_slice()?.as_chunks::<3>().0,
+        self::poses(&poses)?,
+        poses.shape()[0],
+    );
+    let blend = blend_of(&neighbors, &weights, x.len(), poses_len)?;
     let (mut means, mut rotations) = (vec![[0.0f32; 3]; x.len()], vec![[0.0f32; 4]; x.len()]);
     py.detach(|| nodes.carry(&blend, x, (&mut means, &mut rotations), |_, x, q| (x, q)));
     let means = means
@@ -308,8 +340,12 @@ pub fn blend_rigid_backward<'py>(
     by_means: PyReadonlyArray2<'py, f32>,
     by_rotations: PyReadonlyArray2<'py, f32>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let (x, nodes) = (rest.as_slice()?.as_chunks::<3>().0, self::poses(&poses)?);
-    let blend = blend_of(&neighbors, &weights, x.len())?;
+    let (x, nodes, poses_len) = (
+        rest.as_slice()?.as_chunks::<3>().0,
+        self::poses(&poses)?,
+        poses.shape()[0],
+    );
+    let blend = blend_of(&neighbors, &weights, x.len(), poses_len)?;
     let (g, h) = (
         by_means.as_slice()?.as_chunks().0,
         by_rotations.as_slice()?.as_chunks().0,
