@@ -377,7 +377,7 @@ def test_a_changed_input_is_named(tmp_path):
     StreamWriter(
         tmp_path / "a.gsv", config, {"settings": {"quality": 50}, "input": {"files": {"a.png": [1, 2]}}}
     ).close()
-    with pytest.warns(UserWarning, match=r"made anew: a\.png has changed, settings\.quality was 50, is 60"):
+    with pytest.warns(UserWarning, match=r"made differently: a\.png has changed, settings\.quality was 50, is 60"):
         StreamWriter(
             tmp_path / "a.gsv", config, {"settings": {"quality": 60}, "input": {"files": {"a.png": [1, 3]}}}
         ).close()

@@ -1,12 +1,15 @@
 """Runs that are stopped at any moment: what is there plays, and what comes out in the end is what would have come."""
 
+import shutil
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
 from interrupting import gscodec, write_capture
 
 from gscodec.decode import open_stream
+from gscodec.fingerprint import inputs, program, sentence
 
 ENCODE = ("--preset", "fast", "--gop", "2")
 MOMENTS = [
@@ -89,3 +92,27 @@ def test_train_goes_on(capture, tmp_path):
         else:
             assert (whole / name).read_bytes() == (folder / name).read_bytes(), name
     assert "sequence.json" in files
+
+
+def test_train_and_then_encode_is_encode(tmp_path):
+    """On the bundled capture, to the byte; and where the capture is gone, a sentence says what that costs."""
+    example = tmp_path / "lumberjack"
+    shutil.copytree(Path(__file__).parent.parent / "examples" / "lumberjack", example)
+    options = ("--preset", "fast", "--gop", "2", "--frames", "0:3")
+    assert gscodec("encode", example, tmp_path / "whole.gsv", *options) == 0
+    assert gscodec("train", example, tmp_path / "plys", *options) == 0
+    assert gscodec("encode", tmp_path / "plys", tmp_path / "halves.gsv") == 0
+    assert (tmp_path / "halves.gsv").read_bytes() == (tmp_path / "whole.gsv").read_bytes()
+    example.rename(tmp_path / "moved")
+    assert gscodec("encode", tmp_path / "plys", tmp_path / "gone.gsv") == 0
+    assert (tmp_path / "gone.gsv").read_bytes() != (tmp_path / "whole.gsv").read_bytes()
+
+
+def test_a_changed_picture_is_named(tmp_path):
+    write_capture(tmp_path, frames=2)
+    before = {"program": program(), "input": inputs(tmp_path), "settings": {"quality": 50}}
+    picture = next(tmp_path.rglob("*.png"))
+    picture.write_bytes(picture.read_bytes() + b" ")
+    after = before | {"input": inputs(tmp_path)}
+    assert sentence(before, after) == f"{picture.relative_to(tmp_path)} has changed"
+    assert sentence(before, before) == ""

@@ -248,7 +248,7 @@ def test_harmonics_stay_where_colours_depend_on_the_view(gloss, kept):
         assert psnr_of(group.frame(1), capture, 1) > psnr_of(plain, capture, 1) + 0.5
     _, decoded, _ = coded(capture, [group], settings)
     assert decoded[1].shN.shape[1] == kept
-    assert psnr_of(decoded[1], capture, 1) > psnr_of(map(group.frame, range(2))[1], capture, 1) - 1
+    assert psnr_of(decoded[1], capture, 1) > psnr_of(group.frame(1), capture, 1) - 1
 
 
 def test_tracking_finds_the_turn(capture):
@@ -363,7 +363,7 @@ def test_light_that_comes_on_ends_a_group_and_not_the_subject():
     assert second.parents is not None
     np.testing.assert_array_equal(first.frame(0).sh0, first.frame(4).sh0)
     still = psnr_of(first.frame(0), capture, 0)
-    assert min(psnr_of(g, capture, 5) for g in second.frames) > still - 2
+    assert min(psnr_of(g, capture, 5) for g in map(second.frame, range(len(second)))) > still - 2
 
 
 def test_laplace_bits_are_code_lengths():

@@ -93,5 +93,7 @@ def _goes_on(unfinished: Path, made_by: dict) -> bool:
         return False
     before, now = json.loads(unfinished.read_text()), json.loads(json.dumps(made_by))
     if before != now:
-        warnings.warn(f"{unfinished.parent} is trained anew: {sentence(before, now)}", stacklevel=2)
+        warnings.warn(
+            f"{unfinished.parent} starts anew, it was made differently: {sentence(before, now)}", stacklevel=2
+        )
     return before == now

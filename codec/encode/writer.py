@@ -54,7 +54,7 @@ class StreamWriter:
             before = json.loads(self._made_by.read_text())
             if before != fingerprint:
                 changed = sentence(before, fingerprint)
-                warnings.warn(f"{self.part} is not gone on with, it is made anew: {changed}", stacklevel=4)
+                warnings.warn(f"{self.part} starts anew, it was made differently: {changed}", stacklevel=4)
                 return False
             with open(self.part, "rb") as f, mmap.mmap(f.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 if data[: len(self.init)] != self.init:
