@@ -55,7 +55,7 @@ VARIANTS = {
     "no cuts": Variant(run_with(cut_ratio=math.inf)),
     "cut ratio 1.5": Variant(run_with(cut_ratio=1.5)),
     "cut ratio 3": Variant(run_with(cut_ratio=3.0)),
-    "colours held in tracking": Variant(stage_with("tracking", rates=replace(TRACKING.rates, sh0=0.0, shN=0.0))),
+    "colours held in tracking": Variant(stage_with("tracking", rates=TRACKING.rates.but(sh0=0.0, shN=0.0))),
     "full-size pictures only": Variant(stage_with("tracking", small_scale=1.0)),
     "nothing held still": Variant(stage_with("change_detection", threshold=-1.0)),
     "no noise on canonical values": Variant(stage_with("finetune", canonical_noise=False)),
@@ -67,7 +67,7 @@ VARIANTS = {
             "tracking",
             node_rotation_rate=0.0,
             node_translation_rate=0.0,
-            rates=replace(TRACKING.rates, means=TRACKING.node_translation_rate),
+            rates=TRACKING.rates.but(means=TRACKING.node_translation_rate),
         )
     ),
 }

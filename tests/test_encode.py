@@ -100,7 +100,7 @@ def test_nodes_carry_a_rigid_motion():
     assert len(fitted.nodes.positions) == 1, "a rigid body needs one node"
     means = np.stack([g.means for g in group.frames])
     left, moved = np.abs(means - fitted.carried()[0]).max(), np.abs(means - means[4]).max()
-    assert left < 3 * steps_for(60, 1.0).means < 0.1 * moved
+    assert left < 3 * steps_for(60, 1.0)["means"] < 0.1 * moved
 
 
 def test_a_fit_loses_nothing():
@@ -133,15 +133,15 @@ def test_stream_keeps_the_content_up_to_order_and_symmetry(tmp_path, sh_count):
         assert len(np.unique(i)) == len(a) == len(b)
         b = b.take(i)
         steps = steps_for(90, subject_radius(a.means))
-        assert np.abs(a.means - b.means).max() < 4 * steps.means
-        assert np.abs(a.sh0 - b.sh0).max() < 2 * steps.sh0
-        assert np.abs(a.logit_opacities - b.logit_opacities).max() < 2 * steps.logit_opacities
+        assert np.abs(a.means - b.means).max() < 4 * steps["means"]
+        assert np.abs(a.sh0 - b.sh0).max() < 2 * steps["sh0"]
+        assert np.abs(a.logit_opacities - b.logit_opacities).max() < 2 * steps["logit_opacities"]
         ca, cb = covariances(a), covariances(b)
         error = np.linalg.norm(ca - cb, axis=(1, 2)) / np.linalg.norm(ca, axis=(1, 2))
         assert np.median(error) < 0.05
         assert error.max() < 0.3
         if sh_count:
-            assert np.abs(a.shN - b.shN).max() < 3 * steps.shN
+            assert np.abs(a.shN - b.shN).max() < 3 * steps["shN"]
 
 
 def test_higher_quality_costs_more_and_errs_less(tmp_path):

@@ -415,7 +415,7 @@ def test_canonical_rate_is_what_the_coder_pays_and_falls_along_its_gradient():
         assert estimated[name].item() == pytest.approx(before[name], rel=0.15), name
     model.start_optimizer(CpuBackend(), TINY.adam)
     for _ in range(60):
-        rates = {n: 0.1 * getattr(steps, n) for n in names}
+        rates = {n: 0.1 * steps[n] for n in names}
         model.step(rate.gradients(model.params, noise)[1], rates)
     after = coded_bits(rate, model, 62)
     for name in names:

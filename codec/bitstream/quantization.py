@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..model.attributes import ATTRIBUTES
+
 QUALITY_DEFAULT = 50.0
 QUALITY_HALVES = 12.0  # so many points of quality halve every step (6 dB)
 PSNR_DEFAULT = 41.0  # against the input, at QUALITY_DEFAULT
@@ -20,30 +22,25 @@ MODEL = 2.4  # measured error over what independent small errors would add up to
 
 @dataclass(frozen=True)
 class Steps:
-    """Uniform quantization steps, one per attribute, in the attribute's own units (means: world units)."""
+    """Uniform quantization steps: `steps["sh0"]` is in the attribute's own units (means: world units).
 
-    means: float
-    log_scales: float
-    quats: float
-    logit_opacities: float
-    sh0: float
-    shN: float
-    node_translation: float  # world units
+    Attributes:
+        by_attribute: attribute -> step.
+        node_translation: of the nodes, world units.
+    """
+
+    by_attribute: dict[str, float]
+    node_translation: float
+
+    def __getitem__(self, attribute: str) -> float:
+        return self.by_attribute[attribute]
 
 
 def steps_for(quality: float, radius: float) -> Steps:
     """Steps for `quality` (0 coarse .. 100 fine) and a subject of bounding radius `radius` (world units)."""
     f = 2.0 ** ((QUALITY_DEFAULT - quality) / QUALITY_HALVES)
-    means = 0.001 * radius * f
-    return Steps(
-        means=means,
-        log_scales=0.25 * f,
-        quats=0.035 * f,
-        logit_opacities=0.63 * f,
-        sh0=0.125 * f,
-        shN=0.125 * f,
-        node_translation=means,
-    )
+    steps = {a.name: a.nominal_step * f * (radius if a.name == "means" else 1.0) for a in ATTRIBUTES}
+    return Steps(steps, node_translation=steps["means"])
 
 
 def error_for(quality: float) -> float:

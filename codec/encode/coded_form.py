@@ -12,13 +12,13 @@ from functools import cached_property
 import numpy as np
 
 from ..bitstream.color import TO_YCOCG, decorrelate
-from ..model.attributes import BY_NAME
+from ..model.attributes import BY_NAME, CANONICAL
 from ..model.gaussians import Gaussians
 from ..model.parametric_group import NodeMotion, ParametricGroup
 from ..model.rotations import quat_conjugate, quat_multiply, quat_normalize, rotate
 from .axis_order import sorted_axes
 
-APPEARANCE = ("log_scales", "logit_opacities", "sh0", "shN")  # attributes whose trajectories are plain sums
+APPEARANCE = tuple(n for n in CANONICAL if n != "quats")  # attributes whose trajectories are plain sums
 
 
 @dataclass(frozen=True)

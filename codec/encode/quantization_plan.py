@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..bitstream.quantization import error_for, steps_for, subject_radius
-from ..model.attributes import BY_NAME, GRID_BITS_MAX
-from ..render.sensitivity import Importance, steps_for_error
+from ..model.attributes import GRID_BITS_MAX
+from ..render.sensitivity import Importance, coarsest, steps_for_error
 from . import companding, rdo
 from .coded_form import CodedForm
 from .rotation_residuals import fit_scale_exponents, step_factors
@@ -150,7 +150,7 @@ def _parameters(
     even = _steps(form, over_time, error, nominal, radius)
     curves, exponents, bent = _bent(form, importance, settings)
     layer = layer_of(bent, layers, settings.plan)
-    room = {n: np.log2(_coarsest(n, radius) / v.mean()) for n, v in even.items()}
+    room = {n: np.log2(coarsest(n, radius) / v.mean()) for n, v in even.items()}
     shifts = _layer_shifts(bent, layer, layers, room, settings.plan)
     own = {n: v[layer] for n, v in shifts.items()}
     steps = _steps(form, bent, error, nominal, radius, shifts=own, curves=curves, exponents=exponents)
@@ -208,17 +208,13 @@ def _steps(
     times its `step_factors`. `importance` is that of `_bent`, where there are curves and exponents."""
     weights = importance.weights
     if not len(importance.removal):
-        return {n: np.full(w.shape[1], getattr(nominal, n), np.float32) for n, w in weights.items()}
+        return {n: np.full(w.shape[1], nominal[n], np.float32) for n, w in weights.items()}
     values = {n: companding.compand(v, (curves or {}).get(n)) for n, v in form.values.items()}
     factors = step_factors(form.values["log_scales"], np.zeros((3, 3)) if exponents is None else exponents)
     factors, level = _relative(factors)
     values |= {"means": form.rest, "quats": form.coded_rotations[:, 1:] / factors}
     steps = steps_for_error(weights, {n: values[n] for n in weights}, error, radius, shifts)
     return steps | {"quats": steps["quats"] / level.astype(np.float32)}
-
-
-def _coarsest(attribute: str, radius: float) -> float:
-    return BY_NAME[attribute].coarsest_step * (radius if attribute == "means" else 1.0)
 
 
 def _usual_layers(form: CodedForm, settings: PlanSettings) -> int:

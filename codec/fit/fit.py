@@ -81,7 +81,7 @@ def fit_group(group: DenseGroup, *, quality: float = 50.0, rest: np.ndarray | No
 
 def _motion(stack, middle: Gaussians, parents, rest, quality) -> tuple[NodeMotion | None, np.ndarray]:
     """Nodes of the group, and where its Gaussians rest, [N, 3]."""
-    step = steps_for(quality, subject_radius(middle.means)).means
+    step = steps_for(quality, subject_radius(middle.means))["means"]
     if parents is None:
         return fit_nodes(middle.means, stack.frames.means, step), middle.means
     known = np.flatnonzero(checked_parents(parents, len(middle), len(rest)) >= 0)

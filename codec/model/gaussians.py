@@ -86,6 +86,9 @@ class Gaussians:
         return Gaussians(**arrays)
 
 
+PARAMETERS = tuple(f.name for f in fields(Gaussians))
+
+
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
     """One set out of several with the same SH degree."""
     return Gaussians(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)})

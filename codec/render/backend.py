@@ -13,7 +13,6 @@ import numpy as np
 
 from ..model.camera import Camera
 
-PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 STATISTICS = ("grad2d", "max_weight", "sum_weight")
 
 Region = tuple[int, int, int, int]  # x, y, width, height in pixels

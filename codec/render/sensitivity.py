@@ -16,6 +16,7 @@ import numpy as np
 
 from ..bitstream.color import STEP_WEIGHTS, TO_RGB, decorrelate
 from ..bitstream.quantization import Steps, error_for, subject_radius
+from ..model.attributes import BY_NAME
 from ..model.camera import Camera, cameras_around
 from ..model.gaussians import Gaussians
 from .backend import PARAMETERS, Backend
@@ -23,8 +24,6 @@ from .cpu import CpuBackend
 
 VIEWS, SIZE = 24, 512
 GREY = (0.5, 0.5, 0.5)
-# Steps up to which the derivative predicts the error; means in radii of the subject.
-COARSEST = {"means": 0.02, "log_scales": 1.0, "quats": 0.25, "logit_opacities": 2.0, "sh0": 1.0, "shN": 1.0}
 
 
 @dataclass(frozen=True)
@@ -111,7 +110,7 @@ def derivatives(
     g: Gaussians,
     camera: Camera,
     by_picture: Callable[[np.ndarray], np.ndarray],
-    names: Iterable[str] = (*COARSEST, "turns"),
+    names: Iterable[str] = (*BY_NAME, "turns"),
     background: tuple[float, ...] = GREY,
 ) -> dict[str, np.ndarray]:
     """Derivatives by the coded channels, attribute -> [N, C].
@@ -185,9 +184,10 @@ def measured_steps(
     steps["sh0"] /= STEP_WEIGHTS
     if degrees:
         steps["shN"] /= np.tile(STEP_WEIGHTS, degrees)
-    return replace(nominal, **{n: float(np.exp(np.log(s).mean())) for n, s in steps.items()})
+    mean = {n: float(np.exp(np.log(s).mean())) for n, s in steps.items()}
+    return replace(nominal, by_attribute=nominal.by_attribute | mean)
 
 
 def coarsest(attribute: str, radius: float) -> float:
     """The largest step of an attribute for which its sensitivity predicts the error."""
-    return COARSEST[attribute] * (radius if attribute == "means" else 1.0)
+    return BY_NAME[attribute].coarsest_step * (radius if attribute == "means" else 1.0)

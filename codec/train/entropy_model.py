@@ -15,10 +15,10 @@ import torch
 from .. import _native
 from ..bitstream.color import STEP_WEIGHTS, TO_YCOCG
 from ..bitstream.quantization import Steps
+from ..model.attributes import ATTRIBUTES
 from ..model.rotations import quat_conjugate, quat_multiply
 from .settings import EntropyModelSettings
 
-CONTEXT_NEIGHBOURS, CONTEXT_WINDOW = 4, 32  # of a canonical value: nearest Gaussians, among those before it (spec 7.3)
 GRID_MAX = 2**20  # steps along an axis, bound of the Morton order: with far floaters steps are coarser
 LN2 = float(np.log(2))
 _H = 0.5**0.5
@@ -71,14 +71,7 @@ def neighbours(means: torch.Tensor, step: float) -> torch.Tensor:
     step = max(step, float((high - low).max()) / GRID_MAX)
     grid = torch.round((means - low) / step).numpy().astype(np.uint32)
     order = _native.morton_order(grid).astype(np.int64)
-    p = grid[order].astype(np.float32)
-    n = len(p)
-    distance = np.full((n, CONTEXT_WINDOW), np.inf, np.float32)
-    for back in range(1, min(CONTEXT_WINDOW, n - 1) + 1):
-        distance[back:, back - 1] = ((p[back:] - p[:-back]) ** 2).sum(1)
-    back = distance.argsort(1, kind="stable")[:, :CONTEXT_NEIGHBOURS] + 1
-    index = np.arange(n)[:, None] - back
-    index = np.where(index < 0, np.arange(n)[:, None], index)
+    index = _native.context_neighbors(np.ascontiguousarray(grid[order]))
     near = np.empty_like(index)
     near[order] = order[index]
     return torch.from_numpy(near)
@@ -94,16 +87,10 @@ class CanonicalRate:
 
     def __init__(self, means: torch.Tensor, steps: Steps, settings: EntropyModelSettings):
         self.settings = settings
-        self.near = neighbours(means, steps.means)
-        colour = torch.from_numpy(STEP_WEIGHTS).float()
+        self.near = neighbours(means, steps["means"])
         self.to_ycocg = torch.from_numpy(TO_YCOCG.T).float()
-        self.steps = {
-            "log_scales": steps.log_scales,
-            "quats": steps.quats,
-            "logit_opacities": steps.logit_opacities,
-            "sh0": steps.sh0 * colour,
-            "shN": steps.shN * colour,
-        }
+        weights = {True: torch.from_numpy(STEP_WEIGHTS).float(), False: 1.0}
+        self.steps = {a.name: steps[a.name] * weights[a.decorrelated] for a in ATTRIBUTES if a.name != "means"}
 
     def channels(self, params: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """Integers-to-be of each attribute, [N, C], as the encoder codes them, in steps; differentiable."""

@@ -71,10 +71,10 @@ class GroupModel:
         self.known = 0 if key is None else len(key)
         self.key = self._canonical(key, tracked)
         self.basis = torch.from_numpy(dct_basis(len(tracked))).float()  # [T, T]
-        self.canonical_steps = {n: getattr(steps, n) for n in NAMES}
+        self.canonical_steps = {n: steps[n] for n in NAMES}
         self.canonical_rate = CanonicalRate(self.key.params["means"], steps, settings.entropy_model)
-        names = vars(self.settings.frequencies)
-        self.unit = {name: trajectory_step(getattr(steps, name), len(tracked)) for name in names}
+        names = self.settings.frequencies
+        self.unit = {name: trajectory_step(steps[name], len(tracked)) for name in names}
         self.unit["sh0"] *= float(STEP_WEIGHTS[0])  # Y, Co, Cg share one step; RGB errors add up over them
         self.means, self.rotations = zip(*(self._carry(p) for p in self.poses), strict=True)
         self.coefficients = self._project(tracked)
@@ -116,7 +116,7 @@ class GroupModel:
     def _project(self, tracked: list[Model]) -> dict[str, torch.Tensor]:
         """Lowest frequencies of the difference between the tracked frames and what the nodes carry."""
         p = self.key.params
-        residual: dict[str, list] = {name: [] for name in vars(self.settings.frequencies)}
+        residual: dict[str, list] = {name: [] for name in self.settings.frequencies}
         for model, means, rotations in zip(tracked, self.means, self.rotations, strict=True):
             q = model.params
             dq = quat_multiply(q["quats"], quat_conjugate(quat_multiply(rotations, p["quats"])))
@@ -127,7 +127,7 @@ class GroupModel:
             faded = (q["logit_opacities"] - p["logit_opacities"])[:, None]
             residual["logit_opacities"].append(torch.where(q["logit_opacities"][:, None] > REMOVED_LOGIT, faded, 0.0))
         out, per = {}, self.settings.frequencies_frames
-        for name, most in vars(self.settings.frequencies).items():
+        for name, most in self.settings.frequencies.items():
             low = self.basis[: -(-most * max(len(tracked), per) // per)]
             c = torch.einsum("kt,tnc->knc", low, self._hold_outside_lifetime(residual[name])) / self.unit[name]
             out[name] = c.contiguous().requires_grad_()

@@ -97,7 +97,7 @@ def train_keyframe(
         if step >= k.appearance_from * steps:
             views.exposure.learn(target.index, result.grad_gain[0], decay)
             views.extrinsics.learn(target.index, model.params, result.grads, decay)
-        means_rate = radius * k.rates.means * (k.means_rate_end / k.rates.means) ** progress
+        means_rate = radius * k.rates["means"] * (k.means_rate_end / k.rates["means"]) ** progress
         model.step(result.grads, {**k.rates.scaled(radius, decay), "means": means_rate})
         if step == int(k.appearance_from * steps):
             model.set_degree(settings.sh_degree)

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import torch
 
-from ..model.gaussians import SH_C0, Gaussians
+from ..model.gaussians import PARAMETERS, SH_C0, Gaussians
 from ..render.backend import Backend
 from ..render.optimizer import Adam, AdamSettings
 
-NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
+NAMES = PARAMETERS
 REMOVED_LOGIT = -20.0  # logit of the opacity of a Gaussian that is removed, or not there yet
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from ..bitstream.quantization import Steps
+from ..model.attributes import ATTRIBUTES
 from .model import NAMES, Model
 from .settings import TrainSettings
 from .tracking import Tracker
@@ -47,7 +48,7 @@ class Subject:
         exposure, poses = self.tracker.views.exposure, self.tracker.views.extrinsics
         cameras = {"exposure": exposure.values, "extrinsics": poses.values, "center": poses.center}
         whole = {"loss_radius": np.array([self.loss, self.radius]), "parents": self.parents}
-        whole["steps"] = np.array([] if self.steps is None else astuple(self.steps))
+        whole["steps"] = _steps_to_array(self.steps)
         return {**whole, **cameras, **canonical, **self.tracker.state()}
 
     @staticmethod
@@ -57,6 +58,19 @@ class Subject:
         loss, radius = state["loss_radius"].tolist()
         views.exposure.values, views.extrinsics.values = state["exposure"], state["extrinsics"]
         views.extrinsics.set_subject(state["center"], radius)
-        steps = Steps(*state["steps"].tolist()) if len(state["steps"]) else None
+        steps = _steps_from_array(state["steps"])
         tracker = Tracker.restored(state, views, settings)
         return Subject(tracker, loss, radius, Model(canonical), state["parents"], steps)
+
+
+def _steps_to_array(steps: Steps | None) -> np.ndarray:
+    """One number for each attribute of the table, and the nodes' step; empty for None."""
+    return np.array([] if steps is None else [*(steps[a.name] for a in ATTRIBUTES), steps.node_translation])
+
+
+def _steps_from_array(values: np.ndarray) -> Steps | None:
+    """Inverse of `_steps_to_array`."""
+    if not len(values):
+        return None
+    *own, node = values.tolist()
+    return Steps({a.name: v for a, v in zip(ATTRIBUTES, own, strict=True)}, node)

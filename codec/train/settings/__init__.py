@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from ...errors import UsageError
 from ...model.gaussians import GOP
 from ...render.optimizer import AdamSettings
-from .finetune import EntropyModelSettings, FinetuneSettings, RefinementSettings, TemporalFrequencies
+from .finetune import EntropyModelSettings, FinetuneSettings, RefinementSettings
 from .keyframe import (
     CameraCalibrationSettings,
     InitializationSettings,
@@ -46,7 +46,6 @@ __all__ = [
     "PlaneSweepSettings",
     "RefinementSettings",
     "RelocalizationSettings",
-    "TemporalFrequencies",
     "TrackingSettings",
     "TrainSettings",
     "VisualHullSettings",

@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
+from ...model.attributes import BY_NAME, FREQUENCIES_OF
+from ...model.gaussians import Gaussians
 from ...render.optimizer import AdamSettings
 
 
-@dataclass(frozen=True)
-class TemporalFrequencies:
-    """Temporal frequencies (DCT) that residuals may use in a group of `frames` frames; a longer group uses more in
-    proportion, a shorter one as many as it has. Attributes without a field are constant in a group."""
-
-    means: int = 10
-    quats: int = 4
-    log_scales: int = 3
-    logit_opacities: int = 3
-    sh0: int = 6
+def temporal_frequencies() -> dict[str, int]:
+    """Attribute -> temporal frequencies (DCT) that its residuals may use in a group of `FREQUENCIES_OF` frames. A longer
+    group uses more in proportion, a shorter one as many as it has; a missing attribute is constant in a group."""
+    table = {f.name: BY_NAME[f.name].temporal_frequencies for f in fields(Gaussians)}
+    return {name: count for name, count in table.items() if count}
 
 
 @dataclass(frozen=True)
 class FinetuneSettings:
     """Joint optimisation of a group: canonical attributes and residual coefficients."""
 
-    frequencies: TemporalFrequencies = field(default_factory=TemporalFrequencies)
-    frequencies_frames: int = 20  # frames that `frequencies` is for
+    frequencies: dict[str, int] = field(default_factory=temporal_frequencies)
+    frequencies_frames: int = FREQUENCIES_OF  # frames that `frequencies` is for
     free_min: float = 0.5  # quantization steps: a residual from the start, so that a resting Gaussian stays free
     dead_zone: float = 0.1  # quantization steps more than half of one, below which a coefficient is not coded
     coefficient_rate: float = 0.05  # quantization steps

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from .learning_rates import LearningRates
+from .learning_rates import LearningRates, keyframe_rates
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,7 @@ class CameraCalibrationSettings:
 class KeyframeSettings:
     """Optimisation, densification and pruning of a keyframe (Kerbl et al. 2023, shortened)."""
 
-    rates: LearningRates = field(
-        default_factory=lambda: LearningRates(
-            means=1.6e-3, quats=2e-3, log_scales=1e-2, logit_opacities=3e-2, sh0=5e-3, shN=1.5e-3
-        )
-    )
+    rates: LearningRates = field(default_factory=keyframe_rates)
     means_rate_end: float = 1.6e-5  # radii, at the last step
     rate_decay: float = 0.1  # all other rates at the last step, times those at the first
     appearance_from: float = 0.3  # share of the steps; exposure, poses and SH wait for colours that are about right

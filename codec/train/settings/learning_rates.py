@@ -4,18 +4,31 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ...model.attributes import ATTRIBUTES
+
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Learning rate of each attribute of the Gaussians."""
+    """Learning rate of each attribute of the Gaussians.
 
-    means: float  # radii
-    quats: float
-    log_scales: float
-    logit_opacities: float
-    sh0: float
-    shN: float
+    Attributes:
+        by_attribute: attribute -> rate; means in radii of the subject.
+    """
+
+    by_attribute: dict[str, float]
+
+    def __getitem__(self, attribute: str) -> float:
+        return self.by_attribute[attribute]
+
+    def but(self, **rates: float) -> LearningRates:
+        """The same with other rates of some attributes."""
+        return LearningRates(self.by_attribute | rates)
 
     def scaled(self, radius: float, factor: float = 1.0) -> dict[str, float]:
         """Rates by attribute, times `factor`; `radius` in world units."""
-        return {name: rate * factor for name, rate in {**vars(self), "means": self.means * radius}.items()}
+        return {n: rate * factor * (radius if n == "means" else 1.0) for n, rate in self.by_attribute.items()}
+
+
+def keyframe_rates() -> LearningRates:
+    """Those of the attribute table, at the first step of a keyframe."""
+    return LearningRates({a.name: a.learning_rate for a in ATTRIBUTES})

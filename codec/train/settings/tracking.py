@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ...render.optimizer import AdamSettings
-from .learning_rates import LearningRates
+from .learning_rates import LearningRates, keyframe_rates
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class TrackingSettings:
     node_adam: AdamSettings = field(default_factory=lambda: AdamSettings(eps=1e-8))
     # Light changes fast; place and shape are slow, so that the nodes take the motion.
     rates: LearningRates = field(
-        default_factory=lambda: LearningRates(
+        default_factory=lambda: keyframe_rates().but(
             means=3e-5, quats=6e-4, log_scales=6e-3, logit_opacities=2e-2, sh0=5e-2, shN=2.5e-3
         )
     )

@@ -5,6 +5,8 @@ mod container;
 mod decoded;
 mod group_from;
 mod parametric;
+mod quantized_from;
+mod rigid_blend;
 mod values;
 
 use gsv::attributes::Attribute;
@@ -29,8 +31,8 @@ pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(container::fragment, m)?)?;
     m.add_function(wrap_pyfunction!(container::finish, m)?)?;
     m.add_function(wrap_pyfunction!(container::demux, m)?)?;
-    m.add_function(wrap_pyfunction!(parametric::blend_rigid, m)?)?;
-    m.add_function(wrap_pyfunction!(parametric::blend_rigid_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(rigid_blend::blend_rigid, m)?)?;
+    m.add_function(wrap_pyfunction!(rigid_blend::blend_rigid_backward, m)?)?;
     m.add_function(wrap_pyfunction!(attributes, m)?)?;
     m.add_class::<parametric::ParametricEvaluator>()?;
     m.add_class::<decoded::DecodedGroup>()

@@ -26,21 +26,7 @@ pub fn group_from(d: &Bound<PyAny>, reference: Option<&Group>) -> PyResult<Group
         ..Group::default()
     };
     layers_from(d, &mut header, &mut group)?;
-    for a in header.attributes() {
-        let c = entry(&channels, a.name())?;
-        let width = a.channels(header.sh_degree);
-        group.channels.push(planar(
-            &array(&c, "values", "int32")?,
-            a.name(),
-            width,
-            group.positions.len(),
-        )?);
-        let (steps, offsets): (Vec<f32>, Vec<f32>) = (value(&c, "steps")?, value(&c, "offsets")?);
-        if steps.len() != width || offsets.len() != width {
-            return invalid(format!("{}: expected {width} steps and offsets", a.name()));
-        }
-        header.scales.push(Scale { steps, offsets });
-    }
+    channels_from(&channels, &mut header, &mut group)?;
     header.scale_exponents = value(d, "scale_exponents")?;
     header.shifts = shifts_from(d, &header)?;
     header.companding = companding_from(&channels)?;
@@ -48,34 +34,55 @@ pub fn group_from(d: &Bound<PyAny>, reference: Option<&Group>) -> PyResult<Group
     if let Some(n) = optional(d, "nodes")? {
         nodes_from(&n, &mut header, &mut group)?;
     }
-    if optional(d, "lifetimes")?.is_some() {
-        let a = array(d, "lifetimes", "uint16")?;
-        let Ok(a) = a.extract::<PyReadonlyArray2<u16>>() else {
-            return invalid("lifetimes: expected shape [N, 2]".into());
-        };
-        if a.shape()[1] != 2 {
-            return invalid(format!("lifetimes: expected shape [N, 2], got {:?}", a.shape()));
-        }
-        group.lifetimes = Some(a.as_array().outer_iter().map(|r| [r[0], r[1]]).collect());
-    }
-    let same = |r: &Group| {
-        let h = &r.header;
-        (h.origin, h.grid_step, h.grid_bits) == (header.origin, header.grid_step, header.grid_bits)
-            && (&h.scales, &h.scale_exponents, &h.shifts, &h.companding)
-                == (
-                    &header.scales,
-                    &header.scale_exponents,
-                    &header.shifts,
-                    &header.companding,
-                )
-    };
-    if header.reference > 0 && !reference.is_some_and(same) {
+    group.lifetimes = lifetimes_from(d)?;
+    if header.reference > 0 && !reference.is_some_and(|r| same_parameters(&r.header, &header)) {
         return invalid(
-            "a predicted group: expected its reference, with the same grid, steps, offsets and levers".into(),
+            "a predicted group: expected its reference, with the same grid, steps, offsets, companding and exponents"
+                .into(),
         );
     }
     group.header = header;
     Ok(group)
+}
+
+/// Integers, steps and offsets of each attribute.
+fn channels_from(channels: &Bound<PyDict>, header: &mut Header, group: &mut Group) -> PyResult<()> {
+    for a in header.attributes() {
+        let c = entry(channels, a.name())?;
+        let width = a.channels(header.sh_degree);
+        let values = array(&c, "values", "int32")?;
+        group
+            .channels
+            .push(planar(&values, a.name(), width, group.positions.len())?);
+        let (steps, offsets): (Vec<f32>, Vec<f32>) = (value(&c, "steps")?, value(&c, "offsets")?);
+        if steps.len() != width || offsets.len() != width {
+            return invalid(format!("{}: expected {width} steps and offsets", a.name()));
+        }
+        header.scales.push(Scale { steps, offsets });
+    }
+    Ok(())
+}
+
+fn lifetimes_from(d: &Bound<PyAny>) -> PyResult<Option<Vec<[u16; 2]>>> {
+    if optional(d, "lifetimes")?.is_none() {
+        return Ok(None);
+    }
+    let a = array(d, "lifetimes", "uint16")?;
+    let Ok(a) = a.extract::<PyReadonlyArray2<u16>>() else {
+        return invalid("lifetimes: expected shape [N, 2]".into());
+    };
+    if a.shape()[1] != 2 {
+        return invalid(format!("lifetimes: expected shape [N, 2], got {:?}", a.shape()));
+    }
+    Ok(Some(a.as_array().outer_iter().map(|r| [r[0], r[1]]).collect()))
+}
+
+/// Whether a predicted group of header `own` has the parameters of its reference.
+fn same_parameters(reference: &Header, own: &Header) -> bool {
+    let (r, h) = (reference, own);
+    (r.origin, r.grid_step, r.grid_bits) == (h.origin, h.grid_step, h.grid_bits)
+        && (&r.scales, &r.scale_exponents) == (&h.scales, &h.scale_exponents)
+        && (&r.shifts, &r.companding) == (&h.shifts, &h.companding)
 }
 
 /// Fields `layers`, `corrections`, and of a predicted group `reference` and `parents`.
