@@ -23,8 +23,8 @@ import numpy as np
 
 from gscodec.errors import UsageError
 from gscodec.model.camera import Camera
-from gscodec.model.gaussians import Gaussians
-from gscodec.render.backend import PARAMETERS, Crop
+from gscodec.model.gaussians import PARAMETERS, Gaussians
+from gscodec.render.backend import Crop
 from gscodec.render.cpu import CpuBackend
 from gscodec.render.image import render_image, render_rgba
 from gscodec.render.optimizer import AdamSettings

@@ -12,7 +12,8 @@ import numpy as np
 from .. import _native
 from ..errors import UsageError
 from ..model.camera import Camera
-from .backend import PARAMETERS, STATISTICS, Crop, Params, PixelGradient, Region, RenderLoss
+from ..model.gaussians import PARAMETERS
+from .backend import STATISTICS, Crop, Params, PixelGradient, Region, RenderLoss
 from .workspace import Workspace, call, host_array, rgb, view
 
 

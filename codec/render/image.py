@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..model.camera import Camera
-from ..model.gaussians import Gaussians
-from .backend import PARAMETERS
+from ..model.gaussians import PARAMETERS, Gaussians
 from .workspace import Workspace
 
 _shared: list[Workspace] = []  # the workspace of callers that pass none

@@ -18,8 +18,8 @@ from ..bitstream.color import STEP_WEIGHTS, TO_RGB, decorrelate
 from ..bitstream.quantization import Steps, error_for, subject_radius
 from ..model.attributes import BY_NAME
 from ..model.camera import Camera, cameras_around
-from ..model.gaussians import Gaussians
-from .backend import PARAMETERS, Backend
+from ..model.gaussians import PARAMETERS, Gaussians
+from .backend import Backend
 from .cpu import CpuBackend
 
 VIEWS, SIZE = 24, 512

@@ -10,7 +10,8 @@ import numpy as np
 from .. import _native
 from ..errors import LimitError, UsageError
 from ..model.camera import Camera
-from .backend import PARAMETERS, STATISTICS, Region
+from ..model.gaussians import PARAMETERS
+from .backend import STATISTICS, Region
 
 
 def simd_levels() -> list[str]:

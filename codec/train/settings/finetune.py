@@ -10,8 +10,8 @@ from ...render.optimizer import AdamSettings
 
 
 def temporal_frequencies() -> dict[str, int]:
-    """Attribute -> temporal frequencies (DCT) that its residuals may use in a group of `FREQUENCIES_OF` frames. A longer
-    group uses more in proportion, a shorter one as many as it has; a missing attribute is constant in a group."""
+    """Attribute -> temporal frequencies (DCT) that its residuals may use in a group of `FREQUENCIES_OF` frames. A
+    longer group uses more in proportion, a shorter one as many as it has. A missing attribute is constant."""
     table = {f.name: BY_NAME[f.name].temporal_frequencies for f in fields(Gaussians)}
     return {name: count for name, count in table.items() if count}
 
