@@ -237,6 +237,17 @@ def changing(frames=6) -> list[DenseGroup]:
     ]
 
 
+def test_what_comes_out_is_parametric_again(tmp_path):
+    for sh_count, lifetimes in ((3, False), (0, True)):
+        write(turning(150, frames=6, sh_count=sh_count, lifetimes=lifetimes), tmp_path / "a.gsv", keep_all=True)
+        stream = open_stream(tmp_path / "a.gsv")
+        (group,) = stream.sequence().groups
+        assert group.nodes is not None
+        for t in range(6):
+            near = {"means": 1e-5, "log_scales": 1e-5, "sh0": 1e-5, "shN": 1e-5, "opacity": 1e-5}
+            assert_close(stream.frame(t), group.visible(t), **near)
+
+
 @pytest.mark.parametrize("layers", [1, 3])
 def test_a_predicted_group_costs_less_and_keeps_the_content(tmp_path, layers):
     groups = changing()

@@ -9,10 +9,7 @@ torch = pytest.importorskip("torch")
 
 from gscodec.errors import LimitError, UsageError  # noqa: E402
 from gscodec.model.camera import Camera, look_at  # noqa: E402
-from gscodec.model.gaussians import (
-    PARAMETERS,
-    Gaussians,
-)
+from gscodec.model.gaussians import PARAMETERS, Gaussians  # noqa: E402
 from gscodec.render.backend import STATISTICS, Crop  # noqa: E402
 from gscodec.render.cpu import CpuBackend  # noqa: E402
 from gscodec.render.image import render_image, render_rgba  # noqa: E402

@@ -18,8 +18,10 @@ import numpy as np
 from .. import _native
 from ..errors import BitstreamError, LimitError
 from ..model.camera import Camera
-from ..model.gaussian_sequence import DenseGroup, GaussianSequence
+from ..model.gaussian_sequence import GaussianSequence
 from ..model.gaussians import Gaussians
+from ..model.parametric_group import ParametricGroup
+from .parametric import parametric_group
 
 GROUPS_HELD = 3  # decoded groups in memory: the one that plays, the next, and the one to which they refer
 
@@ -157,32 +159,16 @@ class Stream:
 
 
 class _Groups(Sequence):
+    """Groups of a stream as ParametricGroups, decoded when read."""
+
     def __init__(self, stream: Stream):
         self.stream = stream
 
     def __len__(self) -> int:
         return len(self.stream.groups)
 
-    def __getitem__(self, i: int) -> DenseGroup:
-        group = self.stream.group(i)
-        if group.visible(0) is None:
-            return DenseGroup(_Frames(self.stream, i))
-        shown = np.stack([group.visible(t) for t in range(group.frames)])  # [T, N], one run of frames each
-        start = shown.argmax(0)
-        return DenseGroup(_Frames(self.stream, i), np.stack([start, start + shown.sum(0)], 1).astype(np.int32))
-
-
-class _Frames(Sequence):
-    def __init__(self, stream: Stream, i: int):
-        self.stream, self.i = stream, i
-
-    def __len__(self) -> int:
-        return self.stream.groups[self.i]["frames"]
-
-    def __getitem__(self, t: int) -> Gaussians:
-        if not 0 <= t < len(self):
-            raise IndexError(t)
-        return Gaussians(**self.stream.group(self.i).frame(t))
+    def __getitem__(self, i: int) -> ParametricGroup:
+        return parametric_group(self.stream.group(range(len(self))[i]))
 
 
 def open_stream(path: str | Path, *, strict: bool = True, layers: int | None = None) -> Stream:

@@ -1,7 +1,7 @@
 //! DecodedGroup: a payload -> integers in the form that encode_group takes, and attributes of frames.
 
 use super::group_from::group_from;
-use super::parametric::{carried, frame};
+use super::parametric::{canonical, carried, frame};
 use super::quantized_from::{parents_into, quantized};
 use super::values::{bytes_of, raise};
 use gsv::attributes::sh_coefficients;
@@ -117,6 +117,11 @@ impl DecodedGroup {
             units: Vec::new(),
             damage: Vec::new(),
         })
+    }
+
+    /// Canonical attributes of all Gaussians, f32, as `frame` gives those of a frame.
+    fn canonical<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        canonical(py, &self.evaluator.parametric(), sh_coefficients(self.sh_degree()))
     }
 
     /// What the nodes alone do in all frames: means [T, N, 3] f32 and rotations [T, N, 4] f32 wxyz by which Gaussians are carried.

@@ -234,6 +234,22 @@ pub fn frame<'py, V: Coefficient>(
     Ok(d)
 }
 
+/// Canonical attributes, as `frame` gives those of a frame.
+pub fn canonical<'py, V: Coefficient>(py: Python<'py>, p: &Parametric<V>, k: usize) -> PyResult<Bound<'py, PyDict>> {
+    let (d, n) = (PyDict::new(py), p.rest.means.len());
+    let placed = |x: &[f32; 3]| [0, 1, 2].map(|a| p.origin[a] + x[a]);
+    let means: Vec<f32> = p.rest.means.iter().flat_map(placed).collect();
+    let set =
+        |name: &str, values: Vec<f32>, shape: Vec<usize>| d.set_item(name, values.into_pyarray(py).reshape(shape)?);
+    set("means", means, vec![n, 3])?;
+    set("quats", p.rotations.as_flattened().to_vec(), vec![n, 4])?;
+    set("log_scales", p.rest.log_scales.clone(), vec![n, 3])?;
+    set("logit_opacities", p.rest.logit_opacities.clone(), vec![n])?;
+    set("sh0", p.rest.sh0.clone(), vec![n, 3])?;
+    set("shN", p.rest.sh_n.clone(), vec![n, k, 3])?;
+    Ok(d)
+}
+
 /// Means [T, N, 3] and rotations [T, N, 4] by which the nodes alone carry Gaussians in all frames.
 pub fn carried<'py, V: Coefficient>(py: Python<'py>, p: &Parametric<V>) -> PyResult<Pair<'py>> {
     over_time(py, p, |t, m, r| p.carried_into(t, m, r))

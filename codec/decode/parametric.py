@@ -1,0 +1,44 @@
+"""DecodedGroup -> ParametricGroup: what a stream holds, in the form that training makes and encoding takes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..bitstream.color import TO_RGB
+from ..bitstream.quantized_group import QuantizedGroup, QuantizedTrajectories
+from ..model.attributes import BY_NAME
+from ..model.gaussians import Gaussians
+from ..model.parametric_group import NodeMotion, ParametricGroup
+from ..model.temporal_transform import dct_basis
+
+
+def parametric_group(decoded) -> ParametricGroup:
+    """The group of a `_native.DecodedGroup` in floats; its frames are those of the stream within f32.
+
+    Parents are indices in the group that the header names, which may be several groups back: they are left out.
+    """
+    q: QuantizedGroup = decoded.quantized()
+    return ParametricGroup(
+        q.frames,
+        Gaussians(**decoded.canonical()),
+        None if q.nodes is None else _nodes(q, *decoded.blend()),
+        {n: _coefficients(n, t) for n, t in q.trajectories.items()},
+        None if q.lifetimes is None else q.lifetimes.astype(np.int32),
+    )
+
+
+def _nodes(q: QuantizedGroup, neighbors: np.ndarray, weights: np.ndarray) -> NodeMotion:
+    places = q.origin + np.float32(q.grid_step) * q.nodes.positions.astype(np.float32)
+    basis = dct_basis(q.frames)[: len(q.nodes.coefficients)]
+    values = np.einsum("kt,kcm->tmc", basis, q.nodes.coefficients)
+    rotations, translations = values[..., :3] * q.nodes.rotation_step, values[..., 3:] * q.nodes.translation_step
+    moves = rotations.astype(np.float32), translations.astype(np.float32)
+    return NodeMotion(places, *moves, neighbors.astype(np.int32), weights)
+
+
+def _coefficients(attribute: str, t: QuantizedTrajectories) -> np.ndarray:
+    """[K, C, N] f32, colours in RGB."""
+    c = t.coefficients.astype(np.float32) * np.float32(t.step)
+    if not BY_NAME[attribute].decorrelated:
+        return c
+    return (TO_RGB.astype(np.float32) @ c.reshape(len(c), -1, 3, c.shape[2])).reshape(c.shape)
