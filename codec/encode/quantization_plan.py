@@ -78,11 +78,14 @@ class Parameters:
 
 @dataclass(frozen=True)
 class Plan:
-    """Attributes:
-    index: [n] int, the Gaussians of the coded form that are coded.
-    layer: [n] int, the layer of each.
-    importance: of each. price: of a bit, in mean squared error.
-    parameters: see there.
+    """Who is coded, and how.
+
+    Attributes:
+        index: [n] int, the Gaussians of the coded form that are coded.
+        layer: [n] int, the layer of each.
+        importance: of each.
+        price: of a bit, in mean squared error of the picture.
+        parameters: of the group.
     """
 
     index: np.ndarray

@@ -105,32 +105,35 @@ def _ordered(form: CodedForm, plan: Plan, reference) -> tuple[CodedForm, Plan, n
 
 def _channels(form, plan, layers, reference, settings) -> dict[str, QuantizedChannels]:
     """Canonical integers of all attributes but quats, which are 0 for now."""
-    parameters, known, out = plan.parameters, form.lineage >= 0, {}
-    for name in CANONICAL:
-        if name not in parameters.steps and name not in form.values:
+    known, out = form.lineage >= 0, {}
+    for name, steps in plan.parameters.steps.items():
+        if name == "means":
             continue
-        old = reference.integers.channels[name] if reference else None
-        steps = old.steps if old else parameters.steps[name]
-        q = np.zeros((len(steps), len(form.rest)), np.int32)
-        curves = parameters.curves.get(name)
-        if name == "quats":
-            offsets = np.zeros(len(steps), np.float32)
-        else:
+        old, curves = reference and reference.integers.channels[name], plan.parameters.curves.get(name)
+        offsets, q = np.zeros(len(steps), np.float32), np.zeros((len(steps), len(form.rest)), np.int32)
+        if name != "quats":
             values = companding.compand(form.values[name], curves)
             offsets = old.offsets if old else _medians(values)
-            weights = plan.importance.weights[name] * companding.slopes(values, curves) ** 2
-            shift = parameters.shifts[name][plan.layer]
-            for own, near in layers:
-                for c in range(len(steps)):
-                    step = steps[c] * 2.0 ** shift[own]
-                    x = (values[own, c] - offsets[c]) / step
-                    found = rdo.quantize_canonical(x, weights[own, c] * step**2, near, plan.price, settings)
-                    q[c, own] = found.astype(np.int32) << shift[own]
+            q = _integers(name, values, offsets, plan, layers, settings)
         if old:
             q[:, known] = old.values[:, form.lineage[known]]
         rows = None if curves is None else np.array([c.row() for c in curves], np.float32)
         out[name] = QuantizedChannels(q, steps, offsets, rows)
-    return out
+    return {n: out[n] for n in CANONICAL if n in out}
+
+
+def _integers(name: str, values: np.ndarray, offsets: np.ndarray, plan: Plan, layers, settings) -> np.ndarray:
+    """[C, N] i32 for companded values [N, C], of what the layers code themselves; 0 elsewhere."""
+    parameters = plan.parameters
+    shift, steps = parameters.shifts[name][plan.layer], parameters.steps[name]
+    weights = plan.importance.weights[name] * companding.slopes(values, parameters.curves.get(name)) ** 2
+    q = np.zeros(values.shape[::-1], np.int32)
+    for own, near in layers:
+        for c in range(len(steps)):
+            step = steps[c] * 2.0 ** shift[own]
+            x, w = (values[own, c] - offsets[c]) / step, weights[own, c] * step**2
+            q[c, own] = rdo.quantize_canonical(x, w, near, plan.price, settings).astype(np.int32) << shift[own]
+    return q
 
 
 def _medians(values: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-MAX_VALUE = 1 << 24  # integers of channels and trajectories stay within +-MAX_VALUE (spec 6.5)
 GRID_BITS_MAX = 21  # bits of a position per axis (spec 4)
 NEIGHBORS_MAX = 8  # nodes that one Gaussian may blend (spec 4)
 FREQUENCIES_OF = 20  # frames for which `temporal_frequencies` are given; longer groups have more in proportion
