@@ -15,7 +15,7 @@ from .. import _native
 from ..bitstream.quantization import QUALITY_DEFAULT, error_for
 from .settings import RdoSettings
 
-RANGE = 15  # integers and predictions beyond are counted together; that of `_native.code_turns`
+RANGE = 15  # integers and predictions beyond are counted together; that of `_native.quantize_rotations`
 NEAR_WEIGHT = np.array([4, 3, 2, 2])  # of the context's neighbours (spec 7.3)
 
 Layer = tuple[slice, np.ndarray]  # span of what a layer codes itself, [n, 4] neighbours of each, from its first

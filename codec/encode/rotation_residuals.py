@@ -55,9 +55,9 @@ def quantize_rotations(
         given = (quats[own], steps[own], positions[own])
         if not len(given[0]):
             continue
-        plain = _native.code_turns(*given, np.zeros_like(steps[own]), np.zeros(0, np.float32))[0]
+        plain = _native.quantize_rotations(*given, np.zeros_like(steps[own]), np.zeros(0, np.float32))[0]
         lengths = np.stack([rdo.code_lengths(q, near, settings) for q in plain.T]).astype(np.float32).ravel()
         errors = (weights[own] * steps[own] ** 2).T
         worth = np.stack([rdo.lambda_cost(w, price, settings) for w in errors], 1).astype(np.float32)
-        values[own], forms[own] = _native.code_turns(*given, worth, lengths)
+        values[own], forms[own] = _native.quantize_rotations(*given, worth, lengths)
     return values, forms

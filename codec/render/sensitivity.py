@@ -92,7 +92,7 @@ def measure(
                 transparency = np.maximum(1 / (1 + np.exp(g.logit_opacities)), 1e-6)
                 removal += share * (d[:, 0] / transparency) ** 2
     total = {n: w.astype(np.float64) for n, w in total.items()}
-    return Importance(total, total.pop("turns"), removal)
+    return Importance(total, total.pop("scene_rotations"), removal)
 
 
 def params_of(g: Gaussians) -> dict[str, np.ndarray]:
@@ -110,15 +110,15 @@ def derivatives(
     g: Gaussians,
     camera: Camera,
     by_picture: Callable[[np.ndarray], np.ndarray],
-    names: Iterable[str] = (*BY_NAME, "turns"),
+    names: Iterable[str] = (*BY_NAME, "scene_rotations"),
     background: tuple[float, ...] = GREY,
 ) -> dict[str, np.ndarray]:
     """Derivatives by the coded channels, attribute -> [N, C].
 
     Args:
         by_picture: image of `camera` over `background` -> derivative by its pixels, [H, W, 3] f32 both.
-        names: attributes; quats by rotations about the Gaussian's own axes, "turns" about those of the scene. shN is
-            left out where there is none.
+        names: attributes; quats by rotations about the Gaussian's own axes, "scene_rotations" about those of the scene.
+            shN is left out where there is none.
     """
     by_pixels = lambda image, alpha: (by_picture(image), np.zeros_like(alpha))  # noqa: E731
     grads = backend.backpropagate(params_of(g), camera, background, by_pixels)
@@ -127,7 +127,7 @@ def derivatives(
 
 def _by_channels(g: Gaussians, grads: dict, name: str) -> np.ndarray:
     """[N, C] derivatives by the coded channels, from those by the parameters."""
-    if name in ("quats", "turns"):
+    if name in ("quats", "scene_rotations"):
         w, x, y, z = g.quats.T
         scene = [[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]]  # i q, j q, k q: [3, 4, N]
         own = [[-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]]  # q i, q j, q k

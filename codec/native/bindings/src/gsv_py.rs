@@ -21,7 +21,7 @@ pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(morton_order, m)?)?;
     m.add_function(wrap_pyfunction!(node_weights, m)?)?;
     m.add_function(wrap_pyfunction!(context_neighbors, m)?)?;
-    m.add_function(wrap_pyfunction!(code_turns, m)?)?;
+    m.add_function(wrap_pyfunction!(quantize_rotations, m)?)?;
     m.add_function(wrap_pyfunction!(encode_group, m)?)?;
     m.add_function(wrap_pyfunction!(units, m)?)?;
     m.add_function(wrap_pyfunction!(reference_of, m)?)?;
@@ -98,7 +98,7 @@ fn context_neighbors<'py>(py: Python<'py>, positions: PyReadonlyArray2<'py, u32>
 /// `steps` [N, 3] f32 of each; `positions` [N, 3] u32 in Morton order; `worth` [N, 3] f32, bits that an error of one step costs,
 /// squared; `lengths` [3, 31, 31] f32, bits of an integer (last) in a context, from -15 to 15 each, or nothing: all cost the same.
 #[pyfunction]
-fn code_turns<'py>(
+fn quantize_rotations<'py>(
     py: Python<'py>,
     quats: PyReadonlyArray2<'py, f32>,
     steps: PyReadonlyArray2<'py, f32>,
