@@ -16,6 +16,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 LONG_FILE, LONG_FUNCTION, MANY_PARAMETERS = 300, 60, 8
+ATTRIBUTE_NAMES = ("log_scales|LogScales", "quats|Quats", "logit_opacities|LogitOpacities", "sh0|Sh0", "shN|sh_n|ShN")
 RUST_FUNCTION = re.compile(r"^( *)(?:pub(?:\([a-z]+\))? )?(?:const )?fn \w+", re.M)
 
 
@@ -65,6 +66,12 @@ def _numeric(node: ast.AST) -> bool:
     return isinstance(node, ast.Dict) and bool(node.values) and all(map(_numeric, node.values))
 
 
+def lists_attributes(path: Path) -> bool:
+    """Whether a file names all of log_scales, quats, logit_opacities, sh0 and shN outside of docstrings."""
+    text = re.sub(r'"""(.|\n)*?"""', "", path.read_text())
+    return all(re.search(rf"\b({names})\b", text) for names in ATTRIBUTE_NAMES)
+
+
 def package(path: Path, root: Path) -> str:
     """Folder by which lines are counted: "codec/train", "codec/native/gsv", "codec" for single modules."""
     parts = path.relative_to(root).parts
@@ -91,6 +98,7 @@ def measure(root: Path) -> dict[str, int]:
         f"functions above {LONG_FUNCTION} lines, Python": sum(n > LONG_FUNCTION for n, _ in found),
         f"functions above {LONG_FUNCTION} lines, Rust": sum(n > LONG_FUNCTION for n in rust),
         f"functions with more than {MANY_PARAMETERS} parameters, Python": sum(n > MANY_PARAMETERS for _, n in found),
+        "files of codec/ that list the attributes": sum(lists_attributes(p) for p in files if "codec" in p.parts),
         "numeric constants of modules, codec/": sum(setting_constants(p) for p in python if "codec" in p.parts),
         "numeric constants of modules, codec/train": sum(setting_constants(p) for p in python if "train" in p.parts),
         "numeric constants of modules, codec/encode": sum(setting_constants(p) for p in python if "encode" in p.parts),

@@ -16,7 +16,8 @@ from functools import cached_property
 import numpy as np
 
 from .. import _native
-from ..bitstream.color import correlate, decorrelate
+from ..bitstream.channels import channel_values
+from ..bitstream.color import correlate
 from ..model.gaussians import Gaussians
 from ..render.cpu import CpuBackend
 from ..render.optimizer import Adam
@@ -109,7 +110,7 @@ class AdaptiveRounding:
         frames = [Gaussians(**decoded.frame(t)) for t in range(self.frames)]
         if self._still:
             frames = [replace(frames[0], quats=self._quantized.form.coded_rotations)]
-        return [(g, _coded_values(g)) for g in frames]
+        return [(g, {n: v for n, v in channel_values(g).items() if n in MOVING_OVER_TIME}) for g in frames]
 
     def _shown(self, g: Gaussians, t: int) -> Gaussians:
         """The same with an opacity that shows nothing, where frame `t` is outside of a lifetime."""
@@ -120,15 +121,8 @@ class AdaptiveRounding:
         return replace(g, logit_opacities=np.where(shown, g.logit_opacities, np.float32(HIDDEN)))
 
 
-def _coded_values(g: Gaussians) -> dict[str, np.ndarray]:
-    """[N, C] of the attributes that move, colours decorrelated."""
-    values = {"means": g.means, "log_scales": g.log_scales, "logit_opacities": g.logit_opacities[:, None]}
-    values["sh0"] = decorrelate(g.sh0)
-    return values | ({"shN": decorrelate(g.shN).reshape(len(g), -1)} if g.sh_degree else {})
-
-
 def _with_values(g: Gaussians, values: dict[str, np.ndarray]) -> Gaussians:
-    """Inverse of `_coded_values`, with the rotations of `g`."""
+    """Inverse of `channel_values`, with the rotations of `g`."""
     shN = correlate(values["shN"].reshape(g.shN.shape)) if "shN" in values else g.shN
     opacities, sh0 = values["logit_opacities"][:, 0], correlate(values["sh0"])
     return Gaussians(values["means"], g.quats, values["log_scales"], opacities, sh0, shN)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..model.attributes import ATTRIBUTES
 from ..model.camera import Camera
 from ..model.parametric_group import ParametricGroup
 from ..render.sensitivity import Importance, measure
@@ -18,8 +19,8 @@ def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanS
     """
     g, frames = group.canonical, group.frame_count
     if not len(g):
-        sizes = {"means": 3, "log_scales": 3, "quats": 3, "logit_opacities": 1, "sh0": 3}
-        sizes |= {"shN": 3 * g.shN.shape[1]} if g.sh_degree else {}
+        own = [a for a in ATTRIBUTES if a.name != "shN" or g.sh_degree]
+        sizes = {a.name: a.channels * (g.shN.shape[1] if a.name == "shN" else 1) for a in own}
         return Importance({n: np.zeros((0, c)) for n, c in sizes.items()}, np.zeros((0, 3)), np.zeros(0))
     shown = [group.frame(t) for t in sorted({0, frames // 2, frames - 1})]
     views = settings.more_views if frames == 1 or len(g) <= settings.few else settings.views

@@ -12,6 +12,7 @@ from dataclasses import fields
 import numpy as np
 
 from ..bitstream.quantization import steps_for, subject_radius
+from ..model.attributes import CANONICAL
 from ..model.gaussian_sequence import DenseGroup
 from ..model.gaussians import Gaussians
 from ..model.parametric_group import NodeMotion, ParametricGroup, checked_parents
@@ -116,7 +117,7 @@ def _trajectories(stack, canonical: Gaussians, carried: np.ndarray, rotations: n
     frames, f = len(stack), stack.frames
     dq = quat_multiply(f.quats, quat_conjugate(quat_multiply(rotations, canonical.quats[None])))
     residual = {"means": f.means - carried, "quats": np.copysign(1, dq[..., :1]) * dq[..., 1:]}
-    for name in ("log_scales", "logit_opacities", "sh0", "shN"):
+    for name in (n for n in CANONICAL if n != "quats"):
         residual[name] = getattr(f, name) - getattr(canonical, name)
     basis, n, out = dct_basis(frames).astype(np.float32), len(canonical), {}
     for name, values in residual.items():

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..bitstream.color import STEP_WEIGHTS, TO_RGB, decorrelate
+from ..bitstream.channels import channel_values
+from ..bitstream.color import STEP_WEIGHTS, TO_RGB
 from ..bitstream.quantization import Steps, error_for, subject_radius
 from ..model.attributes import BY_NAME
 from ..model.camera import Camera, cameras_around
@@ -177,13 +178,10 @@ def measured_steps(
     if not len(g):
         return nominal
     measured = measure([g], cameras, backend=backend)
-    weights, degrees = measured.weights | {"quats": measured.scene_rotations}, g.shN.shape[1]
-    values = {"means": g.means, "log_scales": g.log_scales, "quats": g.quats[:, 1:], "sh0": decorrelate(g.sh0)}
-    values |= {"logit_opacities": g.logit_opacities[:, None], "shN": decorrelate(g.shN).reshape(len(g), -1)}
+    weights, values = measured.weights | {"quats": measured.scene_rotations}, channel_values(g)
     steps = steps_for_error(weights, {n: values[n] for n in weights}, error_for(quality), subject_radius(g.means))
-    steps["sh0"] /= STEP_WEIGHTS
-    if degrees:
-        steps["shN"] /= np.tile(STEP_WEIGHTS, degrees)
+    for n in (n for n in steps if BY_NAME[n].decorrelated):
+        steps[n] /= np.tile(STEP_WEIGHTS, len(steps[n]) // 3)
     mean = {n: float(np.exp(np.log(s).mean())) for n, s in steps.items()}
     return replace(nominal, by_attribute=nominal.by_attribute | mean)
 
