@@ -241,6 +241,15 @@ def test_poses_have_sixteen_numbers():
         _native.blend_rigid(poses, rest[0], rest[1], rest[2][:, :2].copy())
 
 
+def test_a_gradient_of_another_shape_is_refused():
+    poses, *rest = random_blend(10, 5, 3, False)
+    by_means, by_rotations = np.zeros((10, 3), "f4"), np.zeros((10, 4), "f4")
+    with pytest.raises(ValueError, match=r"by_means: expected shape \[10, 3\], got \[9, 3\]"):
+        _native.blend_rigid_backward(poses, *rest, by_means[1:], by_rotations)
+    with pytest.raises(ValueError, match=r"by_rotations: expected shape \[10, 4\], got \[10, 3\]"):
+        _native.blend_rigid_backward(poses, *rest, by_means, by_means)
+
+
 def test_neighbours_of_a_context_are_the_nearest_before():
     """Spec 7.3."""
     p = np.random.default_rng(0).integers(0, 16, (200, 3)).astype(np.uint32)

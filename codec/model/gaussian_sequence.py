@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from .gaussians import Gaussians
+from .gaussians import Gaussians, shown_at
 from .parametric_group import ParametricGroup
 
 
@@ -34,13 +34,6 @@ class DenseGroup:
     def visible(self, t: int) -> Gaussians:
         """The Gaussians that frame `t` of the group shows."""
         return shown_at(self.frames[t], self.lifetimes, t)
-
-
-def shown_at(g: Gaussians, lifetimes: np.ndarray | None, t: int) -> Gaussians:
-    """The Gaussians of `g` that live at frame `t`; all of them without `lifetimes` ([N, 2])."""
-    if lifetimes is None:
-        return g
-    return g.take((lifetimes[:, 0] <= t) & (t < lifetimes[:, 1]))
 
 
 @dataclass(frozen=True)

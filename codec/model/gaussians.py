@@ -92,3 +92,10 @@ PARAMETERS = tuple(f.name for f in fields(Gaussians))
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
     """One set out of several with the same SH degree."""
     return Gaussians(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)})
+
+
+def shown_at(g: Gaussians, lifetimes: np.ndarray | None, t: int) -> Gaussians:
+    """The Gaussians of `g` that live at frame `t`; all of them without `lifetimes` ([N, 2])."""
+    if lifetimes is None:
+        return g
+    return g.take((lifetimes[:, 0] <= t) & (t < lifetimes[:, 1]))

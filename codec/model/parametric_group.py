@@ -15,7 +15,7 @@ import numpy as np
 from .. import _native
 from ..errors import CaptureError
 from .camera import Calibration
-from .gaussians import Gaussians
+from .gaussians import Gaussians, shown_at
 from .temporal_transform import dct_basis
 
 
@@ -106,10 +106,7 @@ class ParametricGroup:
 
     def visible(self, t: int) -> Gaussians:
         """The Gaussians that frame `t` of the group shows."""
-        g = self.frame(t)
-        if self.lifetimes is None:
-            return g
-        return g.take((self.lifetimes[:, 0] <= t) & (t < self.lifetimes[:, 1]))
+        return shown_at(self.frame(t), self.lifetimes, t)
 
     def carried(self) -> tuple[np.ndarray, np.ndarray]:
         """What the nodes alone do: means [T, N, 3] f32 and rotations [T, N, 4] f32 wxyz that carry the Gaussians."""

@@ -30,11 +30,22 @@ pub fn blend_of(
     })
 }
 
+/// The rows of `a`, named `name`, each of `K` numbers: as many as `count` says, else any number, called `letter`.
+fn rows<'a, const K: usize>(
+    a: &'a PyReadonlyArray2<f32>,
+    name: &str,
+    letter: &str,
+    count: Option<usize>,
+) -> PyResult<&'a [[f32; K]]> {
+    if a.shape()[1] != K || count.is_some_and(|c| c != a.shape()[0]) {
+        let first = count.map_or(letter.to_string(), |c| c.to_string());
+        return invalid(format!("{name}: expected shape [{first}, {K}], got {:?}", a.shape()));
+    }
+    Ok(a.as_slice()?.as_chunks().0)
+}
+
 /// Poses [M, 16] f32 (rows of R, offset s of x -> R x + s, quaternion wxyz) -> `RigidBlend`.
 fn poses(a: &PyReadonlyArray2<f32>) -> PyResult<RigidBlend> {
-    if a.shape()[1] != 16 {
-        return invalid(format!("poses: expected shape [M, 16], got {:?}", a.shape()));
-    }
     let pose = |r: &[f32; 16]| -> Pose {
         let column = |b: usize| [r[b], r[3 + b], r[6 + b], 0.0];
         [
@@ -45,8 +56,7 @@ fn poses(a: &PyReadonlyArray2<f32>) -> PyResult<RigidBlend> {
             [r[12], r[13], r[14], r[15]],
         ]
     };
-    let rows = a.as_slice()?.as_chunks::<16>().0;
-    Ok(RigidBlend::new(rows.iter().map(pose).collect()))
+    Ok(RigidBlend::new(rows(a, "poses", "M", None)?.iter().map(pose).collect()))
 }
 
 /// Where [N, 3] positions at rest are carried, [N, 3], and by which rotations, [N, 4] wxyz (spec 13.3).
@@ -60,12 +70,8 @@ pub fn blend_rigid<'py>(
     neighbors: PyReadonlyArray2<'py, u32>,
     weights: PyReadonlyArray2<'py, f32>,
 ) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
-    let (x, nodes, poses_len) = (
-        rest.as_slice()?.as_chunks::<3>().0,
-        self::poses(&poses)?,
-        poses.shape()[0],
-    );
-    let blend = blend_of(&neighbors, &weights, x.len(), poses_len)?;
+    let (nodes, x) = (self::poses(&poses)?, rows(&rest, "rest", "N", None)?);
+    let blend = blend_of(&neighbors, &weights, x.len(), poses.shape()[0])?;
     let (mut means, mut rotations) = (vec![[0.0f32; 3]; x.len()], vec![[0.0f32; 4]; x.len()]);
     py.detach(|| nodes.carry(&blend, x, (&mut means, &mut rotations), |_, x, q| (x, q)));
     let means = means
@@ -88,15 +94,11 @@ pub fn blend_rigid_backward<'py>(
     by_means: PyReadonlyArray2<'py, f32>,
     by_rotations: PyReadonlyArray2<'py, f32>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let (x, nodes, poses_len) = (
-        rest.as_slice()?.as_chunks::<3>().0,
-        self::poses(&poses)?,
-        poses.shape()[0],
-    );
-    let blend = blend_of(&neighbors, &weights, x.len(), poses_len)?;
+    let (nodes, x) = (self::poses(&poses)?, rows(&rest, "rest", "N", None)?);
+    let blend = blend_of(&neighbors, &weights, x.len(), poses.shape()[0])?;
     let (g, h) = (
-        by_means.as_slice()?.as_chunks().0,
-        by_rotations.as_slice()?.as_chunks().0,
+        rows(&by_means, "by_means", "N", Some(x.len()))?,
+        rows(&by_rotations, "by_rotations", "N", Some(x.len()))?,
     );
     let grads = py.detach(|| nodes.backward(&blend, x, g, h));
     let row = |p: &Pose| -> [f32; 16] {
