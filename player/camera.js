@@ -9,6 +9,8 @@ const clamp = (v, low, high) => Math.min(Math.max(v, low), high);
 
 const FIELD_OF_VIEW = (40 * Math.PI) / 180; // as `gscodec render`
 const PITCH_MAX = 1.5;
+const NEAR = 0.01; // of a file that names none (spec 14)
+const NEAR_MOST = 0.5; // of the distance to the target: what is looked at stays in front
 
 function upVector(axis) {
   const v = [0, 0, 0];
@@ -26,6 +28,7 @@ export class Camera {
     this.side = [this.up[2], this.up[0], this.up[1]];
     this.ahead = cross(this.up, this.side);
     this.references = references;
+    this.nearest = references.length ? Math.min(...references.map((c) => c.near)) : NEAR;
     this.reset();
   }
 
@@ -107,20 +110,21 @@ export class Camera {
     let x = cross(z, this.up);
     x = length(x) > 1e-6 ? scale(x, 1 / length(x)) : this.side;
     const rows = [x, cross(z, x), z].flatMap((axis) => [...axis, -dot(axis, eye)]);
-    return new Float32Array([1000, 1000, 200, 200, 500, 500, ...rows]);
+    return new Float32Array([1000, 1000, 200, 200, 500, 500, ...rows, NEAR]);
   }
 
-  // width, height, fx, fy, cx, cy, 12 of world-to-camera: the input of the rasterizer.
+  // width, height, fx, fy, cx, cy, 12 of world-to-camera, near plane: the input of the rasterizer.
   view(width, height) {
     const c = this.reference;
     if (c) {
       const s = Math.min(width / c.width, height / c.height);
       const [cx, cy] = [s * (c.k[2] - c.width / 2) + width / 2, s * (c.k[4] - c.height / 2) + height / 2];
-      return new Float32Array([width, height, s * c.k[0], s * c.k[3], cx, cy, ...c.viewmat]);
+      return new Float32Array([width, height, s * c.k[0], s * c.k[3], cx, cy, ...c.viewmat, c.near]);
     }
     const f = Math.min(width, height) / 2 / this.tangent;
     const eye = add(this.target, this.#back(), this.distance);
     const rows = this.#axes().flatMap((axis) => [...axis, -dot(axis, eye)]);
-    return new Float32Array([width, height, f, f, width / 2, height / 2, ...rows]);
+    const near = Math.min(this.nearest, NEAR_MOST * this.distance);
+    return new Float32Array([width, height, f, f, width / 2, height / 2, ...rows, near]);
   }
 }

@@ -4,7 +4,6 @@
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i; // slower than the wasm rasterizer
 const ALPHA_MIN = 1 / 255;
 const LOW_PASS = 0.3;
-const NEAR = 0.01;
 const FAR = 1e6; // of the depth buffer, which nothing else uses
 
 // The name of the GPU behind WebGL2; null where there is none, or one that is software.
@@ -49,7 +48,7 @@ export class Gpu {
     this.#renderer.setClearColor(new spark.Color(...background), 1);
     this.name = nameOf(this.#renderer.getContext());
     this.#camera = new spark.PerspectiveCamera();
-    Object.assign(this.#camera, { matrixAutoUpdate: false, near: NEAR, far: FAR });
+    Object.assign(this.#camera, { matrixAutoUpdate: false, far: FAR });
     this.#sorter = new spark.SparkRenderer({
       renderer: this.#renderer,
       autoUpdate: false,
@@ -71,7 +70,7 @@ export class Gpu {
     this.#scene.add(this.#sorter, this.#world);
   }
 
-  // Shows the scene in a headset until the session ends: from where the view (18 numbers) looks, `metres` for a unit of it.
+  // Shows the scene in a headset until the session ends: from where the view (19 numbers) looks, `metres` for a unit of it.
   // Calls tick() for each image of the session: meanwhile the window's own clock may stand still.
   async enter(session, view, metres, tick) {
     const { xr } = this.#renderer;
@@ -106,7 +105,7 @@ export class Gpu {
     return position.clone().applyMatrix4(this.#world.matrix.clone().invert()).toArray();
   }
 
-  // Shows Gaussians that `Native.pack` made for the view (18 numbers); resolves when they are on the canvas, one after another.
+  // Shows Gaussians that `Native.pack` made for the view (19 numbers); resolves when they are on the canvas, one after another.
   draw(view, packed) {
     this.#busy = this.#busy.then(() => this.#draw(view, packed));
     return this.#busy;
@@ -130,16 +129,18 @@ export class Gpu {
   // A pinhole camera with OpenCV axes -> OpenGL.
   #look(view) {
     const [w, h, fx, fy, cx, cy] = view;
+    const near = view.at(-1);
     const { projectionMatrix, projectionMatrixInverse, matrix } = this.#camera;
-    const depth = [-(FAR + NEAR) / (FAR - NEAR), (-2 * FAR * NEAR) / (FAR - NEAR)];
+    const depth = [-(FAR + near) / (FAR - near), (-2 * FAR * near) / (FAR - near)];
     projectionMatrix.set((2 * fx) / w, 0, 1 - (2 * cx) / w, 0, 0, (2 * fy) / h, (2 * cy) / h - 1, 0, 0, 0, ...depth, 0, 0, -1, 0);
     projectionMatrixInverse.copy(projectionMatrix).invert();
     matrix.copy(this.#toCamera(view)).invert();
     this.#camera.updateMatrixWorld(true);
   }
 
-  #toCamera([, , , , , , ...m]) {
+  #toCamera(view) {
     const { Matrix4 } = this.#spark;
+    const m = view.slice(6, 18);
     return new Matrix4().set(...m, 0, 0, 0, 1).premultiply(new Matrix4().makeScale(1, -1, -1));
   }
 

@@ -91,7 +91,7 @@ export class Native {
 
   // Image
 
-  // view: 18 floats, see wasm.rs. Calls take(band) for each band; `splats` is a view into the memory of the instance.
+  // view: 19 floats, see wasm.rs. Calls take(band) for each band; `splats` is a view into the memory of the instance.
   project(view, count, take) {
     this.put(new Uint8Array(view.buffer, view.byteOffset, view.byteLength));
     const bands = this.x.project(count);

@@ -262,7 +262,10 @@ def read_gsvc(r):
         fx, skew, cx, fy, cy = (r.f32("camera matrix") for _ in range(5))
         camera["K"] = np.array([[fx, skew, cx], [0, fy, cy], [0, 0, 1]])
         camera["viewmat"] = np.array([r.f32("viewmat") for _ in range(12)] + [0, 0, 0, 1]).reshape(4, 4)
-        cameras.append(camera)
+        cameras.append(camera | {"near": 0.01})
+    if r.position < r.end:
+        for camera in cameras:
+            camera["near"] = r.f32("near", positive=True)
     return Config(
         level, frame_duration, metres_per_unit, up_axis, color_space, background, sh_degree, sh_frame, cameras
     )

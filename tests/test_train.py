@@ -22,7 +22,7 @@ from gscodec.encode.quantize import quantize
 from gscodec.encode.settings import EncodeSettings
 from gscodec.errors import CaptureError, UsageError
 from gscodec.metrics.image import psnr
-from gscodec.model.camera import Camera, look_at
+from gscodec.model.camera import Camera, look_at, meeting_point
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.model.gaussians import concatenate
 from gscodec.model.parametric_group import ParametricGroup
@@ -45,7 +45,7 @@ from gscodec.train.settings import TrainSettings, train_settings
 from gscodec.train.tracking import Tracker
 from gscodec.train.train import segments, train_groups
 from gscodec.train.views import Views
-from gscodec.train.visual_hull import hull_points, meeting_point, project
+from gscodec.train.visual_hull import hull_points, project
 
 SIZE = 64
 TINY = TrainSettings(

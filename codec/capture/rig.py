@@ -9,19 +9,21 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import CaptureError
-from ..model.camera import Camera
+from ..model.camera import NEAR, Camera, meeting_point
 from .capture import Capture, differs, extent
 from .images import SUFFIXES, View, image_size, read_image, read_mask
 from .undistort import Undistortion
 from .video import Video
 
 FPS = 30.0  # where nothing says it
+NEAR_SHARE = 0.2  # of the depth at which the optical axes meet: nothing that is nearer is part of the scene
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
 Track = Sequence[Camera]  # one camera in each frame of its feed; a single entry holds for all frames
 
@@ -93,7 +95,7 @@ def assemble(name: str, tracks: Sequence[Track], feeds: Sequence[Feed], fps: flo
         CaptureError: the feeds have no frames.
     """
     tracks, feeds, frame_count = _same_length(tracks, feeds)
-    tracks = _still(tracks)
+    tracks = _with_near(_still(tracks))
     lenses = [Undistortion() for _ in tracks]
     pinholes = [[lens.camera(c) for c in track] for lens, track in zip(lenses, tracks, strict=True)]
 
@@ -113,6 +115,16 @@ def assemble(name: str, tracks: Sequence[Track], feeds: Sequence[Feed], fps: flo
     moving = any(len(track) > 1 for track in tracks)
     cameras = [track[0] for track in pinholes]
     return Capture(name, fps or feeds[0].fps, cameras, frame_count, alpha, read, poses=poses if moving else None)
+
+
+def _with_near(tracks: Sequence[Track]) -> list[Track]:
+    """Near planes where the layout says nothing: at `NEAR_SHARE` of the depth at which the optical axes meet."""
+    meeting, out = meeting_point([track[0] for track in tracks]), []
+    for track in tracks:
+        depth = float(track[0].viewmat[2] @ [*meeting, 1])
+        near = NEAR_SHARE * depth if track[0].near == NEAR and depth > 0 else track[0].near
+        out.append([replace(c, near=near) for c in track])
+    return out
 
 
 def _at(track: Track, frame: int) -> Camera:

@@ -2,7 +2,8 @@
 
 The format lists images, a capture has cameras with all their frames: entries are grouped by `camera` and ordered by
 `frame` or `time`. Each entry has its own pose and may have its own intrinsics, so cameras may move. Poses are OpenGL
-camera-to-world (x right, y up, z back) and become OpenCV world-to-camera.
+camera-to-world (x right, y up, z back) and become OpenCV world-to-camera. `near`, in the head or in an entry, is a near
+plane in the units of the poses.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import CaptureError
-from ..model.camera import Camera
+from ..model.camera import NEAR, Camera
 from .capture import Capture
 from .images import SUFFIXES, image_size
 from .rig import FPS, Feed, Track, assemble, pinhole, rigid, usable
@@ -227,7 +228,10 @@ def _camera(name: str, e: Entry, width: int, height: int) -> Camera:
     if (int(v.get("w", width)), int(v.get("h", height))) != (width, height):
         raise CaptureError(f"image {e.image} is {width}x{height}, expected {v.get('w')}x{v.get('h')} (w, h)")
     distortion = np.array([float(v.get(k, 0)) for k in DISTORTION])
-    return Camera(name, _intrinsics(v, width, height), _viewmat(v), width, height, distortion)
+    near = float(v.get("near", NEAR))
+    if not 0 < near < math.inf:
+        raise CaptureError(f"near plane at {near:g}, expected a distance above 0")
+    return Camera(name, _intrinsics(v, width, height), _viewmat(v), width, height, distortion, near=near)
 
 
 def _intrinsics(v: dict, width: int, height: int) -> np.ndarray:

@@ -77,7 +77,7 @@ class Stream:
     def cameras(self) -> list[Camera]:
         """Reference cameras of the capture."""
         return [
-            Camera(c["name"], np.array(c["K"]), np.array(c["viewmat"]), c["width"], c["height"])
+            Camera(c["name"], np.array(c["K"]), np.array(c["viewmat"]), c["width"], c["height"], near=c["near"])
             for c in self.config["cameras"]
         ]
 

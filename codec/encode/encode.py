@@ -74,6 +74,7 @@ def stream_config(
                 "name": c.name,
                 "K": np.asarray(c.K, float).tolist(),
                 "viewmat": np.asarray(c.viewmat, float).tolist(),
+                "near": float(c.near),
                 "width": c.width,
                 "height": c.height,
             }

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+
+NEAR = 0.01  # world units, near plane of a camera of which nothing is known (spec 14)
 
 
 @dataclass(frozen=True)
@@ -18,7 +21,9 @@ class Camera:
         width, height: image size in pixels.
         distortion: [k1, k2, p1, p2, k3] as in OpenCV (any length it takes), empty for none; a Capture hands out
             undistorted images with an empty one.
-        split: "train" or "test".
+        split: "train", "val" or "test".
+        near: near plane, world units: Gaussians whose centre is nearer are not drawn. A reader of captures leaves
+            `NEAR` where its layout says nothing; `Capture` then puts it at a share of the distance to the scene.
     """
 
     name: str
@@ -28,6 +33,7 @@ class Camera:
     height: int
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
     split: str = "train"
+    near: float = NEAR
 
     @property
     def center(self) -> np.ndarray:
@@ -80,6 +86,16 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     m[:3, :3] = R
     m[:3, 3] = -R @ eye
     return m
+
+
+def meeting_point(cameras: Sequence[Camera]) -> np.ndarray:
+    """Point nearest to all optical axes (least squares), [3] f64."""
+    A, b = 1e-6 * np.eye(3), np.zeros(3)
+    for c in cameras:
+        axis = c.viewmat[2, :3]
+        P = np.eye(3) - np.outer(axis, axis)
+        A, b = A + P, b + P @ c.center
+    return np.linalg.solve(A, b)
 
 
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import UsageError, require
-from ..model.camera import Camera, look_at
+from ..model.camera import NEAR, Camera, look_at
 from ..model.gaussians import Gaussians
 from .image import render_image
 from .png import write_png
@@ -26,8 +26,9 @@ def up_vector(axis: str) -> np.ndarray:
     return v
 
 
-def orbit_camera(g: Gaussians, up: str, turn: float, width: int, height: int) -> Camera:
-    """A camera around the 1-99 % box of `g` with its bounding sphere in frame; `turn` in turns."""
+def orbit_camera(g: Gaussians, up: str, turn: float, width: int, height: int, near: float) -> Camera:
+    """A camera around the 1-99 % box of `g` with its bounding sphere in frame; `turn` in turns, `near` plane in world
+    units."""
     low, high = np.percentile(g.means, [1, 99], axis=0) if len(g) else (np.zeros(3), np.ones(3))
     centre, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
     u = up_vector(up)
@@ -39,18 +40,20 @@ def orbit_camera(g: Gaussians, up: str, turn: float, width: int, height: int) ->
     eye = centre + direction / np.linalg.norm(direction) * radius / np.sin(half)
     f = min(width, height) / 2 / np.tan(half)
     K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
-    return Camera("orbit", K, look_at(eye, centre, u), width, height)
+    return Camera("orbit", K, look_at(eye, centre, u), width, height, near=near)
 
 
 def load_camera(path: Path) -> Camera:
-    """A camera from a .json file with K [3, 3], viewmat [4, 4] (world-to-camera, OpenCV), width and height.
+    """A camera from a .json file with K [3, 3], viewmat [4, 4] (world-to-camera, OpenCV), width, height and, if it
+    is known, near (world units).
 
     Raises:
         UsageError: it is not such a file.
     """
     try:
         c = json.loads(Path(path).read_text())
-        return Camera("file", np.array(c["K"], float), np.array(c["viewmat"], float), int(c["width"]), int(c["height"]))
+        K, viewmat, near = np.array(c["K"], float), np.array(c["viewmat"], float), float(c.get("near", NEAR))
+        return Camera("file", K, viewmat, int(c["width"]), int(c["height"]), near=near)
     except (OSError, ValueError, KeyError, TypeError) as e:
         raise UsageError(f"--camera {path}: expected a JSON object with K, viewmat, width and height ({e})") from None
 
@@ -64,9 +67,10 @@ def camera_path(stream, camera: str, size: str | None, frames: range) -> Iterato
     wanted = parse_size(size)
     if camera == "orbit":
         width, height = wanted or (512, 512)
-        first = stream.frame(frames[0])
+        first, near = stream.frame(frames[0]), min((c.near for c in stream.cameras), default=NEAR)
         for t in frames:
-            yield orbit_camera(first, stream.config["up"], t / (stream.fps * ORBIT_SECONDS), width, height)
+            turn = t / (stream.fps * ORBIT_SECONDS)
+            yield orbit_camera(first, stream.config["up"], turn, width, height, near)
         return
     known = {c.name: c for c in stream.cameras}
     if camera in known:

@@ -14,7 +14,6 @@ from ..model.camera import Camera
 # The normative constants; the same as in native/raster/src/constants.rs.
 LOW_PASS = 0.3  # px^2
 FOV_MARGIN = 0.3  # of half the field of view
-NEAR = 0.01  # world units
 ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.999
 TRANSMITTANCE_STOP = 1e-4
@@ -84,7 +83,7 @@ def rasterize_reference(
     image = means.new_zeros(camera.height, camera.width, 3)
     weights = means.new_zeros(len(means))
     for i in torch.argsort(depth, stable=True).tolist():
-        if depth[i] < NEAR:
+        if depth[i] < camera.near:
             continue
         d = pixels - mean2d[i]
         power = 0.5 * torch.einsum("hwi,ij,hwj->hw", d, conic[i], d)

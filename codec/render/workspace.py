@@ -93,6 +93,7 @@ def view(camera: Camera, region: Region) -> dict:
         "size": [camera.width, camera.height],
         "intrinsics": [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
         "viewmat": m[:3].tolist(),
+        "near": float(camera.near),
         "region": [int(v) for v in region],
     }
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from ..capture.detect import LOOKED_FOR, find_capture
 from ..errors import CaptureError, UsageError
-from ..model.camera import Camera
+from ..model.camera import NEAR, Camera
 from ..model.gaussian_sequence import DenseGroup, GaussianSequence
 from ..model.gaussians import GOP, Gaussians
 from ..model.parametric_group import ParametricGroup
@@ -266,4 +266,12 @@ def _digest(paths: list[Path]) -> str:
 
 def _camera(c: dict) -> Camera:
     K, viewmat = (np.array(c[k], np.float64) for k in ("K", "viewmat"))
-    return Camera(str(c["name"]), K, viewmat, int(c["width"]), int(c["height"]), split=str(c.get("split", "train")))
+    return Camera(
+        str(c["name"]),
+        K,
+        viewmat,
+        int(c["width"]),
+        int(c["height"]),
+        split=str(c.get("split", "train")),
+        near=float(c.get("near", NEAR)),
+    )

@@ -109,5 +109,6 @@ def _camera(c: Camera) -> dict:
         "height": c.height,
         "K": c.K.tolist(),
         "viewmat": c.viewmat.tolist(),
+        "near": c.near,
         "split": c.split,
     }

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..model.camera import fibonacci_directions
+from ..model.camera import fibonacci_directions, meeting_point
 from .settings import PlaneSweepSettings
-from .visual_hull import colors_of, meeting_point, project
+from .visual_hull import colors_of, project
 
 
 def sweep(

@@ -8,20 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..model.camera import meeting_point
 from .settings import VisualHullSettings
 
-DEPTH_MIN = 0.01  # world units, the near plane of the renderer
 OPAQUE = 128  # of 255, alpha from which a pixel belongs to the subject
-
-
-def meeting_point(cameras) -> np.ndarray:
-    """Point nearest to all optical axes (least squares), [3] f64."""
-    A, b = 1e-6 * np.eye(3), np.zeros(3)
-    for c in cameras:
-        axis = c.viewmat[2, :3]
-        P = np.eye(3) - np.outer(axis, axis)
-        A, b = A + P, b + P @ c.center
-    return np.linalg.solve(A, b)
 
 
 def project(camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -45,7 +35,7 @@ def _inside(points: np.ndarray, views, settings: VisualHullSettings) -> np.ndarr
     for camera, _, alpha in views:
         p, depth = project(camera, points)
         x, y = np.floor(p).astype(np.int64).T
-        on = (depth > DEPTH_MIN) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+        on = (depth > camera.near) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
         seen += on
         missed[on] += alpha[y[on], x[on]] < OPAQUE
     return (seen >= max(2, settings.seen_share * len(views))) & (missed <= settings.misses_max)
@@ -57,7 +47,7 @@ def colors_of(points: np.ndarray, views) -> np.ndarray:
     for i, (camera, rgb, alpha) in enumerate(views):
         p, depth = project(camera, points)
         x, y = np.floor(p).astype(np.int64).T
-        on = np.flatnonzero((depth > DEPTH_MIN) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height))
+        on = np.flatnonzero((depth > camera.near) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height))
         if alpha is not None:
             on = on[alpha[y[on], x[on]] >= OPAQUE]
         colors[i, on] = rgb[y[on], x[on]] / 255
@@ -125,7 +115,7 @@ def random_points(cameras, views, count: int, seed: int, settings: VisualHullSet
     seen = np.zeros(len(points), np.int32)
     for c in cameras:
         p, depth = project(c, points)
-        seen += (depth > DEPTH_MIN) & (p >= 0).all(1) & (p < [c.width, c.height]).all(1)
+        seen += (depth > c.near) & (p >= 0).all(1) & (p < [c.width, c.height]).all(1)
     points = points[seen >= min(2, len(cameras))]
     points = points[rng.permutation(len(points))[:count]]
     return points, colors_of(points, views)

@@ -246,6 +246,7 @@ INVALID = {  # name: (error, part of the package's message, bytes)
     "config_camera_count": (B, "", patched(b"gsvC", 26, b"\xff\xff")),
     "config_camera_name": (B, "", patched(b"gsvC", 29, b"\xff\xff")),
     "config_camera_width": (B, "", patched(b"gsvC", 29 + len(CAMERA["name"].encode()), u32(0))),
+    "config_camera_near": (B, "near", patched(b"gsvC", 29 + len(CAMERA["name"].encode()) + 76, f32(0))),
     "config_camera_nan": (B, "", patched(b"gsvC", 37 + len(CAMERA["name"].encode()), f32(NAN))),
     "config_sh_degree_low": (B, "degree", lambda: groups_file(make_group(40, 2, sh_degree=1), sh_degree=0)),
     "duration_no_frames": (B, "", lambda: poke_duration(1001, 1000)),

@@ -54,7 +54,7 @@ fn gradients<'a>(g: &'a mut Grads) -> PyResult<Gradients<'a>> {
     })
 }
 
-/// size, (fx, fy, cx, cy), rows of the world-to-camera matrix and the region (x, y, width, height).
+/// size, (fx, fy, cx, cy), rows of the world-to-camera matrix, near plane and the region (x, y, width, height).
 #[derive(FromPyObject)]
 struct ViewArgs {
     #[pyo3(item)]
@@ -63,6 +63,8 @@ struct ViewArgs {
     intrinsics: [f32; 4],
     #[pyo3(item)]
     viewmat: [[f32; 4]; 3],
+    #[pyo3(item)]
+    near: f32,
     #[pyo3(item)]
     region: [usize; 4],
 }
@@ -79,6 +81,7 @@ impl ViewArgs {
             center: [cx, cy],
             rotation: std::array::from_fn(|i| [m[i][0], m[i][1], m[i][2]]),
             translation: [m[0][3], m[1][3], m[2][3]],
+            near: self.near,
             region: Region { x, y, width, height },
         }
     }
@@ -244,5 +247,7 @@ pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<kernels::HashGrid>()?;
     m.add_function(wrap_pyfunction!(kernels::image_loss, m)?)?;
     m.add_function(wrap_pyfunction!(kernels::adam, m)?)?;
+    m.add_function(wrap_pyfunction!(kernels::trajectory_sum, m)?)?;
+    m.add_function(wrap_pyfunction!(kernels::trajectory_step, m)?)?;
     m.add_function(wrap_pyfunction!(simd_levels, m)?)
 }

@@ -110,7 +110,7 @@ pub extern "C" fn attribute(which: usize) {
     with(|p| p.attribute(which));
 }
 
-/// Projects the evaluated frame. Input: 18 f32: width, height, fx, fy, cx, cy, 12 of world-to-camera. Returns the number of
+/// Projects the evaluated frame. Input: 19 f32: width, height, fx, fy, cx, cy, 12 of world-to-camera, near plane. Returns the number of
 /// bands, at most `bands`, or 0.
 #[unsafe(no_mangle)]
 pub extern "C" fn project(bands: usize) -> usize {

@@ -10,6 +10,9 @@ pub trait Fields {
     /// The error of a field that breaks a rule.
     fn fail<T>(&self, expected: String) -> Result<T>;
 
+    /// Whether an optional field at the end is there: always when writing.
+    fn more(&self) -> bool;
+
     fn u8(&mut self, v: &mut u8) -> Result<()> {
         let mut b = [*v];
         self.bytes(&mut b)?;
@@ -63,6 +66,10 @@ pub trait Fields {
 pub struct Writer(pub Vec<u8>);
 
 impl Fields for Writer {
+    fn more(&self) -> bool {
+        true
+    }
+
     fn bytes(&mut self, v: &mut [u8]) -> Result<()> {
         self.0.extend_from_slice(v);
         Ok(())
@@ -105,6 +112,10 @@ impl<'a> Reader<'a> {
 }
 
 impl Fields for Reader<'_> {
+    fn more(&self) -> bool {
+        self.rest() > 0
+    }
+
     fn bytes(&mut self, v: &mut [u8]) -> Result<()> {
         v.copy_from_slice(self.take(v.len())?);
         Ok(())

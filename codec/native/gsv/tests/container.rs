@@ -17,6 +17,7 @@ fn config() -> Config {
         height: 1080,
         k: [1.0; 5],
         viewmat: [0.5; 12],
+        near: 0.5,
     };
     Config {
         timescale: 30_000,

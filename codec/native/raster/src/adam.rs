@@ -37,7 +37,7 @@ impl Adam {
         let values = param.par_chunks_mut(SHARE).zip(grad.par_chunks(SHARE));
         values
             .zip(moments)
-            .for_each(|((param, grad), (first, second))| adam(level, self, param, grad, first, second));
+            .for_each(|((param, grad), (first, second))| adam_values(level, self, param, grad, first, second));
         Ok(())
     }
 }
@@ -64,4 +64,4 @@ fn adam_kernel<V: Vector>(a: Adam, param: &mut [f32], grad: &[f32], first: &mut 
         values::<f32>(a, at, param, grad, first, second);
     }
 }
-dispatch!(fn adam = adam_kernel(a: Adam, param: &mut [f32], grad: &[f32], first: &mut [f32], second: &mut [f32]));
+dispatch!(pub fn adam_values = adam_kernel(a: Adam, param: &mut [f32], grad: &[f32], first: &mut [f32], second: &mut [f32]));

@@ -110,6 +110,7 @@ mod tests {
             center: [width as f32 / 2.0, height as f32 / 2.0],
             rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
             translation: [0.0; 3],
+            near: crate::constants::NEAR,
             region: Region {
                 x: 0,
                 y: 0,

@@ -5,7 +5,7 @@
 pub const LOW_PASS: f32 = 0.3;
 /// x/z and y/z inside the Jacobian are clamped to the image edge plus this share of half the field of view (1.3x in all).
 pub const FOV_MARGIN: f32 = 0.3;
-/// Gaussians whose centre is nearer than this are not drawn, world units.
+/// Near plane of a view that names none, world units: Gaussians whose centre is nearer are not drawn.
 pub const NEAR: f32 = 0.01;
 /// A Gaussian adds nothing to a pixel where its alpha is below this.
 pub const ALPHA_MIN: f32 = 1.0 / 255.0;

@@ -5,7 +5,7 @@ use std::fmt;
 use crate::region::Region;
 
 /// Why a call was refused; nothing was drawn or written then.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub enum RasterError {
     Shape {
         name: &'static str,
@@ -21,6 +21,7 @@ pub enum RasterError {
         what: &'static str,
         limit: usize,
     },
+    Near(f32),
     NothingRendered,
 }
 
@@ -38,6 +39,7 @@ impl fmt::Display for RasterError {
                 r.width, r.height, r.x, r.y
             ),
             RasterError::TooMany { what, limit } => write!(f, "more than {limit} {what}"),
+            RasterError::Near(near) => write!(f, "near plane at {near}, expected a distance above 0"),
             RasterError::NothingRendered => {
                 write!(f, "backward without a forward pass of these Gaussians and this view")
             }

@@ -24,6 +24,7 @@ pub struct Lens {
     pub slope_max: [f32; 2],
     pub size: [f32; 2], // of the region
     pub full: [f32; 2], // of the image
+    pub near: f32,
 }
 
 impl Lens {
@@ -41,6 +42,7 @@ impl Lens {
             slope_max: std::array::from_fn(|i| (full[i] - view.center[i]) / view.focal[i] + margin(i)),
             size: [view.region.width as f32, view.region.height as f32],
             full,
+            near: view.near,
         }
     }
 }

@@ -40,6 +40,7 @@ mod tile;
 mod tile_binning;
 mod tile_passes;
 mod tile_rect;
+pub mod trajectory;
 
 pub use adam::Adam;
 pub use bands::{Band, Bands};

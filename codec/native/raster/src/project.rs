@@ -4,7 +4,7 @@
 //! log2(alpha) = log2_opacity - u^2 - v^2 with u = l11 dx + l21 dy, v = l22 dy. That costs as little per pixel as the
 //! quadratic form, and rounding never makes the exponent positive.
 
-use crate::constants::{LOG2_ALPHA_MIN, NEAR};
+use crate::constants::LOG2_ALPHA_MIN;
 use crate::ellipse::{Ellipse, reach};
 use crate::ewa::{Lens, WHITEN, colour, ewa, exp};
 use crate::projected::{MANY, Projected, SLACK, TILE};
@@ -34,7 +34,7 @@ fn project_lanes<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize, out: &m
     let half = c::<V>(0.5);
     let in_x = (x + rx).ge(half) & (c::<V>(lens.size[0]) - half).ge(x - rx);
     let in_y = (y + ry).ge(half) & (c::<V>(lens.size[1]) - half).ge(y - ry);
-    let front = e.p[2].ge(c(NEAR)) & range.ge(c(0.0)) & logit.finite();
+    let front = e.p[2].ge(c(lens.near)) & range.ge(c(0.0)) & logit.finite();
     let shape = x.finite() & y.finite() & l11.finite() & l21.finite() & l22.finite() & rx.finite() & ry.finite();
     let scales: [V; 3] = load_rows(&soa.log_scales, at);
     let front = front & scales[0].finite() & scales[1].finite() & scales[2].finite();

@@ -148,13 +148,17 @@ pub struct View {
     pub center: [f32; 2],
     pub rotation: [[f32; 3]; 3], // world to camera
     pub translation: [f32; 3],
+    pub near: f32, // world units; Gaussians whose centre is nearer are not drawn
     pub region: Region,
 }
 
 impl View {
     /// # Errors
-    /// An empty or too large image; a region that is not inside the image.
+    /// An empty or too large image; a region that is not inside the image; a near plane that is not in front.
     pub fn check(&self) -> Result<(), RasterError> {
+        if !(self.near > 0.0 && self.near.is_finite()) {
+            return Err(RasterError::Near(self.near));
+        }
         check_size(self.region, self.width, self.height)
     }
 

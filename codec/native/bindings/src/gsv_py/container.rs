@@ -1,7 +1,7 @@
 //! Config dicts <-> the container: init segment, fragments, index, demuxer.
 
 use super::values::{bytes_of, invalid, item, optional, raise, value};
-use gsv::container::config::{COLOR_SPACES, Camera, Config, SH_FRAMES, UP_AXES, rate};
+use gsv::container::config::{COLOR_SPACES, Camera, Config, NEAR, SH_FRAMES, UP_AXES, rate};
 use gsv::container::demux::Demuxer;
 use gsv::container::whole;
 use gsv::container::write::{self, Reference};
@@ -68,6 +68,7 @@ fn camera_from(d: &Bound<PyDict>) -> PyResult<Camera> {
         height: value(d, "height")?,
         k: [k[0], k[1], k[2], k[4], k[5]].map(|v| v as f32),
         viewmat: std::array::from_fn(|i| v[i] as f32),
+        near: optional(d, "near")?.map_or(Ok(NEAR), |v| v.extract())?,
     })
 }
 
@@ -96,6 +97,7 @@ fn config_into<'py>(py: Python<'py>, c: &Config) -> PyResult<Bound<'py, PyDict>>
                 .reshape([3, 3])?,
         )?;
         one.set_item("viewmat", v.into_pyarray(py).reshape([4, 4])?)?;
+        one.set_item("near", f64::from(c.near))?;
         one.set_item("width", c.width)?;
         one.set_item("height", c.height)?;
         cameras.append(one)?;

@@ -1,7 +1,8 @@
-//! Training kernels that work on arrays alone: image loss, Adam and hash grid.
+//! Training kernels that work on arrays alone: image loss, Adam, trajectories and hash grid.
 
 use numpy::{PyArray1, prelude::*};
 use pyo3::prelude::*;
+use raster::trajectory::{self, BitPrice, Trajectories};
 use raster::{Adam, ImageLoss, Pair, SimdLevel};
 
 use super::arrays::{In, InOut, contiguous, level, usage};
@@ -55,15 +56,62 @@ pub fn adam(
     step: i32,
 ) -> PyResult<()> {
     let (mut param, grad, mut first, mut second) = arrays;
-    let adam = Adam {
+    let adam = corrected(rate, betas, epsilon, step);
+    let (param, grad) = (contiguous(param.as_slice_mut())?, contiguous(grad.as_slice())?);
+    let (first, second) = (contiguous(first.as_slice_mut())?, contiguous(second.as_slice_mut())?);
+    py.detach(|| adam.step(SimdLevel::best(), param, grad, first, second))
+        .map_err(usage)
+}
+
+/// The step of Adam number `step`, from 1, with its bias corrections.
+fn corrected(rate: f64, betas: [f64; 2], epsilon: f32, step: i32) -> Adam {
+    Adam {
         betas: betas.map(|b| b as f32),
         epsilon,
         rate: (rate / (1.0 - betas[0].powi(step))) as f32,
         correction: (1.0 / (1.0 - betas[1].powi(step))) as f32,
+    }
+}
+
+/// sum over k of at[k] * rounded(coefficients [K, ...]) -> out, in place.
+#[pyfunction]
+pub fn trajectory_sum(py: Python, coefficients: In, at: Vec<f32>, dead_zone: f32, mut out: InOut) -> PyResult<()> {
+    let (values, out) = (contiguous(coefficients.as_slice())?, contiguous(out.as_slice_mut())?);
+    py.detach(|| trajectory::sum_at(SimdLevel::best(), values, &at, dead_zone, out))
+        .map_err(usage)
+}
+
+/// One step of Adam on coefficients [K, ...] in place, `step` counted from 1: along at[k] * grad and, with a price
+/// (weight, scales [K], noise), along the bits. Returns K times (bits, derivative by the log of the scale).
+#[pyfunction]
+#[allow(clippy::too_many_arguments)]
+pub fn trajectory_step(
+    py: Python,
+    arrays: (InOut, In, InOut, InOut),
+    at: Vec<f32>,
+    price: Option<(f32, Vec<f32>, In)>,
+    rate: f64,
+    betas: [f64; 2],
+    epsilon: f32,
+    step: i32,
+) -> PyResult<Vec<[f64; 2]>> {
+    let (mut values, grad, mut first, mut second) = arrays;
+    let adam = corrected(rate, betas, epsilon, step);
+    let trajectories = Trajectories {
+        values: contiguous(values.as_slice_mut())?,
+        first: contiguous(first.as_slice_mut())?,
+        second: contiguous(second.as_slice_mut())?,
     };
-    let (param, grad) = (contiguous(param.as_slice_mut())?, contiguous(grad.as_slice())?);
-    let (first, second) = (contiguous(first.as_slice_mut())?, contiguous(second.as_slice_mut())?);
-    py.detach(|| adam.step(SimdLevel::best(), param, grad, first, second))
+    let grad = contiguous(grad.as_slice())?;
+    let price = match &price {
+        Some((weight, scales, noise)) => Some(BitPrice {
+            weight: *weight,
+            scales,
+            noise: contiguous(noise.as_slice())?,
+        }),
+        None => None,
+    };
+    py.detach(|| trajectory::step(SimdLevel::best(), adam, trajectories, &at, grad, price))
         .map_err(usage)
 }
 

@@ -216,9 +216,9 @@ fn floats(values: &[f32]) -> Vec<u8> {
     values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }
 
-/// A view from 18 f32; missing ones are 0, which the rasterizer refuses.
+/// A view from 19 f32; missing ones are 0, which the rasterizer refuses.
 fn view(bytes: &[u8]) -> View {
-    let mut v = [0.0f32; 18];
+    let mut v = [0.0f32; 19];
     for (v, b) in v.iter_mut().zip(bytes.as_chunks::<4>().0) {
         *v = f32::from_le_bytes(*b);
     }
@@ -231,6 +231,7 @@ fn view(bytes: &[u8]) -> View {
         center: [v[4], v[5]],
         rotation: std::array::from_fn(|i| std::array::from_fn(|j| m(i, j))),
         translation: std::array::from_fn(|i| m(i, 3)),
+        near: v[18],
         region: Region {
             x: 0,
             y: 0,

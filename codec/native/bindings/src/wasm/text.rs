@@ -47,12 +47,13 @@ fn config(c: &Config) -> String {
 
 fn camera(c: &Camera) -> String {
     format!(
-        r#"{{"name":{},"width":{},"height":{},"k":{},"viewmat":{}}}"#,
+        r#"{{"name":{},"width":{},"height":{},"k":{},"viewmat":{},"near":{}}}"#,
         string(&c.name),
         c.width,
         c.height,
         list(c.k.iter(), f32::to_string),
         list(c.viewmat.iter(), f32::to_string),
+        c.near,
     )
 }
 

@@ -7,11 +7,13 @@ use crate::fields::{Fields, Reader, Writer};
 pub const UP_AXES: [&str; 6] = ["x", "y", "z", "-x", "-y", "-z"];
 /// Names of `color_space` values.
 pub const COLOR_SPACES: [&str; 1] = ["srgb"];
+/// Near plane of a camera of a file that names none, world units.
+pub const NEAR: f32 = 0.01;
 /// Names of `sh_frame` values.
 pub const SH_FRAMES: [&str; 2] = ["world", "body"];
 
 /// A reference camera: OpenCV axes, pixel centres at half-integers.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Camera {
     pub name: String,
     pub width: u32,
@@ -20,6 +22,21 @@ pub struct Camera {
     pub k: [f32; 5],
     /// The upper three rows of world-to-camera.
     pub viewmat: [f32; 12],
+    /// Gaussians whose centre is nearer than this are not drawn, world units.
+    pub near: f32,
+}
+
+impl Default for Camera {
+    fn default() -> Camera {
+        Camera {
+            name: String::new(),
+            width: 0,
+            height: 0,
+            k: [0.0; 5],
+            viewmat: [0.0; 12],
+            near: NEAR,
+        }
+    }
 }
 
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -87,6 +104,11 @@ impl Config {
             }
             camera(f, &mut self.cameras[i])?;
         }
+        if f.more() {
+            for c in &mut self.cameras {
+                f.step(&mut c.near, "near")?;
+            }
+        }
         Ok(())
     }
 }
@@ -136,4 +158,32 @@ pub fn rate(fps: f64) -> Result<(u32, u32)> {
     }
     let duration = if fps > 1000.0 { 10_000 } else { 1_000_000 };
     Ok(((fps * f64::from(duration)).round() as u32, duration))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn near_planes_may_be_missing() {
+        let camera = Camera {
+            width: 1,
+            height: 1,
+            near: 0.75,
+            ..Camera::default()
+        };
+        let config = Config {
+            timescale: 30,
+            frame_duration: 1,
+            level: 1,
+            metres_per_unit: 1.0,
+            cameras: vec![camera.clone(), camera],
+            ..Config::default()
+        };
+        let body = config.write().unwrap();
+        assert_eq!(Config::read(&body, 30).unwrap(), config);
+        let older = Config::read(&body[..body.len() - 8], 30).unwrap();
+        assert!(older.cameras.iter().all(|c| c.near == NEAR));
+        assert!(Config::read(&body[..body.len() - 4], 30).is_err());
+    }
 }

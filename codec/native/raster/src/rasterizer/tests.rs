@@ -36,6 +36,7 @@ fn draw_at(level: SimdLevel, n: usize, log_scale: f32, size: usize, training: bo
         center: [0.5 * size as f32; 2],
         rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
         translation: [0.0; 3],
+        near: crate::constants::NEAR,
         region,
     };
     let mut r = Rasterizer::new(level, 0);
