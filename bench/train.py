@@ -226,8 +226,8 @@ def every_frame_alone(capture: Capture, frames: range, settings) -> tuple[list[G
     """Trains a keyframe for each of `frames`; returns their Gaussians and the seconds."""
     import torch
 
-    from gscodec.bitstream.quantization import subject_radius
     from gscodec.render.cpu import CpuBackend
+    from gscodec.train.budget import budget_of
     from gscodec.train.initialization import initial_model
     from gscodec.train.keyframe import train_keyframe
     from gscodec.train.views import Views
@@ -235,10 +235,10 @@ def every_frame_alone(capture: Capture, frames: range, settings) -> tuple[list[G
     torch.set_num_threads(1)  # as the commands do
     models, start = [], time.perf_counter()
     for frame in frames:
-        model = initial_model(capture, frame, settings)
-        radius = subject_radius(model.params["means"].numpy())
         views = Views(capture, settings, CpuBackend())
-        train_keyframe(model, views, frame, settings, steps=settings.keyframe_steps, radius=radius)
+        budget = budget_of(views, frame, settings.keyframe_steps, settings.budget)
+        model, radius = initial_model(capture, frame, settings.initial_points or budget.points, settings)
+        train_keyframe(model, views, frame, settings, steps=budget.steps, radius=radius)
         models.append(model.gaussians())
     return models, time.perf_counter() - start
 

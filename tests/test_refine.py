@@ -107,7 +107,10 @@ def test_a_trained_group_comes_nearer_to_its_pictures(frames):
     gains = np.geomspace(0.7, 1 / 0.7, len(cameras), dtype=np.float32)[:, None].repeat(3, 1)
     wrong = np.random.default_rng(1).normal(0, 0.15, truth[0].sh0.shape).astype(np.float32)
     model = [replace(g, sh0=g.sh0 + wrong) for g in truth]
-    capture, calibration = pictures_of(truth, cameras, gains), Calibration(np.tile(np.eye(4), (16, 1, 1)), gains)
+    capture, calibration = (
+        pictures_of(truth, cameras, gains),
+        Calibration(np.tile(np.eye(4), (16, 1, 1)), gains, 0 * gains),
+    )
     found = []
     for told in (None, calibration):
         settings = EncodeSettings(keep_all=True, layers=1, refine=80)

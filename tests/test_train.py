@@ -11,7 +11,7 @@ from synthetic import coded as one_group
 
 from bench.train import coded
 from gscodec import _native
-from gscodec.bitstream.quantization import steps_for, subject_radius
+from gscodec.bitstream.quantization import steps_for
 from gscodec.bitstream.quantized_group import QuantizedTrajectories
 from gscodec.capture.capture import Capture
 from gscodec.capture.images import View
@@ -49,7 +49,7 @@ from gscodec.train.visual_hull import hull_points, project
 
 SIZE = 64
 TINY = TrainSettings(
-    gop=3, keyframe_steps=150, motion_steps=60, finetune_steps=10, gaussians_max=600, initial_points=300
+    gop=3, keyframe_steps=150, motion_steps=60, finetune_steps=10, gaussians_max=600, initial_points=300, sh_degree=1
 )
 FEW_NODES = dataclasses.replace(TINY.graph, nodes=32)
 
@@ -150,7 +150,7 @@ def test_initial_points_do_without_shell_or_sweep():
     capture = Capture("wall", 25.0, cameras, 1, False, read)
     no_shell = dataclasses.replace(TINY, plane_sweep=dataclasses.replace(TINY.plane_sweep, shell_points=0))
     no_sweep = dataclasses.replace(TINY, initialization=dataclasses.replace(TINY.initialization, use_plane_sweep=False))
-    with_shell, without, random = (initial_model(capture, 0, s) for s in (TINY, no_shell, no_sweep))
+    with_shell, without, random = (initial_model(capture, 0, 300, s)[0] for s in (TINY, no_shell, no_sweep))
     assert len(with_shell) > len(without) == TINY.initial_points
     opacities = [float(torch.sigmoid(m.params["logit_opacities"][0])) for m in (without, random)]
     assert opacities == pytest.approx([TINY.initialization.surface_opacity, TINY.initialization.random_opacity])
@@ -174,8 +174,7 @@ def test_keyframe_learns_a_view_it_has_not_seen(masks):
     capture = capture_of(turning(300, frames=1), masks=masks)
     points = 300 if masks else 2000  # a random box has most of its points where nothing is
     settings = dataclasses.replace(TINY, initial_points=points, gaussians_max=2 * points)
-    model = initial_model(capture, 0, settings)
-    radius = subject_radius(model.params["means"].numpy())
+    model, radius = initial_model(capture, 0, points, settings)
     losses = []
     train_keyframe(
         model,
@@ -202,14 +201,15 @@ def test_exposure_of_each_camera_is_found(darkest):
         view = capture.read(camera, frame)
         return dataclasses.replace(view, rgb=np.rint(gains[camera] * view.rgb).astype(np.uint8))
 
-    views, model = Views(dataclasses.replace(capture, read=dimmed), TINY, CpuBackend()), initial_model(capture, 0, TINY)
+    views = Views(dataclasses.replace(capture, read=dimmed), TINY, CpuBackend())
+    model, _ = initial_model(capture, 0, 300, TINY)
     train_keyframe(model, views, 0, TINY, steps=600, radius=1.0)
     true = np.log(gains[:-1]) - np.log(gains[:-1]).mean()
-    np.testing.assert_allclose(views.exposure.values[:-1], true[:, None] + np.zeros(3), atol=0.04)
-    assert darkest < 1 or not views.exposure.values.any()
+    np.testing.assert_allclose(views.exposure.values[:-1, :3], true[:, None] + np.zeros(3), atol=0.07)
+    gain, offset = views.exposure.of(0)
     shown = render_image(views.exposure.applied_to(model.gaussians(), 0), capture.cameras[0], (0, 0, 0))
     plain = render_image(model.gaussians(), capture.cameras[0], (0, 0, 0))
-    np.testing.assert_allclose(shown, plain * views.exposure.gain(0), atol=2)
+    np.testing.assert_allclose(shown, plain * gain + 255 * offset * (plain.max(2, keepdims=True) > 0), atol=3)
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.03])
@@ -220,19 +220,20 @@ def test_pose_of_each_camera_is_found(wrong):
     told, trained = Extrinsics(count, list(range(count - 1)), TINY, CpuBackend()), slice(0, -1)
     told.values[trained] = np.random.default_rng(3).uniform(-wrong, wrong, (count - 1, 6))
     cameras = [told.camera(i, c) for i, c in enumerate(capture.cameras)]
-    views, model = (
-        Views(dataclasses.replace(capture, cameras=cameras), TINY, CpuBackend()),
-        initial_model(capture, 0, TINY),
-    )
-    train_keyframe(model, views, 0, TINY, steps=400, radius=1.0)
+    told_to = dataclasses.replace(TINY, calibration=dataclasses.replace(TINY.calibration, refine_poses=True))
+    views = Views(dataclasses.replace(capture, cameras=cameras), told_to, CpuBackend())
+    model, _ = initial_model(capture, 0, 300, TINY)
+    train_keyframe(model, views, 0, told_to, steps=400, radius=1.0)
     left = views.extrinsics.values[trained] + told.values[trained] - told.values[trained].mean(0)
-    assert np.sqrt(np.mean(left**2)) <= 0.5 * np.sqrt(np.mean(told.values[trained] ** 2))
+    assert np.sqrt(np.mean(left**2)) <= max(0.5 * np.sqrt(np.mean(told.values[trained] ** 2)), 0.005)
 
 
 def glossy(gloss: float) -> GaussianSequence:
-    """Two frames of the turning blob, whose colours change by `gloss` with the direction."""
+    """Two frames of the turning blob, whose colours change by `gloss` with the direction, each in its own way: equal
+    ones would look like cameras of different brightness."""
     group = turning(300, frames=2).groups[0]
-    frames = [dataclasses.replace(g, shN=np.full((300, 3, 3), gloss, np.float32)) for g in group.frames]
+    shN = gloss * np.random.default_rng(4).choice([-1, 1], (300, 3, 3)).astype(np.float32)
+    frames = [dataclasses.replace(g, shN=shN) for g in group.frames]
     return GaussianSequence(25.0, [DenseGroup(frames)])
 
 
@@ -270,7 +271,8 @@ def test_tracking_finds_the_turn(capture):
         tracker.graph, None, models, poses, steps_for(50, 1.0), torch.ones(len(key), dtype=torch.bool), TINY
     )
     assert psnr_of(group.group(None).frame(2), capture, 2) > psnr_of(truth.frame(0), capture, 2) + 4
-    carried = np.abs(truth.frame(2).means - group.means[2].numpy()).mean()
+    carried = group.frame(2, CpuBackend()).means.detach().numpy()
+    carried = np.abs(truth.frame(2).means - carried).mean()
     assert carried < 0.3 * still, "the nodes have found it, not the Gaussians each for itself"
 
 

@@ -17,7 +17,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gscodec.bitstream.quantization import subject_radius
 from gscodec.model.rotations import quat_multiply, rotvec_to_quat
 from gscodec.render.cpu import CpuBackend
 from gscodec.train.initialization import initial_model
@@ -28,6 +27,7 @@ from gscodec.train.views import Views, photometric_loss
 
 from .hashgrid import HashGrid
 
+POINTS = 8000  # of the keyframe, to start from
 STEPS = (90, 225)  # per frame, motion and fine-tuning: the time of our preset medium, in the proportion 800 : 2000
 FIELD_RATES = {"grid": 2e-2, "mlp": 2e-3}
 FINE_SHARE = 1.0  # of the keyframe's learning rates
@@ -57,8 +57,7 @@ def train_v3(capture, frames: range, settings: TrainSettings) -> list:
     """Gaussians of each frame: a keyframe for the first, then one frame from the other."""
     settings = replace(settings, sh_degree=0)  # its packing has no more
     views = Views(capture, settings, CpuBackend())
-    model = initial_model(capture, frames[0], settings)
-    radius = subject_radius(model.params["means"].numpy())
+    model, radius = initial_model(capture, frames[0], settings.initial_points or POINTS, settings)
     train_keyframe(model, views, frames[0], settings, steps=settings.keyframe_steps, radius=radius)
     out = [model.gaussians()]
     torch.manual_seed(settings.seed)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def encode(
     seq: SequencePath,
     out: StreamPath,
-    quality: Quality = 50.0,
+    quality: Quality = None,
     bitrate: Annotated[
         str | None, typer.Option(metavar="RATE", help="Bits per second instead of a quality: 8M, 500k.")
     ] = None,
@@ -65,6 +65,10 @@ def encode(
         f"{out}: {r['frames']} frames, {r['gaussians']} Gaussians, {r['bytes']} bytes, "
         f"{r['kb_per_frame']:.2f} kB/frame, {r['bits_per_gaussian_frame']:.2f} bits per Gaussian and frame"
     )
+    if quality is None and bitrate is None and result.chosen_quality:
+        stdout.print(
+            f"quality {result.quality:.1f}, at which coding costs at most {result.loss} dB of what was trained"
+        )
     if result.interrupted:
         print("stopped early: the file holds the groups done, the same command goes on", file=sys.stderr)
         raise typer.Exit(130)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..bitstream.quantization import QUALITY_DEFAULT
 from ..encode.coder import CamerasAt, RefineByPictures
 from ..encode.encode import stream_config
 from ..encode.settings import EncodeSettings
@@ -94,11 +95,15 @@ def splat_source(path: Path, settings: EncodeSettings, frames: str | None, gop: 
     cameras, refinement, level = sequence.cameras, None, None
     if sequence.training and frames is None:
         refinement, level = _trained(path, sequence.training, settings, bar)
+        settings = replace(settings, loss=sequence.training["loss"])
     level = level or _largest(sequence)
     trained = [c for c in cameras if c.split == "train"]
     return Source(
         lambda done, _: fit_groups(
-            sequence.groups, start=done, random_access=settings.random_access, quality=settings.quality
+            sequence.groups,
+            start=done,
+            random_access=settings.random_access,
+            quality=QUALITY_DEFAULT if settings.quality is None else settings.quality,
         ),
         stream_config(fps=sequence.fps, **level, cameras=cameras, up=up_axis(cameras) if cameras else UP_UNKNOWN),
         settings,
@@ -158,11 +163,12 @@ def capture_source(path: Path, out: Path, settings: EncodeSettings, options: Tra
     require("torch", "training a capture")
     from ..train.checkpoint import Checkpoint
     from ..train.refinement import PictureRefinement
-    from ..train.settings import train_settings
+    from ..train.settings import LOSS, train_settings
 
     limit_torch_threads()
     capture = open_frames(path, options.frames)
-    recipe = train_settings(options.preset, gop=options.gop, quality=settings.quality)
+    recipe = train_settings(options.preset, settings.quality, gop=options.gop)
+    settings = replace(settings, loss=LOSS[options.preset])
     work, trained = out.with_name(out.name + ".work"), capture.indices("train")
     if options.cluster:
         groups = partial(_cluster_groups, path, settings, options, recipe, bar)

@@ -29,7 +29,7 @@ def train(
     frames: Frames = None,
     gop: Gop = GOP,
     random_access: RandomAccess = 60,
-    quality: Quality = 50.0,
+    quality: Quality = None,
 ) -> None:
     """Capture to one .ply per frame, the first half of encode."""
     from .sources import TrainOptions
@@ -41,7 +41,7 @@ def train(
 
 
 def train_to_folder(
-    source: Path, folder: Path, options: TrainOptions, *, random_access: int, quality: float, bar: Bar
+    source: Path, folder: Path, options: TrainOptions, *, random_access: int, quality: float | None, bar: Bar
 ) -> int:
     """Trains a capture and writes one .ply per frame and sequence.json, from which `encode` makes the bytes that it
     would make of the capture; returns the number of frames.
@@ -51,13 +51,13 @@ def train_to_folder(
     require("torch", "training a capture")
     from ..splats import SequenceWriter
     from ..train.checkpoint import Checkpoint
-    from ..train.settings import train_settings
+    from ..train.settings import LOSS, train_settings
     from ..train.train import train_groups
     from .sources import limit_torch_threads
 
     limit_torch_threads()
     capture = open_frames(source, options.frames)
-    recipe = train_settings(options.preset, gop=options.gop, quality=quality)
+    recipe = train_settings(options.preset, quality, gop=options.gop)
     work, unfinished = folder / "work", folder / "unfinished.json"
     settings = {"frames": options.frames, "random_access": random_access, "training": asdict(recipe)}
     made_by = {"program": program(), "input": inputs(source), "settings": settings}
@@ -67,6 +67,7 @@ def train_to_folder(
         "sh_degree": recipe.sh_degree,
         "gaussians": recipe.gaussians_max,
         "frames": options.gop,
+        "loss": LOSS[options.preset],
     }
     same = _goes_on(unfinished, made_by)
     writer = SequenceWriter(folder, capture.fps, capture.cameras, training=training, resume=same)

@@ -6,9 +6,10 @@ groups since came from; it is returned with each group and never changed, so tha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -23,11 +24,22 @@ from .companding import Curve
 from .measure import measure_group
 from .quantization_plan import Known, Parameters, plan_group
 from .quantize import Quantized, ReferenceGroup, grid_of, quantize
-from .refinement_views import drawn_views
+from .refinement_views import Target, drawn_views
 from .settings import EncodeSettings
 
-# Refines a group that begins at a frame of the capture by the pictures that it was trained on.
-RefineByPictures = Callable[[ParametricGroup, int, AdaptiveRounding], None]
+
+class RefineByPictures(Protocol):
+    """Refines a group that begins at a frame of the capture by the pictures that it was trained on."""
+
+    def __call__(
+        self, group: ParametricGroup, first_frame: int, quantizer: AdaptiveRounding, views: int | None = None
+    ) -> None:
+        """By `views` pictures; None: by as many as usually pay."""
+
+    def pictures(self, group: ParametricGroup, first_frame: int, count: int, seed: int) -> Iterable[Target]:
+        """`count` of the pictures, in the order that `seed` draws."""
+
+
 CamerasAt = Callable[[int], Sequence[Camera]]  # frame of the stream -> cameras from which the subject was captured
 
 
@@ -144,6 +156,16 @@ class GroupCoder:
         """What `code` needs of a group at any quality."""
         return measure_group(group, list(self.cameras(first_frame + len(group) // 2)), self.settings.plan)
 
+    def has_pictures(self, group: ParametricGroup) -> bool:
+        """Whether `group` can be compared with the pictures that it was trained on."""
+        return self.refine_by_pictures is not None and group.calibration is not None
+
+    def quantized(self, group: ParametricGroup, importance: Importance, quality: float) -> Quantized:
+        """An independent group in integers, before it is refined."""
+        form = coded_form(group, np.full(len(group.canonical), -1))
+        plan = plan_group(form, importance.with_axes(form.axis_order), quality, self.settings)
+        return quantize(form, plan, self.settings.rdo)
+
     def code(
         self, state: CoderState | None, group: ParametricGroup, importance: Importance, quality: float, first_frame: int
     ) -> tuple[CodedGroup, CoderState | None]:
@@ -167,9 +189,7 @@ class GroupCoder:
         return coded, state.after(group, lineage)
 
     def _independent(self, state, group, importance, quality, first_frame) -> tuple[CodedGroup, CoderState | None]:
-        form = coded_form(group, np.full(len(group.canonical), -1))
-        plan = plan_group(form, importance.with_axes(form.axis_order), quality, self.settings)
-        coded, quantized = self._packed(quantize(form, plan, self.settings.rdo), group, first_frame)
+        coded, quantized = self._packed(self.quantized(group, importance, quality), group, first_frame)
         if self.settings.random_access <= len(group):
             return coded, state
         return coded, _state_of(quantized, coded.payload)
@@ -186,7 +206,7 @@ class GroupCoder:
         if self.settings.refine == 0 or not len(quantized.integers):
             return quantized
         rounding = AdaptiveRounding(quantized, self.settings, reference)
-        if self.refine_by_pictures is not None and group.calibration is not None:
+        if self.has_pictures(group):
             self.refine_by_pictures(group, first_frame, rounding)
             return rounding.quantized()
         views, middle = self._drawn_views(group), len(group) // 2

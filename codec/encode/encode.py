@@ -14,9 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from ..bitstream.levels import smallest_level
+from ..bitstream.quantization import QUALITY_DEFAULT
 from ..model.camera import Camera
 from ..model.parametric_group import ParametricGroup
 from .coder import CamerasAt, CodedGroup, CoderState, GroupCoder, RefineByPictures
+from .quality_search import choose_quality
 from .rate_control import code_at_rate
 from .settings import EncodeSettings
 from .writer import StreamWriter
@@ -31,6 +33,9 @@ class EncodeReport:
     predicted: int = 0  # of these, in this run
     bytes: int = 0
     gaussians: int = 0  # most in one group
+    quality: float | None = None  # of the last group
+    chosen_quality: bool = False  # nobody named it: coding costs at most `loss` decibels
+    loss: float = 0.0
     interrupted: bool = False
     seconds: dict = field(default_factory=dict)
     units: dict = field(default_factory=dict)
@@ -137,16 +142,23 @@ def encode_groups(
 def _code_all(groups: Iterable[ParametricGroup], coder: GroupCoder, writer: StreamWriter, report, on_group) -> None:
     """Codes and appends group after group, from the state in which an earlier run left the writer."""
     arrays = writer.state()
-    state, quality = CoderState.from_arrays(arrays), float(arrays.get("quality", coder.settings.quality))
+    state, quality = CoderState.from_arrays(arrays), coder.settings.quality
+    quality = float(arrays["quality"]) if "quality" in arrays else quality
     clock = time.perf_counter
     mark = clock()
     for group in groups:
         report.seconds["input"] += clock() - mark
         mark = clock()
         if coder.settings.bitrate:
-            coded, state, quality = code_at_rate(coder, state, group, (writer.frames, writer.bytes, quality))
+            start = QUALITY_DEFAULT if quality is None else quality
+            coded, state, quality = code_at_rate(coder, state, group, (writer.frames, writer.bytes, start))
         else:
-            coded, state = coder.code(state, group, coder.measure(group, writer.frames), quality, writer.frames)
+            importance = coder.measure(group, writer.frames)
+            if quality is None and coder.has_pictures(group):
+                quality, report.chosen_quality = choose_quality(coder, group, importance, writer.frames), True
+            quality = QUALITY_DEFAULT if quality is None else quality
+            coded, state = coder.code(state, group, importance, quality, writer.frames)
+        report.quality, report.loss = quality, coder.settings.loss
         report.seconds["code"] += clock() - mark
         kept = {"quality": np.array(quality)} | (state.to_arrays() if state else {})
         writer.append(coded.payload, len(group), sync=coded.independent, state=kept)

@@ -135,11 +135,35 @@ class RateControlSettings:
 
 
 @dataclass(frozen=True)
+class QualitySearchSettings:
+    """Quality that follows a capture (quality_search.py).
+
+    Attributes:
+        start: first try; lowest, highest: bounds. tries: at most.
+        tolerance: of the excess of the squared error, as a log ratio. excess_min: below it, it is noise.
+        frame_pictures: pictures a frame by which a try is refined.
+        judged: pictures by which it is judged, at least one a frame. seed: of their order.
+    """
+
+    start: float = 56.0
+    lowest: float = 30.0
+    highest: float = 90.0
+    tries: int = 4
+    tolerance: float = 0.15
+    excess_min: float = 0.005
+    frame_pictures: int = 10
+    judged: int = 24
+    seed: int = 1
+
+
+@dataclass(frozen=True)
 class EncodeSettings:
     """What the encoder is asked for.
 
     Attributes:
-        quality: 0 (small) to 100 (fine); 50 is about 41 dB against the input.
+        quality: 0 (small) to 100 (fine); 50 is about 41 dB against the input. None: of a capture, that at which coding
+            costs `loss`; of splats, 50.
+        loss: decibels that coding may cost against the pictures of a capture, where no quality is named.
         bitrate: bits per second that the whole file is to have, instead of one quality; None: `quality` it is.
         keep_all: also code Gaussians that are never visible.
         random_access: frames from one independent group to the next at most; the groups between are predicted from it
@@ -151,13 +175,15 @@ class EncodeSettings:
         plan, companding, scale_exponents, rdo, rounding, rate_control: hyperparameters of the stages.
     """
 
-    quality: float = 50.0
+    quality: float | None = None
     bitrate: float | None = None
     keep_all: bool = False
     random_access: int = 60
     layers: int | None = None
     refine: int | None = None
     doubt: float = 0.7
+    loss: float = 0.3
+    quality_search: QualitySearchSettings = field(default_factory=QualitySearchSettings)
     plan: PlanSettings = field(default_factory=PlanSettings)
     companding: CompandingSettings = field(default_factory=CompandingSettings)
     scale_exponents: ScaleExponentSettings = field(default_factory=ScaleExponentSettings)
@@ -166,7 +192,7 @@ class EncodeSettings:
     rate_control: RateControlSettings = field(default_factory=RateControlSettings)
 
     def __post_init__(self):
-        if not 0 <= self.quality <= 100:
+        if self.quality is not None and not 0 <= self.quality <= 100:
             raise UsageError(f"--quality {self.quality:g} is out of range, expected 0 (small) to 100 (fine)")
         if self.bitrate is not None and not self.bitrate > 0:
             raise UsageError(f"--bitrate {self.bitrate:g} is out of range, expected bits per second above 0")

@@ -18,7 +18,7 @@ from ..model.camera import Camera
 from ..model.gaussian_sequence import GaussianSequence
 from ..model.gaussians import Gaussians
 from .codec_cameras import codec_cameras
-from .image import foreground, haze, psnr, ssim
+from .image import foreground, haze, psnr, psnr_corrected, ssim
 from .stability import TemporalMeter
 from .vmaf import VmafMeter
 
@@ -75,8 +75,9 @@ def evaluate_capture(
         progress: called with (images done, images).
 
     Returns:
-        frames, gaussians (mean per frame), bytes, kb_per_frame, bits_per_gaussian_frame, psnr, psnr_fg, ssim,
-        haze (8-bit levels), vmaf, vmaf_crop (one per camera), flicker (8-bit levels), stability (dB), per_frame,
+        frames, gaussians (mean per frame), bytes, kb_per_frame, bits_per_gaussian_frame, psnr, psnr_fg, psnr_corrected
+        (of the subject, after a gain and an offset for each view and channel), ssim, haze (8-bit levels), vmaf,
+        vmaf_crop (one per camera), flicker (8-bit levels), stability (dB), per_frame,
         views, split.
 
     Raises:
@@ -118,6 +119,7 @@ def _compare(g: Gaussians, camera: Camera, view: View, temporal: TemporalMeter, 
     return {
         "psnr": psnr(reference, image),
         "psnr_fg": psnr(reference, image, inside),
+        "psnr_corrected": psnr_corrected(reference, image, inside),
         "ssim": ssim(reference, image),
         "haze": haze(reference, image, view.alpha),
         "flicker": flicker,

@@ -35,6 +35,19 @@ def psnr(reference: np.ndarray, image: np.ndarray, mask: np.ndarray | None = Non
     return psnr_of_mse(float(np.mean(d**2, dtype=np.float64))) if d.size else PSNR_MAX
 
 
+def psnr_corrected(reference: np.ndarray, image: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """As `psnr`, after the gain and the offset of each channel that bring the image nearest to the reference: without
+    what the colour of one camera differs from that of all others."""
+    _check(reference, image)
+    y, x = (a.reshape(-1, 3) if mask is None else a[mask] for a in (reference, image))
+    if not len(x):
+        return PSNR_MAX
+    x, y = x.astype(np.float64), y.astype(np.float64)
+    from_mean, wanted = x - x.mean(0), y - y.mean(0)
+    gain = (from_mean * wanted).sum(0) / np.maximum((from_mean**2).sum(0), 1e-9)
+    return psnr_of_mse(float(np.mean((gain * from_mean - wanted) ** 2)))
+
+
 def foreground(alpha: np.ndarray, grow: int = GROW) -> np.ndarray:
     """[H, W] bool: where alpha ([H, W], any scale) is above 0, dilated by a disc of radius `grow`."""
     cv2 = require("cv2", "measuring the foreground")

@@ -62,10 +62,16 @@ class Calibration:
     Attributes:
         corrections: [C, 4, 4] f64, rigid motions of the world: the true viewmat is viewmat @ correction.
         gains: [C, 3] f32, by which the images of a camera are brighter than the scene.
+        offsets: [C, 3] f32, in 0..1, by which they are brighter besides.
     """
 
     corrections: np.ndarray
     gains: np.ndarray
+    offsets: np.ndarray
+
+    def evened(self, rgb: np.ndarray, index: int) -> np.ndarray:
+        """Colours of camera `index` (0 to 255) as the scene has them, f32."""
+        return ((rgb - 255 * self.offsets[index]) / self.gains[index]).astype(np.float32)
 
     def camera(self, camera: Camera, index: int) -> Camera:
         """`camera`, which is camera `index` of the capture in any frame or a crop of it, with the true viewmat."""

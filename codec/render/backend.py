@@ -29,7 +29,8 @@ class Crop:
         target_rgb: [h, w, 3] u8, unassociated colour, of the region.
         target_alpha: [h, w] u8; the target is composited on `background` with it. None: opaque, and no mask term.
         background: 3 floats in [0, 1]; a random one in each step where there are masks.
-        gain: 3 floats, exposure of this camera; multiplies the colour of the Gaussians, not the background.
+        exposure: gain and offset of this camera, 3 floats each, of the light of the Gaussians and not of the
+            background.
         weight: [h, w] f32, weights of pixels in the image loss (a weighted mean).
         region: part of the image that is rendered; None: all of it.
     """
@@ -38,7 +39,7 @@ class Crop:
     target_rgb: np.ndarray
     target_alpha: np.ndarray | None = None
     background: Sequence[float] = (0.0, 0.0, 0.0)
-    gain: Sequence[float] | None = None
+    exposure: tuple[Sequence[float], Sequence[float]] | None = None
     weight: np.ndarray | None = None
     region: Region | None = None
 
@@ -60,7 +61,7 @@ class RenderLoss:
             measure of 3D Gaussian Splatting), summed over the crops.
         max_weight, sum_weight: [N] f32, largest and summed blending weight alpha * transmittance.
         radii: [N] f32, pixels, largest over the crops; 0 for a Gaussian that is not visible.
-        grad_gain: [crops, 3] f64, gradient by each `gain`.
+        grad_exposure: [crops, 2, 3] f64, gradient by the gain and the offset of each.
     """
 
     loss: float
@@ -74,7 +75,7 @@ class RenderLoss:
     max_weight: np.ndarray
     sum_weight: np.ndarray
     radii: np.ndarray
-    grad_gain: np.ndarray
+    grad_exposure: np.ndarray
 
 
 class Backend(Protocol):
@@ -117,4 +118,37 @@ class Backend(Protocol):
         Args:
             arrays: parameter, gradient, first and second moment; f32, contiguous, one shape.
             step: of this parameter, from 1.
+        """
+
+    def trajectory_sum(self, coefficients: np.ndarray, at: np.ndarray, dead_zone: float) -> np.ndarray:
+        """Sum over k of at[k] * rounded(coefficients[k]), [N, C] f32, as a decoder has it.
+
+        Args:
+            coefficients: [K, N, C] f32, quantization steps.
+            at: [K], by which each is multiplied.
+            dead_zone: steps more than half of one, below which a coefficient is 0.
+        """
+
+    def trajectory_step(
+        self,
+        arrays: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+        at: np.ndarray,
+        price: tuple[float, np.ndarray, np.ndarray] | None,
+        *,
+        rate: float,
+        betas: tuple[float, float],
+        eps: float,
+        step: int,
+    ) -> np.ndarray:
+        """One step of Adam on coefficients in place, along the gradient by their sum at a frame, straight through the
+        rounding, and along that by their bits: Laplace code lengths with uniform noise in place of rounding.
+
+        Args:
+            arrays: coefficients [K, N, C], gradient [N, C] by the sum, first and second moment [K, N, C]; f32.
+            at: [K], as of `trajectory_sum`.
+            price: loss of one bit, Laplace scales [K], and at least N * C + K - 1 uniform values in -0.5 .. 0.5.
+            step: of these coefficients, from 1.
+
+        Returns:
+            [K, 2] f64: bits of each coefficient and their derivative by the log of its scale; 0 without a price.
         """

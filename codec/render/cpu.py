@@ -51,7 +51,7 @@ class CpuBackend:
         grads, statistics = self.workspace.gradients(arrays)
         step, native = self.workspace.native.step, [_native_crop(crop) for crop in crops]
         values, radii = call(step, arrays, native, (ssim_lambda, mask_lambda), (grads, statistics))
-        losses, gain = np.array([v[:5] for v in values]), np.array([v[5] for v in values])
+        losses, exposure = np.array([v[:5] for v in values]), np.array([v[5:] for v in values])
         loss, means = float(losses[:, 0].sum()), losses[:, 1:].mean(0).tolist()
         return RenderLoss(
             loss,
@@ -59,7 +59,7 @@ class CpuBackend:
             pixels=sum(crop.part()[2] * crop.part()[3] for crop in crops),
             grads={k: _like(g, params[k]) for k, g in zip(PARAMETERS, grads, strict=True)},
             radii=radii,
-            grad_gain=gain,
+            grad_exposure=exposure,
             **dict(zip(STATISTICS, statistics, strict=True)),
         )
 
@@ -88,6 +88,27 @@ class CpuBackend:
         """As of `Backend`."""
         call(_native.adam, arrays, rate, betas, eps, step)
 
+    def trajectory_sum(self, coefficients: np.ndarray, at: np.ndarray, dead_zone: float) -> np.ndarray:
+        """As of `Backend`."""
+        out = np.empty(coefficients.shape[1:], np.float32)
+        call(_native.trajectory_sum, coefficients, at.tolist(), dead_zone, out)
+        return out
+
+    def trajectory_step(
+        self,
+        arrays: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+        at: np.ndarray,
+        price: tuple[float, np.ndarray, np.ndarray] | None,
+        *,
+        rate: float,
+        betas: tuple[float, float],
+        eps: float,
+        step: int,
+    ) -> np.ndarray:
+        """As of `Backend`."""
+        native = None if price is None else (price[0], price[1].tolist(), price[2])
+        return np.array(call(_native.trajectory_step, arrays, at.tolist(), native, rate, betas, eps, step))
+
 
 def _arrays(params: Params) -> tuple[np.ndarray, ...]:
     """The six arrays in the order of PARAMETERS."""
@@ -99,7 +120,7 @@ def _native_crop(crop: Crop) -> tuple:
     target = (crop.target_rgb, crop.target_alpha, crop.weight)
     return (
         view(crop.camera, crop.part()),
-        (rgb(crop.background), None if crop.gain is None else rgb(crop.gain)),
+        (rgb(crop.background), None if crop.exposure is None else tuple(map(rgb, crop.exposure))),
         tuple(None if t is None else np.ascontiguousarray(t) for t in target),
     )
 

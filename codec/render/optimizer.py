@@ -79,6 +79,44 @@ class Adam:
         state.first, state.second = _resized(state.first, columns), _resized(state.second, columns)
 
 
+class TrajectoryAdam:
+    """The optimiser of the coefficients of trajectories, [K, N, C] of each attribute, which a frame shows as a sum."""
+
+    def __init__(self, backend: Backend, settings: AdamSettings):
+        self._backend, self._settings = backend, settings
+        self._states: dict[str, _State] = {}
+
+    def step(
+        self,
+        name: str,
+        coefficients: np.ndarray,
+        grad: np.ndarray,
+        at: np.ndarray,
+        price: tuple[float, np.ndarray, np.ndarray] | None,
+        rate: float,
+    ) -> np.ndarray:
+        """One step of the coefficients of attribute `name`, in place; arguments and result as of
+        `Backend.trajectory_step`."""
+        s, state = self._settings, self._states.get(name)
+        if state is None:
+            state = self._states[name] = _State(np.zeros_like(coefficients), np.zeros_like(coefficients))
+        state.steps += 1
+        arrays, betas = (coefficients, grad, state.first, state.second), (s.beta1, s.beta2)
+        step = self._backend.trajectory_step
+        return step(arrays, at, price, rate=rate, betas=betas, eps=s.eps, step=state.steps)
+
+    def select(self, index: np.ndarray) -> None:
+        """Keeps the Gaussians at `index` ([M] int or [N] bool)."""
+        for state in self._states.values():
+            state.first, state.second = (np.ascontiguousarray(a[:, index]) for a in (state.first, state.second))
+
+    def append(self, count: int) -> None:
+        """Adds `count` Gaussians with zero moments."""
+        for state in self._states.values():
+            more = np.zeros((len(state.first), count, *state.first.shape[2:]), np.float32)
+            state.first, state.second = (np.concatenate([a, more], 1) for a in (state.first, state.second))
+
+
 def _resized(a: np.ndarray, columns: int) -> np.ndarray:
     """[N, C, ...] -> [N, columns, ...], zeros where there was nothing."""
     out = np.zeros((len(a), columns, *a.shape[2:]), np.float32)

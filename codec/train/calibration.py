@@ -1,8 +1,9 @@
-"""Calibration of the training cameras: exposure and pose of each, learned with a keyframe and kept while it is tracked.
+"""Calibration of the training cameras: colour and pose of each, learned with a keyframe and kept while it is tracked.
 
 The mean over the cameras stays 0, since the brightness and the place of the scene cannot be told from that of all
-cameras together. Both are learned late: with wrong colours, shading looks like exposure, and with missing shapes,
-errors look like a wrong pose. Values that are no larger than this effect are set to 0.
+cameras together. Colour is learned from the first step on (as in Dynamic 3D Gaussians), so that Gaussians never take up
+what differs between cameras. Poses are learned late, since with missing shapes errors look like a wrong pose, and only
+where matched features say that they are off.
 """
 
 from __future__ import annotations
@@ -27,72 +28,68 @@ class _Learned:
         trained: indices of the training cameras.
         adam: optimiser of the values.
         rate: learning rate.
-        negligible: root mean square below which `freeze_if_negligible` sets all values to 0.
 
     Attributes:
         values: [C, K] f32.
     """
 
-    def __init__(self, count: int, width: int, trained: list[int], adam: Adam, *, rate: float, negligible: float):
-        self._shape, self._trained, self._rate, self._negligible = (count, width), trained, rate, negligible
-        self._adam = adam
+    def __init__(self, count: int, width: int, trained: list[int], adam: Adam, *, rate: float):
+        self._shape, self._trained, self._rate, self._adam = (count, width), trained, rate, adam
         self.reset()
 
     def reset(self) -> None:
         """Sets all values to 0."""
         self.values = np.zeros(self._shape, np.float32)
         self._adam.restart()
-        self._frozen = False
 
     def learn(self, camera: int, grad: np.ndarray, decay: float) -> None:
         """One step for one camera; `grad`: [K], gradient of the loss; `decay` multiplies the learning rate."""
-        if self._frozen:
-            return
         name = str(camera)
         self._adam.step({name: self.values[camera]}, {name: grad}, {name: self._rate * decay})
         self.values[self._trained] -= self.values[self._trained].mean(0)
 
-    def freeze_if_negligible(self) -> None:
-        """Sets the values to 0 for good (until `reset`) where they are negligible."""
-        if np.sqrt(np.mean(self.values[self._trained] ** 2)) < self._negligible:
-            self.reset()
-            self._frozen = True
-
 
 class Exposure(_Learned):
-    """Log gains of the channels of each training camera: they multiply its rendered images, and no others."""
+    """Colour of each training camera: gains and offsets of the channels of its rendered images, and of no others.
+
+    Values: log gains, then offsets in units of `offset_unit`: few cameras differ in their black.
+    """
 
     def __init__(self, count: int, trained: list[int], settings: TrainSettings, backend: Backend):
         c = settings.calibration
-        super().__init__(
-            count, 3, trained, Adam(backend, settings.adam), rate=c.exposure_rate, negligible=c.exposure_min
-        )
-        self._weight = c.exposure_weight
+        super().__init__(count, 6, trained, Adam(backend, settings.adam), rate=c.exposure_rate)
+        self._weight, self._unit = c.exposure_weight, np.float32(c.offset_unit)
 
-    def gain(self, camera: int) -> np.ndarray:
-        """[3] f32, factor of each channel."""
-        return np.exp(self.values[camera])
+    def of(self, camera: int) -> tuple[np.ndarray, np.ndarray]:
+        """[3] f32 gain and [3] f32 offset of camera `camera`."""
+        return np.exp(self.values[camera, :3]), self._unit * self.values[camera, 3:]
 
     def applied_to(self, g: Gaussians, camera: int) -> Gaussians:
         """The Gaussians in the colours of `camera`."""
-        gain, grey = self.gain(camera), 0.5 / SH_C0
-        return replace(g, sh0=gain * (g.sh0 + grey) - grey, shN=gain * g.shN)
+        (gain, offset), grey = self.of(camera), 0.5 / SH_C0
+        return replace(g, sh0=gain * (g.sh0 + grey) - grey + offset / SH_C0, shN=gain * g.shN)
 
     def learn(self, camera: int, grad: np.ndarray, decay: float) -> None:
-        """As of `_Learned`; `grad`: [3], gradient of the loss by the gains."""
-        super().learn(camera, grad * self.gain(camera) + self._weight * self.values[camera], decay)
+        """As of `_Learned`; `grad`: [2, 3], gradients of the loss by the gain and the offset."""
+        gain, offset = grad
+        own = np.concatenate([gain * self.of(camera)[0], offset * self._unit])
+        super().learn(camera, own + self._weight * self.values[camera], decay)
 
 
 class Extrinsics(_Learned):
     """Correction of each camera's pose, as a small rigid motion of the scene before it.
 
     Values: rotation vector about the center of the subject in radians, then translation in radii of the subject.
+
+    Attributes:
+        learns: whether the calibration is off and `learn` does anything.
     """
 
     def __init__(self, count: int, trained: list[int], settings: TrainSettings, backend: Backend):
         c = settings.calibration
-        super().__init__(count, 6, trained, Adam(backend, settings.adam), rate=c.pose_rate, negligible=c.pose_min)
+        super().__init__(count, 6, trained, Adam(backend, settings.adam), rate=c.pose_rate)
         self.set_subject(np.zeros(3), 1.0)
+        self.learns = False
 
     def set_subject(self, center: np.ndarray, radius: float) -> None:
         """Sets the center ([3]) and the radius of the subject, world units."""
@@ -115,7 +112,7 @@ class Extrinsics(_Learned):
 
     def learn(self, camera: int, params: dict, grads: dict, decay: float) -> None:
         """As of `_Learned`, from the gradients by the Gaussians `params`: the motion moves all, to first order."""
-        if self._frozen:
+        if not self.learns:
             return
         means, quats, by_means, by_quats = (x[n].numpy() for x in (params, grads) for n in ("means", "quats"))
         torque = np.cross(means - self.center, by_means).sum(0)

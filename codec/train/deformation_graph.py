@@ -211,6 +211,10 @@ class NodeGraph:
         means, low, extent = (torch.from_numpy(state[n]) for n in ("means", "low", "extent"))
         return NodeGraph(means, low, float(state["step"]), state["chosen"], state["batch"], extent, settings)
 
+    def copy(self) -> NodeGraph:
+        """The same nodes; Gaussians added to the copy are not added here."""
+        return NodeGraph.restored(self.state(), self.settings)
+
     def select(self, chosen: torch.Tensor) -> None:
         """Keeps the Gaussians of `chosen` ([N] bool)."""
         self.means = self.means[chosen]

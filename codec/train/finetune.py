@@ -8,7 +8,7 @@ them; their gradient passes straight through the rounding. joint_optimization.py
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -16,21 +16,46 @@ import torch
 from ..bitstream.color import STEP_WEIGHTS
 from ..bitstream.quantization import Steps, trajectory_step
 from ..model.parametric_group import NodeMotion, ParametricGroup
-from ..model.rotations import quat_conjugate, quat_multiply, quat_to_rotvec
+from ..model.rotations import quat_conjugate, quat_multiply, quat_normalize, quat_to_rotvec, rotate, rotvec_to_quat
 from ..model.temporal_transform import dct_basis
+from ..render.backend import Backend
 from .deformation_graph import NodeGraph, Pose
-from .entropy_model import CanonicalRate, laplace_bits
+from .entropy_model import CanonicalRate
 from .model import NAMES, REMOVED_LOGIT, Model
 from .settings import TrainSettings
 
 
-def rounded(c: torch.Tensor, dead_zone: float) -> torch.Tensor:
+@dataclass
+class Frame:
+    """One frame of a group, and what its backward pass needs.
+
+    Attributes:
+        params: attributes as they are rendered.
+        pose: of the nodes, with its leaves `turn` and `shift` [M, 3].
+        means, rotations: [N, 3] and [N, 4], where the nodes carry the Gaussians; differentiable in the leaves.
+        residual: [N, 4], the residual rotation, unit. inner: [N, 4], rotation before it. quats: [N, 4], canonical.
+        shown: [N] bool.
+    """
+
+    params: dict[str, torch.Tensor]
+    pose: Pose
+    turn: torch.Tensor
+    shift: torch.Tensor
+    means: torch.Tensor
+    rotations: torch.Tensor
+    residual: torch.Tensor
+    inner: torch.Tensor
+    quats: torch.Tensor
+    shown: torch.Tensor
+
+
+def rounded(c: np.ndarray, dead_zone: float) -> np.ndarray:
     """Integers of the coefficients, as the encoder rounds them."""
-    return torch.nn.functional.softshrink(c, dead_zone).round_()
+    return np.sign(c) * np.rint(np.maximum(np.abs(c) - dead_zone, 0))
 
 
 class GroupModel:
-    """Canonical Gaussians, fixed motion of the nodes, and coefficients of the residual trajectories.
+    """Canonical Gaussians, motion of the nodes, and coefficients of the residual trajectories.
 
     Args:
         graph: carries the N Gaussians of the last frame.
@@ -44,10 +69,11 @@ class GroupModel:
     Attributes:
         key: canonical Gaussians; the first `known` are those of the group before.
         start, end: [N] int, lifetime of each Gaussian in frames of the group, `end` excluded.
-        coefficients: attribute -> [K, N, C], of the residual trajectories, in quantization steps.
+        coefficients: attribute -> [K, N, C] f32, of the residual trajectories, in quantization steps.
         free: [N] bool, Gaussians whose coefficients are optimised.
-        log_scales: attribute -> [K, 1, 1], log of the Laplace scale of its coefficients.
-        means, rotations: T times [N, 3] and [N, 4], canonical means carried to each frame, and the nodes' rotations.
+        log_scales: attribute -> [K] f32, log of the Laplace scale of its coefficients.
+        turns, shifts: T times [M, 3], corrections of the poses of the nodes: rotation vectors, world units.
+        origin: [N] index of each Gaussian in the last frame of tracking; -1: it was added here.
     """
 
     def __init__(
@@ -60,8 +86,11 @@ class GroupModel:
         moved: torch.Tensor,
         settings: TrainSettings,
     ):
-        self.settings = settings.finetune
-        self.graph, self.poses = graph, _at_rest_until_added(poses)
+        self.settings, self._entropy, self._steps = settings.finetune, settings.entropy_model, steps
+        self.graph, self._tracked_poses = graph.copy(), _at_rest_until_added(poses)
+        self.origin = torch.arange(len(graph.means))
+        self.turns = [torch.zeros_like(p.nodes) for p in self._tracked_poses]
+        self.shifts = [torch.zeros_like(p.nodes) for p in self._tracked_poses]
         counts = torch.tensor([len(m) for m in tracked])
         self.start = (counts[:, None] <= torch.arange(counts[-1])).sum(0)
         tracked = [_padded(m, tracked[-1]) for m in tracked]
@@ -70,25 +99,41 @@ class GroupModel:
         self.end = len(tracked) - removed.sum(0)
         self.known = 0 if key is None else len(key)
         self.key = self._canonical(key, tracked)
-        self.basis = torch.from_numpy(dct_basis(len(tracked))).float()  # [T, T]
+        self.basis = dct_basis(len(tracked)).astype(np.float32)  # [T, T]
         self.canonical_steps = {n: steps[n] for n in NAMES}
         self.canonical_rate = CanonicalRate(self.key.params["means"], steps, settings.entropy_model)
         names = self.settings.frequencies
         self.unit = {name: trajectory_step(steps[name], len(tracked)) for name in names}
         self.unit["sh0"] *= float(STEP_WEIGHTS[0])  # Y, Co, Cg share one step; RGB errors add up over them
-        self.means, self.rotations = zip(*(self._carry(p) for p in self.poses), strict=True)
         self.coefficients = self._project(tracked)
-        large = [(c.detach().abs() > self.settings.free_min).any(2).any(0) for c in self.coefficients.values()]
-        self.free = torch.stack(large).any(0) | moved
+        large = [(np.abs(c) > self.settings.free_min).any((0, 2)) for c in self.coefficients.values()]
+        self.free = torch.from_numpy(np.any(large, 0)) | moved
         self.log_scales = {
-            n: torch.full((len(c), 1, 1), self.settings.log_scale_start, requires_grad=True)
-            for n, c in self.coefficients.items()
+            n: np.full(len(c), self.settings.log_scale_start, np.float32) for n, c in self.coefficients.items()
         }
 
+    def select(self, keep: torch.Tensor) -> None:
+        """Keeps the Gaussians of `keep` ([N] bool), among them those of the group before."""
+        self.key.select(keep)
+        self.graph.select(keep)
+        self.start, self.end, self.free, self.origin = (x[keep] for x in (self.start, self.end, self.free, self.origin))
+        self.coefficients = {n: np.ascontiguousarray(c[:, keep.numpy()]) for n, c in self.coefficients.items()}
+        self.canonical_rate = CanonicalRate(self.key.params["means"], self._steps, self._entropy)
+
+    def append(self, children: dict[str, torch.Tensor], parents: torch.Tensor) -> None:
+        """Adds canonical Gaussians, which live and move as their `parents` ([K] index) do."""
+        self.key.append(children)
+        self.graph.extend(children["means"])
+        self.start, self.end, self.free = (torch.cat([x, x[parents]]) for x in (self.start, self.end, self.free))
+        self.origin = torch.cat([self.origin, torch.full((len(parents),), -1)])
+        index = parents.numpy()
+        self.coefficients = {n: np.concatenate([c, c[:, index]], 1) for n, c in self.coefficients.items()}
+        self.canonical_rate = CanonicalRate(self.key.params["means"], self._steps, self._entropy)
+
     @property
-    def born(self) -> torch.Tensor:
-        """Older name of `start`."""
-        return self.start
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self._tracked_poses)
 
     def _hold_outside_lifetime(self, x: list[torch.Tensor]) -> torch.Tensor:
         """T values of each Gaussian, [T, N, ...]; outside of its lifetime those of its first or last frame."""
@@ -100,7 +145,7 @@ class GroupModel:
         """Canonical Gaussians: `key`, then the new ones as the mean of their tracked frames, in the keyframe's pose."""
         params = {n: self._hold_outside_lifetime([m.params[n] for m in tracked]).mean(0) for n in NAMES}
         params["means"] = self.graph.means
-        rotations = [self.graph.carry(self.graph.means, pose)[1] for pose in self.poses]
+        rotations = [self.graph.carry(self.graph.means, pose)[1] for pose in self._tracked_poses]
         back = [quat_multiply(quat_conjugate(q), m.params["quats"]) for q, m in zip(rotations, tracked, strict=True)]
         back = self._hold_outside_lifetime(back)
         back = back * torch.where((back * back[-1]).sum(2, keepdim=True) < 0, -1.0, 1.0)
@@ -109,15 +154,12 @@ class GroupModel:
             params = {n: torch.cat([key.params[n], p[self.known :]]) for n, p in params.items()}
         return Model(params)
 
-    def _carry(self, pose: Pose) -> tuple[torch.Tensor, torch.Tensor]:
-        """Canonical means carried to a pose, and the rotations by the nodes."""
-        return self.graph.carry(self.key.params["means"], pose)
-
-    def _project(self, tracked: list[Model]) -> dict[str, torch.Tensor]:
+    def _project(self, tracked: list[Model]) -> dict[str, np.ndarray]:
         """Lowest frequencies of the difference between the tracked frames and what the nodes carry."""
         p = self.key.params
         residual: dict[str, list] = {name: [] for name in self.settings.frequencies}
-        for model, means, rotations in zip(tracked, self.means, self.rotations, strict=True):
+        for model, pose in zip(tracked, self._tracked_poses, strict=True):
+            means, rotations = self.graph.carry(p["means"], pose)
             q = model.params
             dq = quat_multiply(q["quats"], quat_conjugate(quat_multiply(rotations, p["quats"])))
             residual["means"].append(q["means"] - means)
@@ -128,94 +170,97 @@ class GroupModel:
             residual["logit_opacities"].append(torch.where(q["logit_opacities"][:, None] > REMOVED_LOGIT, faded, 0.0))
         out, per = {}, self.settings.frequencies_frames
         for name, most in self.settings.frequencies.items():
-            low = self.basis[: -(-most * max(len(tracked), per) // per)]
+            low = torch.from_numpy(self.basis[: -(-most * max(len(tracked), per) // per)])
             c = torch.einsum("kt,tnc->knc", low, self._hold_outside_lifetime(residual[name])) / self.unit[name]
-            out[name] = c.contiguous().requires_grad_()
+            out[name] = c.contiguous().numpy()
         return out
 
-    @torch.no_grad()
-    def residuals(self, t: int) -> dict[str, torch.Tensor]:
-        """Residuals at frame `t`, attribute -> [N, C], in the units of the attribute."""
-        dead_zone = self.settings.dead_zone
-        return {n: torch.tensordot(self._at(n, t), rounded(c, dead_zone), 1) for n, c in self.coefficients.items()}
-
-    @torch.no_grad()
-    def backward(self, t: int, residuals: dict[str, torch.Tensor]) -> None:
-        """Adds the gradient by the `residuals` of frame `t` to that of the coefficients, straight through the rounding.
-        The gradient of Gaussians that are not free is 0."""
-        free = self.free[:, None]
-        for n, c in self.coefficients.items():
-            grad = self._at(n, t)[:, None, None] * (residuals[n].grad * free)
-            c.grad = grad if c.grad is None else c.grad.mul_(free).add_(grad)
-
-    def _at(self, name: str, t: int) -> torch.Tensor:
-        """Residual at frame `t` for each coefficient of an attribute that is 1, [K]."""
+    def at(self, name: str, t: int) -> np.ndarray:
+        """Residual at frame `t` for each coefficient of an attribute that is 1, [K] f32."""
         return self.unit[name] * self.basis[: len(self.coefficients[name]), t]
 
-    def _with_noise(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Canonical attributes, the new ones with uniform noise in place of quantization."""
-        p, out = self.key.params, dict(self.key.params)
-        for name, step in self.canonical_steps.items():
-            noise = step * (torch.rand(p[name].shape, generator=generator) - 0.5)
-            noise[: self.known] = 0
-            out[name] = p[name] + noise
-        return out
+    def pose(self, t: int) -> tuple[Pose, torch.Tensor, torch.Tensor]:
+        """Corrected pose of the nodes at frame `t`, differentiable in the correction [M, 3] and [M, 3] behind it."""
+        tracked, turn, shift = self._tracked_poses[t], self.turns[t].clone(), self.shifts[t].clone()
+        turn, shift = turn.requires_grad_(), shift.requires_grad_()
+        rotations = quat_normalize(quat_multiply(rotvec_to_quat(turn), tracked.rotations))
+        return replace(tracked, rotations=rotations, nodes=tracked.nodes + shift), turn, shift
 
-    def frame(
-        self, t: int, residuals: dict[str, torch.Tensor], generator: torch.Generator | None = None
-    ) -> dict[str, torch.Tensor]:
-        """Attributes of frame `t`; differentiable in its `residuals`.
+    def frame(self, t: int, backend: Backend, noise: dict[str, torch.Tensor] | None = None) -> Frame:
+        """Frame `t`.
 
         Args:
-            generator: of the noise on canonical attributes; None: no noise.
+            noise: attribute -> what is added to the canonical values; None: nothing.
         """
-        new = self.known < len(self.key)
-        p = self._with_noise(generator) if new and generator is not None else self.key.params
-        means = self.graph.carry(p["means"], self.poses[t])[0] if new else self.means[t]
-        dq = residuals["quats"]
-        opacities = p["logit_opacities"] + residuals["logit_opacities"][:, 0]
-        w = (1 - dq.square().sum(1, keepdim=True)).clamp(min=1e-6).sqrt()
-        return {
-            **p,
-            "means": means + residuals["means"],
-            "quats": quat_multiply(torch.cat([w, dq], 1), quat_multiply(self.rotations[t], p["quats"])),
-            "log_scales": p["log_scales"] + residuals["log_scales"],
-            "logit_opacities": torch.where((self.start <= t) & (t < self.end), opacities, REMOVED_LOGIT),
-            "sh0": p["sh0"] + residuals["sh0"],
+        p, zone = self.key.params, self.settings.dead_zone
+        if noise is not None:
+            p = {n: v + noise[n] for n, v in p.items()}
+        delta = {
+            n: torch.from_numpy(backend.trajectory_sum(c, self.at(n, t), zone)) for n, c in self.coefficients.items()
         }
+        pose, turn, shift = self.pose(t)
+        means, rotations = self.graph.carry(p["means"], pose)
+        with torch.no_grad():
+            dq = delta["quats"]
+            residual = torch.cat([(1 - dq.square().sum(1, keepdim=True)).clamp(min=1e-6).sqrt(), dq], 1)
+            inner = quat_multiply(rotations, p["quats"])
+            shown = (self.start <= t) & (t < self.end)
+            opacities = p["logit_opacities"] + delta["logit_opacities"][:, 0]
+            params = {
+                **p,
+                "means": means + delta["means"],
+                "quats": quat_multiply(residual, inner),
+                "log_scales": p["log_scales"] + delta["log_scales"],
+                "logit_opacities": torch.where(shown, opacities, REMOVED_LOGIT),
+                "sh0": p["sh0"] + delta["sh0"],
+            }
+        return Frame(params, pose, turn, shift, means, rotations, residual, inner, p["quats"], shown)
 
-    def bits(self, generator: torch.Generator) -> torch.Tensor:
-        """Estimated bits of all coefficients, with uniform noise in place of rounding."""
-        total = torch.zeros(())
-        for name, c in self.coefficients.items():
-            noise = torch.rand(c.shape, generator=generator) - 0.5
-            total = total + laplace_bits(c + noise, self.log_scales[name]).sum()
-        return total
+    @torch.no_grad()
+    def gradients(self, frame: Frame, grads: dict[str, torch.Tensor]) -> tuple[dict, dict, torch.Tensor]:
+        """From the gradients by what is rendered: those by the residuals, attribute -> [N, C], 0 for Gaussians that are
+        not free; those by the canonical attributes; and that by the rotations of the nodes, [N, 4]."""
+        by_inner = quat_multiply(quat_conjugate(frame.residual), grads["quats"])
+        by_residual = quat_multiply(grads["quats"], quat_conjugate(frame.inner))
+        by_dq = by_residual[:, 1:] - by_residual[:, :1] * (frame.residual[:, 1:] / frame.residual[:, :1])
+        opacities = grads["logit_opacities"] * frame.shown
+        residuals = {**grads, "quats": by_dq, "logit_opacities": opacities[:, None]}
+        free = self.free[:, None]
+        residuals = {n: (residuals[n] * free).numpy() for n in self.coefficients}
+        back = quat_conjugate(frame.rotations)
+        canonical = {
+            **grads,
+            "means": rotate(back, grads["means"]),
+            "quats": quat_multiply(back, by_inner),
+            "logit_opacities": opacities,
+        }
+        return residuals, canonical, quat_multiply(by_inner, quat_conjugate(frame.quats))
 
     def group(self, parents: np.ndarray | None) -> ParametricGroup:
         """The group as it is encoded; `parents` as in ParametricGroup."""
-        frames = len(self.poses)
-        lifetimes = torch.stack([self.born, self.end], 1).numpy().astype(np.int32)
+        frames = self.frames
+        lifetimes = torch.stack([self.start, self.end], 1).numpy().astype(np.int32)
         cut = (lifetimes != [0, frames]).any()
-        with torch.no_grad():
-            used = {n: rounded(c, self.settings.dead_zone) * self.unit[n] for n, c in self.coefficients.items()}
+        used = {n: rounded(c, self.settings.dead_zone) * self.unit[n] for n, c in self.coefficients.items()}
         return ParametricGroup(
             frames,
             self.key.gaussians(),
             self.nodes(),
-            {n: np.ascontiguousarray(c.transpose(1, 2).numpy()) for n, c in used.items() if c.any()},
+            {n: np.ascontiguousarray(c.transpose(0, 2, 1), np.float32) for n, c in used.items() if c.any()},
             lifetimes if cut else None,
             parents,
             rate_optimized=True,
         )
 
+    @torch.no_grad()
     def nodes(self) -> NodeMotion:
         """The carrying motion."""
         rotations, near = [], None
-        for pose in self.poses:
+        poses = [self.pose(t)[0] for t in range(self.frames)]
+        for pose in poses:
             near = quat_to_rotvec(pose.rotations, near)
             rotations.append(near)
-        translations = [pose.nodes - self.graph.nodes for pose in self.poses]
+        translations = [pose.nodes - self.graph.nodes for pose in poses]
         arrays = (self.graph.nodes, torch.stack(rotations), torch.stack(translations))
         return NodeMotion(*(a.numpy().astype(np.float32) for a in arrays), self.graph.neighbors, self.graph.weights)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..bitstream.quantization import subject_radius
 from ..errors import CaptureError
 from .model import Model, from_points
 from .plane_sweep import shell, sweep
@@ -11,8 +12,12 @@ from .settings import TrainSettings
 from .visual_hull import hull_points, random_points
 
 
-def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
-    """Gaussians from the visual hull of the masks. Without masks: from a plane sweep, or random where it finds little.
+def initial_model(capture, frame: int, count: int, settings: TrainSettings) -> tuple[Model, float]:
+    """Gaussians from the visual hull of the masks, and the radius of what they show. Without masks: from a plane sweep,
+    and a far shell that the radius does not count, or random where the sweep finds little.
+
+    Args:
+        count: of points, about.
 
     Raises:
         CaptureError: there is no training camera, or no point is seen by two of them.
@@ -26,15 +31,16 @@ def initial_model(capture, frame: int, settings: TrainSettings) -> Model:
         views.append((capture.camera(camera, frame), v.rgb, v.alpha))
     known = [c for c, _, _ in views]
     if all(alpha is not None for _, _, alpha in views):
-        points, colors = hull_points(known, views, settings.initial_points, settings.visual_hull)
+        points, colors = hull_points(known, views, count, settings.visual_hull)
         if len(points):
-            return from_points(points, colors, opacity=s.surface_opacity)
+            return from_points(points, colors, opacity=s.surface_opacity), subject_radius(points)
     if s.use_plane_sweep:
-        points, colors = sweep(views, settings.initial_points, settings.seed, settings.plane_sweep)
-        if len(points) >= s.sweep_min_share * settings.initial_points:
+        points, colors = sweep(views, count, settings.seed, settings.plane_sweep)
+        if len(points) >= s.sweep_min_share * count:
             surface = zip((points, colors), shell(views, settings.plane_sweep), strict=True)
-            return from_points(*(np.concatenate(pair) for pair in surface), opacity=s.surface_opacity)
-    points, colors = random_points(known, views, settings.initial_points, settings.seed, settings.visual_hull)
+            whole = from_points(*(np.concatenate(pair) for pair in surface), opacity=s.surface_opacity)
+            return whole, subject_radius(points)
+    points, colors = random_points(known, views, count, settings.seed, settings.visual_hull)
     if len(points) == 0:
         raise CaptureError(f"{capture.name}: no point is seen by two cameras, expected cameras that overlap")
-    return from_points(points, colors, opacity=s.random_opacity)
+    return from_points(points, colors, opacity=s.random_opacity), subject_radius(points)

@@ -1,4 +1,5 @@
-"""Fine-tuning, the optimisation: canonical attributes and residual coefficients of a group against all its frames.
+"""Fine-tuning, the optimisation: canonical attributes, node motion and residual coefficients of a group against all its
+frames.
 
 The loss is that of the image and a rate term (V3's residual-entropy loss, made differentiable): the entropy of the
 coefficients under noise-relaxed quantization at the step sizes of the stream, with a learned Laplace scale for each
@@ -13,9 +14,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from ..model.rotations import quat_conjugate, quat_multiply
-from ..render.optimizer import Adam
-from .finetune import GroupModel
+from ..render.optimizer import Adam, TrajectoryAdam
+from .finetune import Frame, GroupModel
+from .keyframe import Statistics, split_or_clone
 from .settings import TrainSettings
 from .views import Views, photometric_loss
 
@@ -26,70 +27,134 @@ class _Finetuner:
     def __init__(self, group: GroupModel, views: Views, frames: range, settings: TrainSettings, radius: float):
         self.group, self.views, self.frames, self.settings = group, views, frames, settings
         self.rng = np.random.default_rng([settings.seed, frames[0], 2])
-        self.noise = torch.Generator().manual_seed(settings.seed)
-        f = settings.finetune
-        scales = {f"{n}.log_scale": s for n, s in group.log_scales.items()}
-        self.leaves = {**group.coefficients, **scales}  # optimised besides the canonical attributes
-        self.rates = dict.fromkeys(group.coefficients, f.coefficient_rate) | dict.fromkeys(scales, f.log_scale_rate)
-        self.adam = Adam(views.backend, f.coefficient_adam)
-        group.key.start_optimizer(views.backend, settings.adam)
+        self.generator = torch.Generator().manual_seed(settings.seed)
+        f, backend = settings.finetune, views.backend
+        self.coefficients = TrajectoryAdam(backend, f.coefficient_adam)
+        self.scales, self.nodes = Adam(backend, f.coefficient_adam), Adam(backend, f.coefficient_adam)
+        group.key.start_optimizer(backend, settings.adam)
         canonical = settings.keyframe.rates.scaled(radius, f.canonical_rate_share)
         canonical["means"] = f.canonical_means_rate * radius
         self.canonical_rates = canonical if group.known < len(group.key) else {}
+        self.node_rates = {"turn": f.node_rotation_rate, "shift": f.node_translation_rate * radius}
         self.loss = 0.0  # running mean
-        self.canonical_bits, _ = group.canonical_rate.gradients(group.key.params, self.noise)
+        self.noise = self._noise()
+        self.canonical_bits, self.by_rate = group.canonical_rate.gradients(group.key.params, self.generator)
+        self.steps = 0
+        self.statistics = Statistics(len(group.key), settings.keyframe.mse_min)
+        self.bits = sum(self._step_coefficients(0, None, 0.0, 0.0))
 
     def step(self, t: int, decay: float) -> float:
         """One step on frame `t`, all learning rates times `decay`; returns the image loss."""
         f, group = self.settings.finetune, self.group
-        residuals = {n: r.requires_grad_() for n, r in group.residuals(t).items()}
-        params = group.frame(t, residuals, self.noise if f.canonical_noise else None)
-        target = self.views.draw(self.frames[t])
-        result = photometric_loss(params, target, self.settings, self.rng, self.views.backend)
+        frame = group.frame(t, self.views.backend, self.noise)
+        result = photometric_loss(
+            frame.params, self.views.draw(self.frames[t]), self.settings, self.rng, self.views.backend
+        )
         self.loss += (result.loss - self.loss) * (f.loss_smoothing if self.loss else 1.0)
-        heads, seeds = [params[n] for n in group.coefficients], [result.grads[n] for n in group.coefficients]
-        by_rate: dict[str, torch.Tensor] = {}
+        self.statistics.add(result)
+        residuals, canonical, by_rotations = group.gradients(frame, result.grads)
+        self._step_nodes(t, frame, result.grads["means"], by_rotations, decay)
         if self.settings.rate_lambda and self.rng.integers(f.rate_every) == 0:
-            bits, by_rate = self._rate_term()
-            heads.append(bits)
-            seeds.append(torch.ones(()))
-        for leaf in self.leaves.values():
-            leaf.grad = None
-        torch.autograd.backward(heads, seeds)
-        group.backward(t, residuals)
-        by_leaf = {n: leaf.grad for n, leaf in self.leaves.items() if leaf.grad is not None}  # scales: with bits only
-        self.adam.step(self.leaves, by_leaf, {n: self.rates[n] * decay for n in by_leaf})
+            weight = f.rate_every * self._bit_weight()
+            self.bits = sum(self._step_coefficients(t, residuals, weight, decay))
+        else:
+            self._step_coefficients(t, residuals, 0.0, decay)
         if self.canonical_rates:
-            self._step_canonical(t, result.grads, by_rate, decay)
+            self._step_canonical(canonical, decay)
         return result.loss
 
-    def _rate_term(self) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Weighted bits of the coefficients, and the weighted gradients of the canonical bits by attribute."""
-        bits = self.group.bits(self.noise)
-        weight = self._bit_weight(float(bits.detach()))
-        if not self.canonical_rates:
-            return weight * bits, {}
-        self.canonical_bits, grads = self.group.canonical_rate.gradients(self.group.key.params, self.noise)
-        return weight * bits, {n: self.settings.finetune.canonical_bit_weight * weight * g for n, g in grads.items()}
+    def _step_canonical(self, grads: dict[str, torch.Tensor], decay: float) -> None:
+        """One step of the new canonical Gaussians along the gradients of the image and of the rate term, as that was at
+        most `canonical_rate_every` steps ago."""
+        s, group = self.settings, self.group
+        if self.steps % s.finetune.canonical_rate_every == 0:
+            self.noise = self._noise()
+            self.canonical_bits, self.by_rate = group.canonical_rate.gradients(group.key.params, self.generator)
+        self.steps += 1
+        weight = s.finetune.canonical_bit_weight * self._bit_weight()
+        for n, g in grads.items():
+            if weight and n in self.by_rate:
+                g = g.add(self.by_rate[n], alpha=weight)
+            g[: group.known] = 0
+            grads[n] = g
+        group.key.step(grads, {n: r * decay for n, r in self.canonical_rates.items()})
 
-    def _bit_weight(self, bits: float) -> float:
-        """Weight of a bit in the image loss, where the residuals take `bits`.
+    def change_topology(self) -> None:
+        """Removes new Gaussians that all frames together do without, and gives a second one to those whose screen
+        gradient is still large: what the keyframe did not show, or a motion has stretched."""
+        group, k, stats = self.group, self.settings.keyframe, self.statistics
+        opacities = torch.sigmoid(group.key.params["logit_opacities"])
+        contribution = stats.contribution(opacities)
+        keep = contribution >= k.contribution_min
+        keep &= stats.max_weight > k.prune_weight
+        keep[: group.known] = True
+        gradient = stats.mean_screen_gradient() * keep
+        room = min(int(self.settings.finetune.growth * len(keep)), self.settings.gaussians_max - int(keep.sum()))
+        chosen = torch.topk(gradient, max(0, min(room, len(gradient)))).indices
+        chosen = chosen[(gradient[chosen] > k.gradient_min) & (chosen >= group.known)]
+        children = split_or_clone(group.key, chosen, self.rng, k)
+        group.append(children, chosen)
+        self.coefficients.append(len(chosen))
+        keep = torch.cat([keep, torch.ones(len(chosen), dtype=torch.bool)])
+        if keep.any():
+            group.select(keep)
+            self.coefficients.select(keep.numpy())
+        self.statistics = Statistics(len(group.key), k.mse_min)
+        self.noise = self._noise()
+        self.canonical_bits, self.by_rate = group.canonical_rate.gradients(group.key.params, self.generator)
+
+    def _noise(self) -> dict[str, torch.Tensor] | None:
+        """Uniform noise in place of the quantization of the new canonical Gaussians; None: there is none."""
+        group = self.group
+        if not self.canonical_rates or not self.settings.finetune.canonical_noise:
+            return None
+        noise = {}
+        for n, step in group.canonical_steps.items():
+            uniform = self.rng.random(group.key.params[n].shape, np.float32)
+            uniform[: group.known] = 0.5
+            noise[n] = torch.from_numpy(step * (uniform - np.float32(0.5)))
+        return noise
+
+    def _step_coefficients(self, t: int, residuals: dict | None, weight: float, decay: float) -> list[float]:
+        """One step of all coefficients along the gradients by the residuals of frame `t` (None: 0), a bit weighing
+        `weight`; returns the bits of each attribute."""
+        f, group, bits = self.settings.finetune, self.group, []
+        rate = f.coefficient_rate * decay
+        for n, c in group.coefficients.items():
+            grad = np.zeros(c.shape[1:], np.float32) if residuals is None else residuals[n]
+            price = None
+            if weight or residuals is None:
+                noise = self.rng.random(grad.size + len(c), np.float32) - np.float32(0.5)
+                price = (weight, np.exp(group.log_scales[n]), noise)
+            of_each = self.coefficients.step(n, c, grad, group.at(n, t), price, rate)
+            if weight:
+                by_scale = {n: (weight * of_each[:, 1]).astype(np.float32)}
+                self.scales.step(group.log_scales, by_scale, {n: f.log_scale_rate * decay})
+            bits.append(float(of_each[:, 0].sum()))
+        return bits
+
+    def _step_nodes(
+        self, t: int, frame: Frame, by_means: torch.Tensor, by_rotations: torch.Tensor, decay: float
+    ) -> None:
+        """One step of the nodes at frame `t`, along the gradients by where they carry the Gaussians and that of the
+        rigidity of the graph."""
+        if not self.node_rates["turn"]:
+            return
+        rigidity = self.settings.rigidity * self.group.graph.rigidity(frame.pose)
+        heads, seeds = [frame.means, frame.rotations, rigidity], [by_means, by_rotations, torch.ones(())]
+        torch.autograd.backward(heads, seeds)
+        values = {f"turn {t}": self.group.turns[t], f"shift {t}": self.group.shifts[t]}
+        grads = {f"turn {t}": frame.turn.grad, f"shift {t}": frame.shift.grad}
+        self.nodes.step(values, grads, {n: decay * self.node_rates[n.split()[0]] for n in values})
+
+    def _bit_weight(self) -> float:
+        """Weight of a bit in the image loss.
 
         Relative changes of bits and of loss count. All groups of a subject count the canonical bits, as if each stood
         alone, so that a bit has the same weight in all of them.
         """
         s = self.settings
-        return s.finetune.rate_every * s.rate_lambda * self.loss / (bits + self.canonical_bits)
-
-    def _step_canonical(self, t: int, grads: dict, by_rate: dict[str, torch.Tensor], decay: float) -> None:
-        """One step of the new canonical Gaussians along the gradients at frame `t` and those of the rate term."""
-        group = self.group
-        back = quat_multiply(quat_conjugate(group.rotations[t]), grads["quats"])  # to the pose of the keyframe
-        grads = {**grads, "quats": back}
-        for n, g in grads.items():
-            g += by_rate.get(n, 0)
-            g[: group.known] = 0
-        group.key.step(grads, {n: r * decay for n, r in self.canonical_rates.items()})
+        return s.rate_lambda * self.loss / (self.bits + self.canonical_bits)
 
 
 def finetune(
@@ -101,7 +166,7 @@ def finetune(
     radius: float,
     on_step: Callable[[int, float], None] | None = None,
 ) -> None:
-    """Optimises the coefficients of `group` and its new canonical Gaussians over all `frames`, in place.
+    """Optimises the coefficients of `group`, its nodes and its new canonical Gaussians over all `frames`, in place.
 
     Args:
         radius: of the moving Gaussians, world units.
@@ -113,6 +178,8 @@ def finetune(
     for step in range(steps):
         # The first and the last frame come twice: they have neighbours on one side only.
         order = order or run.rng.permutation([0, *range(len(frames)), len(frames) - 1]).tolist()
+        if step == round(settings.finetune.topology_at * steps):
+            run.change_topology()
         loss = run.step(order.pop(), settings.finetune.rate_decay ** (step / steps))
         if on_step:
             on_step(step, loss)

@@ -85,28 +85,29 @@ def train_keyframe(
     k = settings.keyframe
     rng = np.random.default_rng([settings.seed, frame])
     stats, losses = Statistics(len(model), k.mse_min), []
+    densify_every = max(k.densify_every, round(k.densify_share * steps))
     model.start_optimizer(views.backend, settings.adam)
-    views.reset_calibration(model.params["means"].numpy().mean(0, dtype=np.float64), radius)
+    views.reset_calibration(frame, model.params["means"].numpy().mean(0, dtype=np.float64), radius)
     for step in range(steps):
-        target = views.draw(frame)
-        result = photometric_loss(model.params, target, settings, rng, views.backend)
+        target = views.draw(frame, picture_scale(step / steps, views.largest_side, k))
+        result = photometric_loss(
+            _shaken(model.params, k.position_noise * radius, rng), target, settings, rng, views.backend
+        )
         stats.add(result)
         losses.append(result.loss - settings.mask_lambda * result.mask)
         progress = step / max(steps - 1, 1)
         decay = k.rate_decay**progress
+        views.exposure.learn(target.index, result.grad_exposure[0], decay)
         if step >= k.appearance_from * steps:
-            views.exposure.learn(target.index, result.grad_gain[0], decay)
             views.extrinsics.learn(target.index, model.params, result.grads, decay)
+        result.grads["shN"].add_(model.params["shN"], alpha=k.harmonics_weight / len(model))
         means_rate = radius * k.rates["means"] * (k.means_rate_end / k.rates["means"]) ** progress
         model.step(result.grads, {**k.rates.scaled(radius, decay), "means": means_rate})
         if step == int(k.appearance_from * steps):
             model.set_degree(settings.sh_degree)
-        if step == int(k.densify_until * steps):
-            views.exposure.freeze_if_negligible()
-            views.extrinsics.freeze_if_negligible()
         if step == int(k.thin_until * steps) and not harmonics_needed(model, views, frame, settings):
             model.set_degree(0)
-        if (step + 1) % k.densify_every == 0:
+        if (step + 1) % densify_every == 0:
             if k.densify_from * steps < step < k.densify_until * steps:
                 densify(model, stats, int(k.gaussians_share * settings.gaussians_max), rng, k)
             elif step >= k.densify_until * steps:
@@ -115,6 +116,29 @@ def train_keyframe(
         if on_step:
             on_step(step, result.loss)
     return float(np.mean(losses[-len(views.train_cameras) :]))
+
+
+def _shaken(params: dict[str, torch.Tensor], size: float, rng: np.random.Generator) -> dict[str, torch.Tensor]:
+    """The same with noise of a standard deviation of `size` (world units) on the means: what holds only from where a
+    training camera stands falls apart (HiCoM, Gao et al. 2024)."""
+    if not size:
+        return params
+    noise = torch.from_numpy(rng.standard_normal(params["means"].shape, np.float32))
+    return {**params, "means": params["means"] + size * noise}
+
+
+def picture_scale(progress: float, side: int, settings: KeyframeSettings) -> float:
+    """Scale of the pictures at a share of the steps: coarse ones first, whose shapes are large and steps cheap
+    (DashGaussian, Chen et al. 2025). Halves, so that a picture is made small once.
+
+    Args:
+        side: of the largest picture, pixels.
+    """
+    if progress >= settings.full_size_from:
+        return 1.0
+    coarsest = min(1.0, settings.coarse_side / side)
+    wanted = coarsest ** (1 - progress / settings.full_size_from)
+    return 0.5 ** int(np.log2(1 / wanted) + 0.5)
 
 
 def harmonics_needed(model: Model, views: Views, frame: int, settings: TrainSettings) -> bool:
@@ -145,14 +169,25 @@ def prune(model: Model, stats: Statistics, settings: KeyframeSettings, *, thin: 
 
 @torch.no_grad()
 def densify(model: Model, stats: Statistics, most: int, rng: np.random.Generator, settings: KeyframeSettings) -> None:
-    """One round of densification, up to `most` Gaussians: those with the largest screen gradients are split (large
-    ones) or cloned (small ones). Gaussians that are not visible are removed."""
+    """One round of densification, up to `most` Gaussians: those with large screen gradients are split (large ones) or
+    cloned (small ones). Gaussians that are not visible are removed."""
     keep = _visible(model, stats, settings)
     gradient = stats.mean_screen_gradient()
     gradient[~keep] = 0
     room = max(0, min(int(settings.growth * len(model)), most - int(keep.sum())))
     chosen = torch.topk(gradient, min(room, len(gradient))).indices
-    chosen = chosen[gradient[chosen] > 0]
+    chosen = chosen[gradient[chosen] > settings.gradient_min]
+    children = split_or_clone(model, chosen, rng, settings)
+    if keep.any():
+        model.select(keep)
+    model.append(children)
+
+
+@torch.no_grad()
+def split_or_clone(
+    model: Model, chosen: torch.Tensor, rng: np.random.Generator, settings: KeyframeSettings
+) -> dict[str, torch.Tensor]:
+    """A second Gaussian for each of `chosen` ([K] index): large ones are split, in place, small ones cloned."""
     children = {n: p[chosen].clone() for n, p in model.params.items()}
     spread = torch.exp(children["log_scales"])
     large = spread.max(1).values > torch.exp(model.params["log_scales"]).max(1).values.median()
@@ -163,9 +198,7 @@ def densify(model: Model, stats: Statistics, most: int, rng: np.random.Generator
     model.params["means"][parents] -= settings.split_offset * offset[large]
     model.params["log_scales"][parents] -= np.log(settings.split_shrink)
     children["log_scales"][large] -= np.log(settings.split_shrink)
-    if keep.any():
-        model.select(keep)
-    model.append(children)
+    return children
 
 
 def random_offset(params: dict[str, torch.Tensor], rng: np.random.Generator) -> torch.Tensor:

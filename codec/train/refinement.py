@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from ..capture import Capture, View, blend, cropped
-from ..model.camera import Calibration, Camera
+from ..model.camera import Camera
 from ..model.parametric_group import ParametricGroup
 from .settings import RefinementSettings
 
@@ -46,25 +46,33 @@ class PictureRefinement:
         self._capture, self._settings, self._views = capture, settings or RefinementSettings(), views
         self._trained = capture.indices("train")
 
-    def __call__(self, group: ParametricGroup, first_frame: int, quantizer: Quantizer) -> None:
-        """Refines `group`, which begins at `first_frame`.
+    def __call__(
+        self, group: ParametricGroup, first_frame: int, quantizer: Quantizer, views: int | None = None
+    ) -> None:
+        """Refines `group`, which begins at `first_frame`, by `views` pictures; None: by as many as the settings say.
 
         Raises:
             CaptureError: a picture cannot be read.
         """
         s, cameras = self._settings, self._capture.cameras
         usual = min(s.passes * len(self._trained), s.frame_pictures) * quantizer.frames
-        count = usual if self._views is None else self._views
+        views = self._views if views is None else views
+        count = usual if views is None else views
         if not count:
             return
         pixels = sum(cameras[i].width * cameras[i].height for i in self._trained)
         reach = min(s.reach_max, s.reach * (pixels / max(quantizer.gaussians, 1)) ** 0.5)
-        targets = self._pictures(group.calibration, first_frame, count, quantizer.frames)
-        quantizer.follow(targets, count, reach / count**0.5)
+        quantizer.follow(self.pictures(group, first_frame, count), count, reach / count**0.5)
 
-    def _pictures(self, calibration: Calibration, first_frame: int, count: int, frames: int) -> Iterator[Picture]:
-        """All cameras of a frame before any one again, all frames in turn, each picture over a background of its own: a
-        haze in the colour of a known background would pass for opacity."""
+    def pictures(self, group: ParametricGroup, first_frame: int, count: int, seed: int = 0) -> Iterator[Picture]:
+        """`count` pictures of `group`, which begins at `first_frame`, in the order that `seed` draws: all cameras of a
+        frame before any one again, all frames in turn, each picture over a background of its own: a haze in the colour
+        of a known background would pass for opacity.
+
+        Raises:
+            CaptureError: a picture cannot be read.
+        """
+        calibration, frames = group.calibration, len(group)
 
         def read(camera: int, t: int) -> tuple[View, Camera]:
             view, there = self._capture.view(camera, first_frame + t), self._capture.camera(camera, first_frame + t)
@@ -72,12 +80,12 @@ class PictureRefinement:
 
         largest = max(4 * c.width * c.height for c in self._capture.cameras)
         cached = lru_cache(max(1, self._settings.cache_bytes // largest))(read)
-        random, order = np.random.default_rng(0), [[] for _ in range(frames)]
+        random, order = np.random.default_rng(seed), [[] for _ in range(frames)]
         rounds = [random.permutation(frames) for _ in range(0, count, frames)]
         for t in np.concatenate(rounds)[:count].tolist():
             order[t] = order[t] or random.permutation(self._trained).tolist()
             i = order[t].pop()
             view, camera = cached(i, t)
             background = tuple(random.uniform(0, 1, 3).tolist())
-            evened = View(view.rgb / calibration.gains[i], view.alpha)
+            evened = View(calibration.evened(view.rgb, i), view.alpha)
             yield t, camera, background, np.ascontiguousarray(blend(evened, background) / 255, np.float32)

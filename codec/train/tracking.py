@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -32,6 +33,9 @@ from .model import NAMES, REMOVED_LOGIT, Model
 from .relocalization import relocalize
 from .settings import TrainSettings
 from .views import Views, view_losses
+
+if TYPE_CHECKING:
+    from .finetune import GroupModel
 
 OnStep = Callable[[int, float], None] | None  # called with (step, loss)
 
@@ -175,6 +179,22 @@ class Tracker:
         self.graph.select(chosen)
         self.own.select(chosen)
         self.moving = self.moving[chosen]
+
+    def adopt(self, group: GroupModel) -> None:
+        """Removes and adds Gaussians as fine-tuning did; new ones as they are in the last frame."""
+        kept = torch.zeros(len(self.own), dtype=torch.bool)
+        kept[group.origin[group.origin >= 0]] = True
+        self.select(kept)
+        new = group.origin < 0
+        if not new.any():
+            return
+        frame = group.frame(group.frames - 1, self.views.backend)
+        self.graph = group.graph.copy()
+        means, rotations = (x[new] for x in self.graph.carry(self.graph.means, self.pose))
+        params = {n: p[new] for n, p in frame.params.items()}
+        quats = quat_multiply(quat_conjugate(rotations), params["quats"])
+        self.own.append({**params, "means": params["means"] - means, "quats": quats})
+        self.moving = torch.cat([self.moving, torch.ones(int(new.sum()), dtype=torch.bool)])
 
     def densify(self, frame: int, on_step: OnStep = None) -> None:
         """Adds the Gaussians that `frame` needs besides, after `advance`."""

@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..bitstream.quantization import steps_for, subject_radius
+from ..bitstream.quantization import steps_for
 from ..model.parametric_group import ParametricGroup
 from ..render.backend import Backend
 from ..render.cpu import CpuBackend
 from ..render.sensitivity import measured_steps
+from .budget import budget_of
 from .checkpoint import Checkpoint
 from .deformation_graph import Pose
 from .finetune import GroupModel
@@ -149,6 +150,7 @@ class _Run:
             subject.parents = np.arange(len(subject.canonical))
             return ParametricGroup(1, subject.canonical.gaussians(), rate_optimized=False)
         model = self._finetuned(subject, done, track)
+        subject.tracker.adopt(model)
         known = len(model.key) if parents is None else len(parents)
         new = np.full(len(model.key) - known, -1)
         group = model.group(None if parents is None else np.append(parents, new).astype(np.int32))
@@ -160,10 +162,11 @@ class _Run:
     def _keyframe(self, frames: range) -> Subject:
         """A new subject from the first of `frames`."""
         s = self.settings
-        model = initial_model(self.capture, frames[0], s)
-        radius = subject_radius(model.params["means"].numpy())
+        budget = budget_of(self.views, frames[0], s.keyframe_steps, s.budget)
+        self.progress.total += budget.steps - s.keyframe_steps
+        model, radius = initial_model(self.capture, frames[0], s.initial_points or budget.points, s)
         on_step = self._report(f"keyframe {frames[0]}")
-        loss = train_keyframe(model, self.views, frames[0], s, steps=s.keyframe_steps, radius=radius, on_step=on_step)
+        loss = train_keyframe(model, self.views, frames[0], s, steps=budget.steps, radius=radius, on_step=on_step)
         return Subject(Tracker.start(model, self.views, s, loss, frames), loss, radius)
 
     def _track(self, frames: range, track: _TrackedFrames) -> bool:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..capture import View, cropped
+from ..capture.epipolar import epipolar_error
 from ..model.camera import Calibration, Camera
 from ..model.gaussians import Gaussians
 from ..render.backend import Backend, Crop, RenderLoss
@@ -31,16 +32,18 @@ class Target:
     Attributes:
         camera: pinhole camera of the crop, in its calibrated pose.
         rgb: [H, W, 3] u8, unassociated colour.
-        alpha: [H, W] u8, or None where the capture has no masks.
+        alpha: [H, W] u8; 255 everywhere where the capture has no masks.
         index: of the camera in the capture.
-        gain: [3], exposure of the camera.
+        opaque: the capture has no masks.
+        exposure: gain and offset of the camera, [3] each.
     """
 
     camera: Camera
     rgb: np.ndarray
-    alpha: np.ndarray | None
+    alpha: np.ndarray
     index: int
-    gain: np.ndarray | None = None
+    opaque: bool = False
+    exposure: tuple[np.ndarray, np.ndarray] | None = None
 
 
 class Views:
@@ -60,10 +63,17 @@ class Views:
         self.exposure = Exposure(len(capture.cameras), self.train_cameras, settings, backend)
         self.extrinsics = Extrinsics(len(capture.cameras), self.train_cameras, settings, backend)
         self._seed = settings.seed
+        self._poses_learn = settings.calibration.refine_poses
+        self._pose_error_min = settings.calibration.pose_error_min
         self._cache: OrderedDict[tuple, View | Target] = OrderedDict()
         self._bytes = 0
         self._order: dict[int, list[int]] = {}
         self._rounds: dict[int, int] = {}
+
+    @property
+    def largest_side(self) -> int:
+        """Of the pictures, pixels."""
+        return max(max(self.capture.cameras[i].width, self.capture.cameras[i].height) for i in self.train_cameras)
 
     def view(self, camera: int, frame: int) -> View:
         """Image of camera `camera` at `frame` as the capture gives it."""
@@ -77,7 +87,7 @@ class Views:
 
         target = self._cached((camera, frame, scale), load)
         moved = self.extrinsics.camera(camera, target.camera)
-        return replace(target, camera=moved, gain=self.exposure.gain(camera))
+        return replace(target, camera=moved, exposure=self.exposure.of(camera))
 
     def camera(self, index: int, frame: int) -> Camera:
         """Camera `index` at `frame`, in its calibrated pose."""
@@ -87,7 +97,8 @@ class Views:
         """Corrections of the poses, and exposures, of all cameras."""
         every = range(len(self.capture.cameras))
         corrections = np.stack([self.extrinsics.correction(i) for i in every])
-        return Calibration(corrections, np.stack([self.exposure.gain(i) for i in every]))
+        gains, offsets = (np.stack(a) for a in zip(*(self.exposure.of(i) for i in every), strict=True))
+        return Calibration(corrections, gains, offsets)
 
     def render(self, g: Gaussians, index: int, frame: int, size: Sequence[int] | None = None) -> np.ndarray:
         """Gaussians as camera `index` shows them at `frame`, with its exposure, over mid-grey; [H, W, 3] u8.
@@ -111,9 +122,14 @@ class Views:
         self._cache.move_to_end(key)
         return self._cache[key]
 
-    def reset_calibration(self, center: np.ndarray, radius: float) -> None:
-        """Exposures and poses as the capture gives them, for a subject around `center` ([3], world units)."""
+    def reset_calibration(self, frame: int, center: np.ndarray, radius: float) -> None:
+        """Colours and poses as the capture gives them, for a subject around `center` ([3], world units). Poses are
+        learned from `frame` on where the capture's own contradict its pictures."""
         self.exposure.reset()
+        if self._poses_learn is None:
+            error = epipolar_error(self.capture, frame, self.train_cameras)
+            self._poses_learn = error is not None and error > self._pose_error_min
+        self.extrinsics.learns = self._poses_learn
         self.extrinsics.reset()
         self.extrinsics.set_subject(center, radius)
 
@@ -138,7 +154,9 @@ class Views:
 
     def _cropped(self, camera: int, frame: int) -> Target:
         view, crop = cropped(self.view(camera, frame), self.capture.camera(camera, frame))
-        return Target(crop, view.rgb, view.alpha, camera)
+        opaque = view.alpha is None
+        alpha = np.full(view.rgb.shape[:2], 255, np.uint8) if opaque else view.alpha
+        return Target(crop, view.rgb, alpha, camera, opaque)
 
 
 def shrink(target: Target, scale: float) -> Target:
@@ -147,25 +165,24 @@ def shrink(target: Target, scale: float) -> Target:
 
     height, width = target.rgb.shape[:2]
     size = (max(1, round(scale * width)), max(1, round(scale * height)))
-    alpha = np.full((height, width), 255, np.uint8) if target.alpha is None else target.alpha
-    share = (alpha / np.float32(255))[..., None]
+    share = (target.alpha / np.float32(255))[..., None]
     small = cv2.resize(share, size, interpolation=cv2.INTER_AREA)
     rgb = cv2.resize(target.rgb * share, size, interpolation=cv2.INTER_AREA) / np.maximum(small, 1e-3)[..., None]
-    return Target(
-        target.camera.resized(*size),
-        np.rint(rgb.clip(0, 255)).astype(np.uint8),
-        None if target.alpha is None else np.rint(255 * small).astype(np.uint8),
-        target.index,
+    return replace(
+        target,
+        camera=target.camera.resized(*size),
+        rgb=np.rint(rgb.clip(0, 255)).astype(np.uint8),
+        alpha=np.rint(255 * small).astype(np.uint8),
     )
 
 
 def photometric_loss(
     params: dict, target: Target, settings: TrainSettings, rng: np.random.Generator, backend: Backend
 ) -> RenderLoss:
-    """Loss of Gaussians against one target (`Backend.photometric_loss`), over a random background: with a known one,
-    Gaussians in its colour could stand for transparency."""
-    background = tuple(rng.uniform(0, 1, 3))
-    crop = Crop(target.camera, target.rgb, target.alpha, background, target.gain)
+    """Loss of Gaussians against one target (`Backend.photometric_loss`). Behind a target with alpha the background is
+    random: with a known one, Gaussians in its colour could stand for transparency. An opaque one is to be covered."""
+    background = GREY if target.opaque else tuple(rng.uniform(0, 1, 3))
+    crop = Crop(target.camera, target.rgb, target.alpha, background, target.exposure)
     return backend.photometric_loss(params, [crop], ssim_lambda=settings.ssim_lambda, mask_lambda=settings.mask_lambda)
 
 

@@ -1,4 +1,5 @@
-"""Settings of training, one frozen dataclass a stage. A preset is a set of step counts; the rest is the same for all.
+"""Settings of training, one frozen dataclass a stage. A preset is a price of quality in seconds and in bits; the rest
+is the same for all.
 
 A function takes the settings of its stage. An ablation is a variant of the settings, made by `dataclasses.replace`.
 Units: a radius is that of the subject (`subject_radius`), a grey level is 1/255, "share of the steps" is of the
@@ -14,6 +15,7 @@ from ...model.gaussians import GOP
 from ...render.optimizer import AdamSettings
 from .finetune import EntropyModelSettings, FinetuneSettings, RefinementSettings
 from .keyframe import (
+    BudgetSettings,
     CameraCalibrationSettings,
     InitializationSettings,
     KeyframeSettings,
@@ -33,6 +35,7 @@ from .tracking import (
 __all__ = [
     "PRESETS",
     "AdamSettings",
+    "BudgetSettings",
     "CameraCalibrationSettings",
     "ChangeDetectionSettings",
     "DeformationGraphSettings",
@@ -59,11 +62,11 @@ class TrainSettings:
 
     Attributes:
         gop: most frames in a group.
-        keyframe_steps: optimisation steps of a keyframe.
+        keyframe_steps: optimisation steps of a keyframe of small pictures (budget.py).
         motion_steps: steps a frame for tracking.
         finetune_steps: steps a frame for the joint fine-tuning of a group.
-        gaussians_max: bound on the count of Gaussians.
-        initial_points: of a keyframe, about.
+        gaussians_max: bound on the count of Gaussians, and so on the memory; how many there are follows from the scene.
+        initial_points: of a keyframe, about; None: as the scene needs (budget.py).
         sh_degree: bound on the degree of spherical harmonics; a keyframe keeps them where they lower the error.
         ssim_lambda: share of D-SSIM in the image loss (3D Gaussian Splatting: 0.2).
         mask_lambda: weight of the alpha loss where the capture has masks.
@@ -75,24 +78,25 @@ class TrainSettings:
     """
 
     gop: int = GOP
-    keyframe_steps: int = 1500
+    keyframe_steps: int = 2000
     motion_steps: int = 200
-    finetune_steps: int = 120
-    gaussians_max: int = 17500
-    initial_points: int = 8000
-    sh_degree: int = 1
+    finetune_steps: int = 200
+    gaussians_max: int = 120_000
+    initial_points: int | None = None
+    sh_degree: int = 3
     ssim_lambda: float = 0.2
     mask_lambda: float = 0.1
     cut_ratio: float = 2.0
     rigidity: float = 0.1
     rate_lambda: float = 0.4
-    quality: float = 50.0
+    quality: float = 56.0
     seed: int = 0
     adam: AdamSettings = field(default_factory=AdamSettings)
     initialization: InitializationSettings = field(default_factory=InitializationSettings)
     visual_hull: VisualHullSettings = field(default_factory=VisualHullSettings)
     plane_sweep: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
     calibration: CameraCalibrationSettings = field(default_factory=CameraCalibrationSettings)
+    budget: BudgetSettings = field(default_factory=BudgetSettings)
     keyframe: KeyframeSettings = field(default_factory=KeyframeSettings)
     change_detection: ChangeDetectionSettings = field(default_factory=ChangeDetectionSettings)
     graph: DeformationGraphSettings = field(default_factory=DeformationGraphSettings)
@@ -110,18 +114,31 @@ class TrainSettings:
 
 
 PRESETS = {
-    "fast": {"keyframe_steps": 700, "motion_steps": 100, "finetune_steps": 40, "gaussians_max": 10000},
+    "fast": {"keyframe_steps": 800, "motion_steps": 100, "finetune_steps": 60},
     "medium": {},
-    "slow": {"keyframe_steps": 4000, "motion_steps": 250, "finetune_steps": 300, "gaussians_max": 31000},
+    "slow": {"keyframe_steps": 5000, "motion_steps": 250, "finetune_steps": 500},
+}
+PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
+    "fast": {"gradient_min": 4e-4, "contribution_min": 10.0},
+    "medium": {},
+    "slow": {"gradient_min": 1e-4, "contribution_min": 2.0},
 }
 
 
-def train_settings(preset: str, **changes) -> TrainSettings:
+LOSS = {"fast": 0.5, "medium": 0.3, "slow": 0.2}  # decibels that coding may cost where no quality is named
+
+
+def train_settings(preset: str, quality: float | None = None, **changes) -> TrainSettings:
     """Settings of a preset, with changes.
+
+    Args:
+        quality: of the stream; None: it is found when the first group is coded, and training assumes the usual one.
 
     Raises:
         UsageError: the preset does not exist or a value is out of range.
     """
     if preset not in PRESETS:
         raise UsageError(f"--preset {preset} does not exist, expected one of {', '.join(PRESETS)}")
-    return TrainSettings(**{**PRESETS[preset], **changes})
+    if quality is not None:
+        changes["quality"] = quality
+    return TrainSettings(**{**PRESETS[preset], "keyframe": KeyframeSettings(**PRICES[preset]), **changes})

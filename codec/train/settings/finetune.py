@@ -28,12 +28,17 @@ class FinetuneSettings:
     log_scale_start: float = -1.0  # log of a Laplace scale, quantization steps
     log_scale_rate: float = 0.02
     coefficient_adam: AdamSettings = field(default_factory=lambda: AdamSettings(eps=1e-8))
-    canonical_means_rate: float = 4e-5  # radii
-    canonical_rate_share: float = 0.3  # of the keyframe's rates, for all other canonical attributes
+    node_rotation_rate: float = 2e-3  # radians; 0: the nodes move as they were tracked
+    node_translation_rate: float = 3e-4  # radii
+    canonical_means_rate: float = 1.6e-4  # radii
+    canonical_rate_share: float = 1.0  # of the keyframe's rates, for all other canonical attributes
     canonical_bit_weight: float = 3.0  # of a canonical bit, in bits of residuals
     canonical_noise: bool = True  # uniform noise in place of quantization, on canonical attributes
     rate_decay: float = 0.05  # rates at the last step, times those at the first
+    topology_at: float = 0.3  # share of the steps at which Gaussians are removed and added
+    growth: float = 0.1  # share of the Gaussians that may be added then
     rate_every: int = 8  # steps: the rate term has every coefficient, an image few; its weight grows by as much
+    canonical_rate_every: int = 24  # steps for which the gradient of the canonical bits, and their noise, are held
     loss_smoothing: float = 0.05  # share of one step in the running mean of the loss
 
 

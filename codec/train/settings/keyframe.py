@@ -48,13 +48,26 @@ class PlaneSweepSettings:
 
 @dataclass(frozen=True)
 class CameraCalibrationSettings:
-    """Exposure (log gain of each channel) and pose of each training camera, learned with a keyframe."""
+    """Colour (log gain and offset of each channel) and pose of each training camera, learned with a keyframe."""
 
-    exposure_rate: float = 0.02
-    exposure_weight: float = 0.02  # of half the square of a log gain in the loss, which keeps gains near 1
-    exposure_min: float = 0.05  # root mean square; shading alone, with equal gains, gives 0.01 to 0.05
-    pose_rate: float = 5e-3  # radians, radii
-    pose_min: float = 1e-2  # root mean square; right poses give 0.001 to 0.009, an error of 0.5 degrees and 5 mm 0.015
+    exposure_rate: float = 2e-2  # log gain
+    offset_unit: float = 0.1  # of 0..1: an offset is learned so much more slowly than a log gain
+    exposure_weight: float = 0.02  # of half the square of both in the loss: shading, too, looks like exposure
+    pose_rate: float = 3e-3  # radians, radii
+    refine_poses: bool | None = None  # None: where `pose_error_min` says so
+    pose_error_min: float = 0.75  # pixels, median distance of features from their epipolar lines; good rigs have 0.25
+
+
+@dataclass(frozen=True)
+class BudgetSettings:
+    """What a scene needs (`budget.py`)."""
+
+    points_share: float = 0.15  # points to start from, of the pixels of a picture that show the scene
+    points_min: int = 4000
+    points_max: int = 40_000
+    pixels: float = 50_000.0  # that show the scene, for which a preset's steps are meant
+    steps_exponent: float = 0.5  # of the pixels, in the steps
+    steps_most: float = 2.5  # times a preset's steps
 
 
 @dataclass(frozen=True)
@@ -64,9 +77,14 @@ class KeyframeSettings:
     rates: LearningRates = field(default_factory=keyframe_rates)
     means_rate_end: float = 1.6e-5  # radii, at the last step
     rate_decay: float = 0.1  # all other rates at the last step, times those at the first
+    position_noise: float = 0.0  # radii, standard deviation of the noise that the means have in each step
     appearance_from: float = 0.3  # share of the steps; exposure, poses and SH wait for colours that are about right
-    gaussians_share: float = 0.8  # of gaussians_max; the rest is left for densification while tracking
-    densify_every: int = 100  # steps between rounds of densification or pruning
+    gaussians_share: float = 0.8  # of gaussians_max; the rest is left for tracking
+    full_size_from: float = 0.4  # share of the steps; before it pictures are smaller
+    coarse_side: float = 192.0  # pixels, of the longer side of the first pictures
+    densify_every: int = 50  # steps between rounds of densification or pruning, at least
+    densify_share: float = 0.025  # of the steps, between such rounds
+    gradient_min: float = 2e-4  # screen gradient from which a Gaussian is split or cloned, halves of the image
     densify_from: float = 0.1  # share of the steps
     densify_until: float = 0.6  # share of the steps
     thin_until: float = 0.8  # share of the steps; after it the image recovers from what was removed
@@ -75,6 +93,7 @@ class KeyframeSettings:
     contribution_min: float = 5.0  # increase of the error without a Gaussian, in shares of the error per Gaussian
     mse_min: float = 1e-8  # mean squared error of an image below which shares of it mean nothing
     harmonics_gain_min: float = 0.1  # SH stay if the error grows by this share without them; their bits buy 0.04
+    harmonics_weight: float = 0.0  # of half the square of shN in the loss, over the Gaussians: few views say little
     prune_opacity: float = 0.02  # a Gaussian below it is removed
     prune_weight: float = 0.02  # largest blending weight in any view; a Gaussian below it is hidden and removed
     split_shrink: float = 1.6  # by which the scales of a Gaussian are divided when it is split

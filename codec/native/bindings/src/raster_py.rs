@@ -19,10 +19,10 @@ type Grads<'py> = (
 );
 type Crop<'py> = (
     ViewArgs,
-    ([f32; 3], Option<[f32; 3]>),
+    ([f32; 3], Option<([f32; 3], [f32; 3])>),
     (Bytes<'py>, Option<Bytes<'py>>, Option<In<'py>>),
 );
-type Value = (f64, f64, f64, f64, f64, [f64; 3]);
+type Value = (f64, f64, f64, f64, f64, [f64; 3], [f64; 3]);
 /// (image, alpha), flat
 type Picture<'py> = (Bound<'py, PyArray1<f32>>, Bound<'py, PyArray1<f32>>);
 
@@ -156,9 +156,9 @@ impl Rasterizer {
             .map_err(usage)
     }
 
-    /// One training step on a batch of crops. Returns for each crop (loss, l1, mse, ssim, mask, gradient of the gain), and
-    /// [N] the largest radii. The gradients are those of the sum of the losses. A crop is (view, (background, gain or None),
-    /// (rgb, alpha or None, weight or None)).
+    /// One training step on a batch of crops. Returns for each crop (loss, l1, mse, ssim, mask, gradient of the gain, of the
+    /// offset), and [N] the largest radii. The gradients are those of the sum of the losses. A crop is (view, (background,
+    /// (gain, offset) or None), (rgb, alpha or None, weight or None)).
     fn step<'py>(
         &mut self,
         py: Python<'py>,
@@ -175,23 +175,24 @@ impl Rasterizer {
         };
         let (step, inner) = (&mut self.step, &mut self.inner);
         let (mut values, mut radii) = (Vec::new(), vec![0.0f32; splats.len()]);
-        for (view, (background, gain), (rgb, alpha, weight)) in &crops {
+        for (view, (background, exposure), (rgb, alpha, weight)) in &crops {
             let target = TargetImage {
                 rgb: contiguous(rgb.as_slice())?,
                 alpha: alpha.as_ref().map(|a| contiguous(a.as_slice())).transpose()?,
                 weight: weight.as_ref().map(|w| contiguous(w.as_slice())).transpose()?,
+                offset: exposure.map_or([0.0; 3], |e| e.1),
             };
             let (view, background) = (
                 view.view(),
                 Background {
                     rgb: *background,
-                    gain: *gain,
+                    gain: exposure.map(|e| e.0),
                 },
             );
             let v = py
                 .detach(|| step.run(inner, &splats, &view, background, target, lambdas, &mut out))
                 .map_err(usage)?;
-            values.push((v.loss, v.image.l1, v.image.mse, v.image.ssim, v.mask, v.gain));
+            values.push((v.loss, v.image.l1, v.image.mse, v.image.ssim, v.mask, v.gain, v.offset));
             radii
                 .iter_mut()
                 .zip(inner.projected())

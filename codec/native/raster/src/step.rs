@@ -18,6 +18,8 @@ pub struct TargetImage<'a> {
     pub rgb: &'a [u8],
     pub alpha: Option<&'a [u8]>,
     pub weight: Option<&'a [f32]>,
+    /// Added by the camera to all light of the Gaussians; the loss compares what is left without it.
+    pub offset: [f32; 3],
 }
 
 #[derive(Clone, Copy)]
@@ -33,6 +35,8 @@ pub struct StepValue {
     pub loss: f64,
     /// Gradient with respect to the gain of `Background`.
     pub gain: [f64; 3],
+    /// Gradient with respect to the offset of the target.
+    pub offset: [f64; 3],
 }
 
 /// v / 255
@@ -54,7 +58,7 @@ pub struct Step {
     weight: Vec<f32>,
     grad_image: Vec<f32>,
     grad_alpha: Vec<f32>,
-    rows: Vec<[f64; 4]>, // mask and gain sums of each image row
+    rows: Vec<[f64; 7]>, // mask, gain and offset sums of each image row
 }
 
 impl Step {
@@ -77,8 +81,14 @@ impl Step {
         check_length("target rgb", target.rgb.len(), 3 * pixels)?;
         check_length("target alpha", target.alpha.map_or(pixels, <[u8]>::len), pixels)?;
         check_length("weight", target.weight.map_or(pixels, <[f32]>::len), pixels)?;
+        // gain sum(w rgb) + (1 - T) offset + T background, less the offset, is that over a background less the offset
+        let less = std::array::from_fn(|ch| background.rgb[ch] - target.offset[ch]);
+        let shifted = Background {
+            rgb: less,
+            ..background
+        };
         rasterizer.run(|r| {
-            r.forward_here(splats, view, background, true)?;
+            r.forward_here(splats, view, shifted, true)?;
             let start = Clock::start();
             let value = self.photometric_loss(r, view, background, target, lambdas)?;
             r.timings.loss = start.ms();
@@ -99,7 +109,7 @@ impl Step {
         self.target.resize(3 * n, 0.0);
         self.grad_image.resize(3 * n, 0.0);
         self.grad_alpha.resize(n, 0.0);
-        self.rows.resize(view.region.height, [0.0; 4]);
+        self.rows.resize(view.region.height, [0.0; 7]);
         self.composite(r, view, background, target, lambdas.mask);
         let weight = target.weight.map(|w| {
             let region = view.region;
@@ -118,12 +128,13 @@ impl Step {
         };
         let image = self.loss.run(r.level(), pair, lambdas.ssim, &mut self.grad_image)?;
         let mask = self.rows.iter().map(|s| s[0]).sum::<f64>() / n as f64;
-        let gain = self.gain_gradient(r, view.region.width, background);
+        let (gain, offset) = self.exposure_gradient(r, view.region.width, background, target.offset);
         Ok(StepValue {
             image,
             mask,
             loss: image.loss + f64::from(lambdas.mask) * mask,
             gain,
+            offset,
         })
     }
 
@@ -148,7 +159,9 @@ impl Step {
             let at = (region.y + y) * view.width + region.x;
             let rgb = &target.rgb[3 * at..3 * (at + width)];
             let Some(alpha) = target.alpha.map(|a| &a[at..at + width]) else {
-                out.iter_mut().zip(rgb).for_each(|(o, &v)| *o = BYTE[usize::from(v)]);
+                for (o, v) in out.as_chunks_mut::<3>().0.iter_mut().zip(rgb.as_chunks::<3>().0) {
+                    *o = [0, 1, 2].map(|ch| BYTE[usize::from(v[ch])] - target.offset[ch]);
+                }
                 grad.fill(0.0);
                 sums[0] = 0.0;
                 return;
@@ -169,6 +182,7 @@ impl Step {
                         [0, 1, 2].map(|ch| BYTE[usize::from(rgb[ch])] * a + (1.0 - a) * background.rgb[ch])
                     }
                 };
+                *out = [0, 1, 2].map(|ch| out[ch] - target.offset[ch]);
                 let d = drawn - BYTE[usize::from(a)];
                 sum += d.abs();
                 *grad = slope * (f32::from(d > 0.0) - f32::from(d < 0.0));
@@ -177,31 +191,41 @@ impl Step {
         });
     }
 
-    /// sum over pixels of g . (image - T background) / gain
-    fn gain_gradient(&mut self, r: &Rasterizer, width: usize, background: Background) -> [f64; 3] {
-        let Some(gain) = background.gain else { return [0.0; 3] };
+    /// By the gain: sum over pixels of g . (image - T background) / gain; by the offset: sum of g (1 - T).
+    fn exposure_gradient(
+        &mut self,
+        r: &Rasterizer,
+        width: usize,
+        background: Background,
+        offset: [f32; 3],
+    ) -> ([f64; 3], [f64; 3]) {
+        let Some(gain) = background.gain else {
+            return ([0.0; 3], [0.0; 3]);
+        };
         let grads = self.grad_image.par_chunks(3 * width);
         let drawn = r.image().par_chunks(3 * width).zip(r.alpha().par_chunks(width));
         grads
             .zip(drawn)
             .zip(&mut self.rows)
             .for_each(|((g, (image, alpha)), sums)| {
-                let mut s = [0.0f64; 3];
+                let mut s = [0.0f64; 6];
                 for (x, a) in alpha.iter().enumerate() {
                     for ch in 0..3 {
-                        let own = image[3 * x + ch] - (1.0 - a) * background.rgb[ch];
+                        let own = image[3 * x + ch] - (1.0 - a) * (background.rgb[ch] - offset[ch]);
                         s[ch] += f64::from(g[3 * x + ch] * own);
+                        s[3 + ch] += f64::from(g[3 * x + ch] * a);
                     }
                 }
                 sums[1..].copy_from_slice(&s);
             });
-        let sum = |ch: usize| self.rows.iter().map(|s| s[1 + ch]).sum::<f64>();
-        std::array::from_fn(|ch| {
+        let sum = |i: usize| self.rows.iter().map(|s| s[1 + i]).sum::<f64>();
+        let by_gain = |ch: usize| {
             if gain[ch] == 0.0 {
                 0.0
             } else {
                 sum(ch) / f64::from(gain[ch])
             }
-        })
+        };
+        (std::array::from_fn(by_gain), std::array::from_fn(|ch| sum(3 + ch)))
     }
 }

@@ -246,7 +246,7 @@ mod tests {
             assert!((scalar.0[i] - expected).abs() < 1e-4);
         }
         for level in SimdLevel::available() {
-            let other = run(*level);
+            let other = run(level);
             assert!(other.0.iter().zip(&scalar.0).all(|(a, b)| (a - b).abs() < 1e-4));
             assert!(other.2.iter().zip(&scalar.2).all(|(a, b)| (a - b).abs() < 1e-2));
             for (a, b) in other.1.iter().flatten().zip(scalar.1.iter().flatten()) {
