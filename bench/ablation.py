@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gscodec.capture import Capture
+from gscodec.encode.settings import EncodeSettings
 from gscodec.errors import UsageError
 from gscodec.train.settings import TrackingSettings, TrainSettings, train_settings
 
@@ -106,7 +107,7 @@ def _entry(capture: Capture, name: str, preset: str, quality: float) -> dict:
     settings = variant.change(train_settings(preset, quality=quality))
     groups, seconds = train.sequence(capture, settings)
     models = train.shown(groups)
-    size, decoded, _ = train.coded(capture, groups, settings)
+    size, decoded, *_ = train.coded(capture, groups, settings, EncodeSettings(quality))
     model, stream = (train.evaluate(capture, frames) for frames in (models, decoded))
     return {
         "variant": name,

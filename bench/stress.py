@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gscodec.encode.settings import EncodeSettings
 from gscodec.model.gaussians import Gaussians
 from gscodec.model.parametric_group import ParametricGroup
 
@@ -25,6 +26,7 @@ from .procedural import Scene
 from .stress_scenes import SCENES
 
 PRESET = "fast"
+QUALITY = 50.0
 BUDGET = {"gaussians_max": 3750, "initial_points": 2000}  # for pictures of 128 x 128
 BUDGETS = {  # case -> changes of the budget
     "200 frames": {
@@ -72,7 +74,7 @@ def compare(name: str, scene: Scene, **budget) -> dict:
     """Results of one case; `budget`: changes of the training settings."""
     from gscodec.train.settings import train_settings
 
-    settings = train_settings(PRESET, **(BUDGET | budget))
+    settings = train_settings(PRESET, QUALITY, **(BUDGET | budget))
     capture = scene.capture(name)
     for camera in range(len(capture.cameras)):  # traced and cached here, so that training is timed without it
         for t in range(capture.frame_count):
@@ -80,12 +82,12 @@ def compare(name: str, scene: Scene, **budget) -> dict:
     groups, seconds = train.sequence(capture, settings)
     models = train.shown(groups)
     ours = train.evaluate(capture, models)
-    size, decoded, _ = train.coded(capture, groups, settings)
+    size, decoded, *_ = train.coded(capture, groups, settings, EncodeSettings(QUALITY))
     chosen = range(0, capture.frame_count, -(-capture.frame_count // ALONE_MOST))
     alone, alone_seconds = train.every_frame_alone(capture, chosen, settings)
     part = train.part(capture, chosen)
     theirs = train.evaluate(part, alone)
-    alone_size, _, _ = train.coded(part, [ParametricGroup(1, g) for g in alone], settings)
+    alone_size, *_ = train.coded(part, [ParametricGroup(1, g) for g in alone], settings, EncodeSettings(QUALITY))
     there = [t for t in range(capture.frame_count) if _subject(capture, t)]
     both = [(t, i) for i, t in enumerate(chosen) if t in there]
     loss = [theirs["per_frame"][i]["psnr_fg"] - ours["per_frame"][t]["psnr_fg"] for t, i in both]

@@ -28,13 +28,15 @@ from gscodec.model.camera import Camera
 from gscodec.model.gaussians import Gaussians
 from gscodec.model.parametric_group import ParametricGroup
 
+from .drawn import Rig, animated_capture
 from .machine import update_entries
 from .still import still_share
 
 RECIPES = ("gscodec", "alone", "v3")
 V3_PACKING = {"qp": 25, "raw": True}  # its default qp, and the better of its two scripts
 V3_GOP = 20  # frames in a group of V3
-KEYS = ("psnr", "psnr_fg", "ssim", "gaussians", "kb_per_frame", "flicker")
+KEYS = ("psnr", "psnr_fg", "psnr_corrected", "ssim", "vmaf", "gaussians", "kb_per_frame", "flicker")
+WORK = Path("build/bench")  # where moving splats are kept
 
 
 @dataclass(frozen=True)
@@ -46,12 +48,16 @@ class Case:
         test: names of the test cameras instead of the capture's own, which are then left out.
         scale: factor on the size of the images.
         frames: the first frames that are used; None: all.
+        splat: a static splat of the data folder instead, which `animate_splat` moves and `drawn.py` draws.
+        vmaf: it is measured too.
     """
 
     folder: str
     test: tuple[str, ...] = ()
     scale: float = 1.0
     frames: int | None = None
+    splat: str | None = None
+    vmaf: bool = False
 
     def open(self, data: Path) -> Capture:
         """The capture.
@@ -61,6 +67,9 @@ class Case:
         """
         from gscodec.capture import open_capture
 
+        if self.splat:
+            rig = Rig(width=1080, height=1440)
+            return animated_capture(Path(data) / self.splat, WORK, self.frames, rig).scaled(self.scale)
         folder = Path(data) / self.folder
         if not folder.is_dir():
             raise UsageError(f"{folder} does not exist")
@@ -72,6 +81,8 @@ CASES = {
     "lumberjack": Case("lumberjack"),
     "lumberjack-upper": Case("lumberjack", test=("cam16", "cam17", "cam18", "cam19")),  # the upper ring left out
     "stage": Case("stage"),
+    "basketball": Case("basketball", frames=60),
+    "statue-drawn": Case("", splat="splats/statue.ply", frames=40, vmaf=True),
     "pose2sim": Case("pose2sim", test=("cam04",), scale=0.25, frames=10),
 }
 
@@ -102,7 +113,7 @@ class Run:
     recipe: str
     preset: str
     frames: str | None
-    quality: float
+    quality: float | None
 
 
 def run(runs: Iterable[Run], data: Path, out: Path) -> Iterator[dict]:
@@ -121,14 +132,16 @@ def measure(run: Run, data: Path) -> Iterator[dict]:
     Raises:
         UsageError: the capture is not in the data folder.
     """
-    from gscodec.train.settings import train_settings
+    from gscodec.encode.settings import EncodeSettings
+    from gscodec.train.settings import LOSS, train_settings
 
     capture = CASES[run.case].open(data)
     chosen = range(capture.frame_count)[slice(*(int(x) if x else None for x in (run.frames or ":").split(":")))]
-    settings = train_settings(run.preset, quality=run.quality)
+    settings = train_settings(run.preset, run.quality)
+    encoding = EncodeSettings(run.quality, loss=LOSS[run.preset])
     recipe = {"gscodec": _ours, "alone": _alone, "v3": _v3}[run.recipe]
-    for name, seconds, size, models, *more in recipe(capture, chosen, settings):
-        result = evaluate(part(capture, chosen), models)
+    for name, seconds, size, models, *more in recipe(capture, chosen, settings, encoding):
+        result = evaluate(part(capture, chosen), models, vmaf=CASES[run.case].vmaf)
         yield {
             "capture": run.case,
             "recipe": name,
@@ -144,26 +157,27 @@ def measure(run: Run, data: Path) -> Iterator[dict]:
         }
 
 
-def _ours(capture: Capture, frames: range, settings) -> Iterator[tuple]:
+def _ours(capture: Capture, frames: range, settings, encoding) -> Iterator[tuple]:
     if frames.step != 1:
         raise UsageError("gscodec follows what moves: it needs every frame, expected a range without a step")
     own = part(capture, frames)
     groups, trained = sequence(own, settings)
     yield "model", trained, None, shown(groups)
-    size, decoded, seconds = coded(own, groups, settings)
-    share, bits = still_share(groups[0], settings.quality, training_cameras(own, len(groups[0]) // 2))
-    still = {"still_gaussians": round(share, 3), "still_bits": round(bits, 4)}
-    yield "gscodec", trained + seconds, size, decoded, still
+    size, decoded, seconds, quality = coded(own, groups, settings, encoding)
+    share, bits = still_share(groups[0], quality, training_cameras(own, len(groups[0]) // 2))
+    found = {"still_gaussians": round(share, 3), "still_bits": round(bits, 4), "coded_quality": round(quality, 2)}
+    yield "gscodec", trained + seconds, size, decoded, found
 
 
-def _alone(capture: Capture, frames: range, settings) -> Iterator[tuple]:
+def _alone(capture: Capture, frames: range, settings, encoding) -> Iterator[tuple]:
     models, seconds = every_frame_alone(capture, frames, settings)
     yield "alone", seconds, None, models
-    size, decoded, more = coded(part(capture, frames), [ParametricGroup(1, g) for g in models], settings)
+    alone = [ParametricGroup(1, g) for g in models]
+    size, decoded, more, _ = coded(part(capture, frames), alone, settings, encoding)
     yield "alone-coded", seconds + more, size, decoded
 
 
-def _v3(capture: Capture, frames: range, settings) -> Iterator[tuple]:
+def _v3(capture: Capture, frames: range, settings, _) -> Iterator[tuple]:
     from .baselines import videogs
     from .baselines.v3 import train_v3
 
@@ -196,30 +210,31 @@ def training_cameras(capture: Capture, t: int) -> list[Camera]:
     return [capture.camera(i, t) for i in capture.indices("train")]
 
 
-def coded(capture: Capture, groups: list[ParametricGroup], settings) -> tuple[int, list[Gaussians], float]:
+def coded(
+    capture: Capture, groups: list[ParametricGroup], settings, encoding
+) -> tuple[int, list[Gaussians], float, float]:
     """Codes the groups, refined by the pictures of the capture where training has calibrated its cameras.
 
     Returns:
-        Bytes of the stream, its decoded frames, seconds of coding.
+        Bytes of the stream, its decoded frames, seconds of coding, the quality.
     """
     from gscodec.decode import open_stream
     from gscodec.encode.encode import StreamOutput, encode_groups, stream_config
-    from gscodec.encode.settings import EncodeSettings
     from gscodec.train.refinement import PictureRefinement
 
     degree, most = settings.sh_degree, settings.gaussians_max
     config = stream_config(fps=capture.fps, sh_degree=degree, gaussians=most, frames=settings.gop)
     with tempfile.TemporaryDirectory() as folder:
         out, start = Path(folder) / "out.gsv", time.perf_counter()
-        encode_groups(
+        report = encode_groups(
             lambda done, _: iter(groups[done:]),
             StreamOutput(out, config),
-            EncodeSettings(settings.quality),
+            encoding,
             cameras=lambda t: training_cameras(capture, t),
             refine_by_pictures=PictureRefinement(capture, settings.refinement),
         )
         seconds, stream = time.perf_counter() - start, open_stream(out)
-        return out.stat().st_size, [stream.frame(t) for t in range(stream.frame_count)], seconds
+        return out.stat().st_size, [stream.frame(t) for t in range(stream.frame_count)], seconds, report.quality
 
 
 def every_frame_alone(capture: Capture, frames: range, settings) -> tuple[list[Gaussians], float]:
@@ -257,11 +272,11 @@ def part(capture: Capture, frames: range) -> Capture:
     )
 
 
-def evaluate(capture: Capture, frames: list[Gaussians]) -> dict:
+def evaluate(capture: Capture, frames: list[Gaussians], *, vmaf: bool = False) -> dict:
     """Results on the test cameras (metrics/evaluate.py), with the mean count of Gaussians."""
     from gscodec.metrics.evaluate import evaluate_capture
 
-    result = evaluate_capture(lambda t: frames[t], capture, "test", with_vmaf=False)
+    result = evaluate_capture(lambda t: frames[t], capture, "test", with_vmaf=vmaf)
     return result | {"gaussians": int(np.mean([len(g) for g in frames]))}
 
 

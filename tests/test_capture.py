@@ -79,6 +79,14 @@ def test_pose_becomes_opencv_world_to_camera(rig):
     assert (camera.K[0, 0], camera.K[1, 1], camera.K[0, 2]) == (30, 30, 12)
 
 
+def test_near_plane_is_the_files_or_a_share_of_the_distance(rig):
+    _, data, save = rig
+    assert [c.near for c in save().cameras] == pytest.approx([0.2 * 10**0.5] * 3), "all look at the origin"
+    data["near"] = 0.5
+    data["frames"][0]["near"] = 0.25
+    assert sorted({c.near for c in save().cameras}) == [0.25, 0.5]
+
+
 def test_frame_range_and_scale(rig):
     capture = rig[2]().frames(1, None).scaled(0.5)
     assert capture.frame_count == 1

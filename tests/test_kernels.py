@@ -1,4 +1,4 @@
-"""Training kernels against their plain references: image loss, Adam and its surgery, hash grid."""
+"""Training kernels against their plain references: image loss, Adam and its surgery, trajectories, hash grid."""
 
 import numpy as np
 import pytest
@@ -8,9 +8,12 @@ torch = pytest.importorskip("torch")
 from bench.baselines.hashgrid import HashGrid  # noqa: E402
 from gscodec import _native  # noqa: E402
 from gscodec.errors import UsageError  # noqa: E402
+from gscodec.model.camera import Camera  # noqa: E402
+from gscodec.render.backend import Crop  # noqa: E402
 from gscodec.render.cpu import CpuBackend  # noqa: E402
-from gscodec.render.optimizer import Adam, AdamSettings  # noqa: E402
+from gscodec.render.optimizer import Adam, AdamSettings, TrajectoryAdam  # noqa: E402
 from gscodec.render.reference import image_loss_reference  # noqa: E402
+from gscodec.train.entropy_model import laplace_bits  # noqa: E402
 from gscodec.train.model import Model  # noqa: E402
 
 
@@ -176,3 +179,61 @@ def test_hash_grid_names_wrong_sizes():
         HashGrid(features=3)
     with pytest.raises(UsageError, match=r"expected \[N, 3\]"):
         HashGrid()(torch.zeros(3, 4))
+
+
+def test_trajectory_step_is_that_of_torch():
+    """Value, step and bits of the coefficients against plain torch; the rounding lets gradients through."""
+    rng = np.random.default_rng(0)
+    coefficients = rng.normal(0, 2, (3, 50, 3)).astype(np.float32)
+    at, scales = np.array([0.5, -0.3, 0.1], np.float32), np.array([0.4, 1.0, 3.0], np.float32)
+    grad = rng.normal(size=(50, 3)).astype(np.float32)
+    noise = rng.random(50 * 3 + 3, np.float32) - np.float32(0.5)
+    shown = CpuBackend().trajectory_sum(coefficients, at, 0.1)
+    rounded_ = np.sign(coefficients) * np.rint(np.maximum(np.abs(coefficients) - 0.1, 0))
+    np.testing.assert_allclose(shown, np.tensordot(at, rounded_, 1), atol=1e-5)
+
+    leaf, log_scales = torch.from_numpy(coefficients.copy()).requires_grad_(), torch.from_numpy(np.log(scales))
+    log_scales = log_scales[:, None, None].requires_grad_()
+    shifted = torch.from_numpy(np.stack([noise[k : k + 150].reshape(50, 3) for k in range(3)]))
+    bits = laplace_bits(leaf + shifted, log_scales)
+    loss = (torch.from_numpy(at)[:, None, None] * leaf * torch.from_numpy(grad)).sum() + 0.2 * bits.sum()
+    optimizer = torch.optim.Adam([leaf], lr=0.1, betas=(0.9, 0.99), eps=1e-8)
+    loss.backward()
+    optimizer.step()
+    adam = TrajectoryAdam(CpuBackend(), AdamSettings(eps=1e-8))
+    of_each = adam.step("means", coefficients, grad, at, (0.2, scales, noise), 0.1)
+    np.testing.assert_allclose(coefficients, leaf.detach().numpy(), atol=1e-4)
+    np.testing.assert_allclose(of_each[:, 0], bits.sum((1, 2)).detach().numpy(), rtol=1e-4)
+    np.testing.assert_allclose(0.2 * of_each[:, 1], log_scales.grad.flatten().numpy(), rtol=1e-3, atol=1e-3)
+
+
+def test_offset_of_a_camera_is_added_to_the_light_of_the_gaussians():
+    """The loss of a picture that is brighter by gain and offset, and its gradients by both."""
+    g = torch.Generator().manual_seed(5)
+    params = {
+        "means": 0.3 * torch.randn(30, 3, generator=g),
+        "quats": torch.randn(30, 4, generator=g),
+        "log_scales": torch.full((30, 3), -2.0),
+        "logit_opacities": torch.randn(30, generator=g),
+        "sh0": torch.randn(30, 3, generator=g),
+        "shN": torch.zeros(30, 0, 3),
+    }
+    camera = Camera("a", np.array([[60, 0, 32], [0, 60, 32], [0, 0, 1.0]]), np.eye(4), 64, 64)
+    camera.viewmat[2, 3] = 2.5
+    backend, background, exposure = CpuBackend(), (0.2, 0.3, 0.9), ([1.2, 0.9, 1.0], [0.05, -0.02, 0.1])
+    image, alpha = backend.render(params, camera, (0, 0, 0))
+    seen = np.float32(exposure[0]) * image + alpha[..., None] * np.float32(exposure[1])
+    rgb = np.rint(255 * (seen / np.maximum(alpha, 1e-3)[..., None]).clip(0, 1)).astype(np.uint8)
+    target = (rgb, np.rint(255 * alpha).astype(np.uint8), background)
+
+    def loss(gain, offset):
+        return backend.photometric_loss(params, [Crop(camera, *target, (gain, offset))], ssim_lambda=0, mask_lambda=0)
+
+    right, plain = loss(*exposure), loss([1] * 3, [0] * 3)
+    assert right.loss < 0.1 * plain.loss
+    for which in (0, 1):
+        up, down = (np.array([np.ones(3), np.zeros(3)]) for _ in range(2))
+        up[which, 0] += 0.01
+        down[which, 0] -= 0.01
+        slope = (loss(*up).loss - loss(*down).loss) / 0.02
+        assert plain.grad_exposure[0, which, 0] == pytest.approx(slope, abs=2e-3)

@@ -20,6 +20,7 @@ from gscodec.metrics import (
     foreground,
     haze,
     psnr,
+    psnr_corrected,
     psnr_fg,
     rising,
     ssim,
@@ -62,6 +63,14 @@ def test_psnr_fg_leaves_the_empty_outside_alone():
     assert haze(grey(100), image, alpha) == 50
     assert psnr_fg(grey(100), image, None) == psnr(grey(100), image)
     assert haze(grey(100), image, None) == 0
+
+
+def test_psnr_corrected_leaves_out_the_colour_of_a_camera():
+    image = np.random.default_rng(0).integers(40, 200, (20, 30, 3)).astype(np.uint8)
+    reference = np.rint(image * [1.1, 0.9, 1.0] + [5, 10, -8]).astype(np.uint8)
+    assert psnr(reference, image) < 30
+    assert psnr_corrected(reference, image) > 50
+    assert psnr_corrected(image, image, np.zeros((20, 30), bool)) == 100
 
 
 def test_ssim():

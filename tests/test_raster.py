@@ -138,9 +138,9 @@ def test_threads_change_no_bit():
     target = np.random.default_rng(0).integers(0, 256, (150, 203, 3), np.uint8)
     results = []
     for threads in (1, 2, 5):
-        crop = Crop(cam, target, target[..., 0], BACKGROUND, gain=(1, 0.9, 1.1))
+        crop = Crop(cam, target, target[..., 0], BACKGROUND, ((1, 0.9, 1.1), (0, 0.1, 0)))
         r = CpuBackend(threads).photometric_loss(params, [crop], mask_lambda=0.1)
-        results.append([r.loss, r.grad_gain, *r.grads.values(), *(getattr(r, s) for s in STATISTICS)])
+        results.append([r.loss, r.grad_exposure, *r.grads.values(), *(getattr(r, s) for s in STATISTICS)])
     for other in results[1:]:
         for a, b in zip(results[0], other, strict=True):
             np.testing.assert_array_equal(a, b)
@@ -206,21 +206,22 @@ def test_step_is_the_sum_of_its_parts():
     weight = rng.random((cam.height, cam.width), np.float32)
     params = scene(k=3)
     gain = torch.tensor([1.1, 0.9, 1.0], dtype=torch.float64, requires_grad=True)
+    offset = torch.tensor([0.05, -0.02, 0.0], dtype=torch.float64)
     black, alpha, _ = rasterize_reference(*params, cam)
     background = torch.tensor(BACKGROUND, dtype=torch.float64)
-    image = gain * black + (1 - alpha)[..., None] * background
+    image = gain * black + (1 - alpha)[..., None] * (background - offset)  # less the offset, as the target
     a = torch.from_numpy(mask) / 255.0
-    target = torch.from_numpy(rgb) / 255.0 * a[..., None] + (1 - a)[..., None] * background
+    target = torch.from_numpy(rgb) / 255.0 * a[..., None] + (1 - a)[..., None] * background - offset
     loss = image_loss_reference(image, target, ssim_lambda, torch.from_numpy(weight).double())
     loss = loss + mask_lambda * (alpha - a).abs().mean()
     want = torch.autograd.grad(loss, [*params, gain])
     named = {k: p.detach().float() for k, p in zip(PARAMETERS, params, strict=True)}
-    crop = Crop(cam, rgb, mask, BACKGROUND, gain.tolist(), weight)
+    crop = Crop(cam, rgb, mask, BACKGROUND, (gain.tolist(), offset.tolist()), weight)
     r = CpuBackend().photometric_loss(named, [crop], ssim_lambda=ssim_lambda, mask_lambda=mask_lambda)
     assert r.loss == pytest.approx(loss.item(), rel=1e-5)
     for w, (name, g) in zip(want, r.grads.items(), strict=False):
         assert (g - w).norm() <= 1e-3 * w.norm(), name
-    np.testing.assert_allclose(r.grad_gain[0], want[-1].numpy(), rtol=1e-4)
+    np.testing.assert_allclose(r.grad_exposure[0, 0], want[-1].numpy(), rtol=1e-4)
 
 
 def test_region_is_a_crop():
@@ -237,7 +238,11 @@ def test_batch_of_crops_is_the_sum_of_its_crops():
     rng = np.random.default_rng(1)
     rgb = rng.integers(0, 256, (cam.height, cam.width, 3), np.uint8)
     other = replace(cam, viewmat=cam.viewmat @ np.diag([-1.0, 1.0, -1.0, 1.0]))
-    crops = [Crop(cam, rgb, region=(5, 3, 20, 17)), Crop(cam, rgb, None, BACKGROUND, (1.1, 0.9, 1.0)), Crop(other, rgb)]
+    crops = [
+        Crop(cam, rgb, region=(5, 3, 20, 17)),
+        Crop(cam, rgb, None, BACKGROUND, ((1.1, 0.9, 1.0), (0, 0, 0))),
+        Crop(other, rgb),
+    ]
     batch = CpuBackend().photometric_loss(params, crops)
     single = [CpuBackend().photometric_loss(params, [crop]) for crop in crops]
     assert batch.loss == pytest.approx(sum(s.loss for s in single))
@@ -248,7 +253,7 @@ def test_batch_of_crops_is_the_sum_of_its_crops():
     np.testing.assert_allclose(batch.sum_weight, sum(s.sum_weight for s in single), rtol=1e-5)
     for name in ("max_weight", "radii"):
         np.testing.assert_array_equal(getattr(batch, name), np.max([getattr(s, name) for s in single], 0))
-    np.testing.assert_array_equal(batch.grad_gain, [s.grad_gain[0] for s in single])
+    np.testing.assert_array_equal(batch.grad_exposure, [s.grad_exposure[0] for s in single])
     with pytest.raises(UsageError, match="at least one crop"):
         CpuBackend().photometric_loss(params, [])
 

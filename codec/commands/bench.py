@@ -100,7 +100,7 @@ def train(
     recipe: Annotated[str | None, typer.Option(help="Comma-separated: gscodec, alone (every frame), v3.")] = None,
     preset: Preset = "medium",
     frames: Annotated[str | None, typer.Option(metavar="A:B:STEP", help="Only these frames.")] = None,
-    quality: Quality = 50.0,
+    quality: Quality = None,
     data: Captures = None,
     out: Results = Path("bench/results/train.json"),
     as_json: Json = False,

@@ -3,7 +3,7 @@
 from .bd_rate import bd_rate, rising
 from .codec_cameras import codec_cameras
 from .evaluate import evaluate_capture, evaluate_splats
-from .image import foreground, haze, psnr, psnr_fg, ssim
+from .image import foreground, haze, psnr, psnr_corrected, psnr_fg, ssim
 from .stability import TemporalMeter
 from .vmaf import VmafMeter
 
@@ -17,6 +17,7 @@ __all__ = [
     "foreground",
     "haze",
     "psnr",
+    "psnr_corrected",
     "psnr_fg",
     "rising",
     "ssim",

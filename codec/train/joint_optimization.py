@@ -178,7 +178,8 @@ def finetune(
     for step in range(steps):
         # The first and the last frame come twice: they have neighbours on one side only.
         order = order or run.rng.permutation([0, *range(len(frames)), len(frames) - 1]).tolist()
-        if step == round(settings.finetune.topology_at * steps):
+        enough = run.statistics.views >= settings.finetune.topology_views * len(views.train_cameras)
+        if step == round(settings.finetune.topology_at * steps) and enough:
             run.change_topology()
         loss = run.step(order.pop(), settings.finetune.rate_decay ** (step / steps))
         if on_step:

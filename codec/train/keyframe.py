@@ -14,7 +14,7 @@ import torch
 
 from ..model.rotations import quat_normalize, rotate
 from ..render.backend import RenderLoss
-from .model import Model
+from .model import REMOVED_LOGIT, Model
 from .settings import KeyframeSettings, TrainSettings
 from .views import Views, photometric_loss, view_losses
 
@@ -90,9 +90,9 @@ def train_keyframe(
     views.reset_calibration(frame, model.params["means"].numpy().mean(0, dtype=np.float64), radius)
     for step in range(steps):
         target = views.draw(frame, picture_scale(step / steps, views.largest_side, k))
-        result = photometric_loss(
-            _shaken(model.params, k.position_noise * radius, rng), target, settings, rng, views.backend
-        )
+        dropped = k.dropout * min(1.0, k.dropout_views / len(views.train_cameras)) * step / steps
+        params = _disturbed(model.params, k.position_noise * radius, dropped, rng)
+        result = photometric_loss(params, target, settings, rng, views.backend)
         stats.add(result)
         losses.append(result.loss - settings.mask_lambda * result.mask)
         progress = step / max(steps - 1, 1)
@@ -105,8 +105,8 @@ def train_keyframe(
         model.step(result.grads, {**k.rates.scaled(radius, decay), "means": means_rate})
         if step == int(k.appearance_from * steps):
             model.set_degree(settings.sh_degree)
-        if step == int(k.thin_until * steps) and not harmonics_needed(model, views, frame, settings):
-            model.set_degree(0)
+        if step == int(k.thin_until * steps):
+            model.set_degree(harmonics_degree(model, views, frame, settings))
         if (step + 1) % densify_every == 0:
             if k.densify_from * steps < step < k.densify_until * steps:
                 densify(model, stats, int(k.gaussians_share * settings.gaussians_max), rng, k)
@@ -118,13 +118,23 @@ def train_keyframe(
     return float(np.mean(losses[-len(views.train_cameras) :]))
 
 
-def _shaken(params: dict[str, torch.Tensor], size: float, rng: np.random.Generator) -> dict[str, torch.Tensor]:
-    """The same with noise of a standard deviation of `size` (world units) on the means: what holds only from where a
-    training camera stands falls apart (HiCoM, Gao et al. 2024)."""
-    if not size:
-        return params
-    noise = torch.from_numpy(rng.standard_normal(params["means"].shape, np.float32))
-    return {**params, "means": params["means"] + size * noise}
+def _disturbed(
+    params: dict[str, torch.Tensor], noise: float, dropped: float, rng: np.random.Generator
+) -> dict[str, torch.Tensor]:
+    """The Gaussians of one step, so disturbed that what holds only from where a training camera stands falls apart.
+
+    Args:
+        noise: standard deviation of what is added to the means, world units (HiCoM, Gao et al. 2024).
+        dropped: share of the Gaussians that are left out (DropGaussian, Park et al. 2025).
+    """
+    params = dict(params)
+    if noise:
+        shift = torch.from_numpy(rng.standard_normal(params["means"].shape, np.float32))
+        params["means"] = params["means"] + noise * shift
+    if dropped:
+        gone = torch.from_numpy(rng.random(len(params["means"]), np.float32) < dropped)
+        params["logit_opacities"] = torch.where(gone, REMOVED_LOGIT, params["logit_opacities"])
+    return params
 
 
 def picture_scale(progress: float, side: int, settings: KeyframeSettings) -> float:
@@ -141,12 +151,21 @@ def picture_scale(progress: float, side: int, settings: KeyframeSettings) -> flo
     return 0.5 ** int(np.log2(1 / wanted) + 0.5)
 
 
-def harmonics_needed(model: Model, views: Views, frame: int, settings: TrainSettings) -> bool:
-    """Whether the error of the training views of `frame` grows by more without spherical harmonics than their bits are
-    worth."""
-    k, plain = settings.keyframe, {**model.params, "shN": model.params["shN"][:, :0].contiguous()}
-    whole, less = (np.mean([r.mse for r in view_losses(p, views, frame, settings)]) for p in (model.params, plain))
-    return less > (1 + k.harmonics_gain_min) * max(whole, k.mse_min)
+def harmonics_degree(model: Model, views: Views, frame: int, settings: TrainSettings) -> int:
+    """The lowest degree of spherical harmonics with which the error of the training views of `frame` grows by less than
+    the bits of the others are worth."""
+    k, shN = settings.keyframe, model.params["shN"]
+
+    def error(count: int) -> float:
+        params = {**model.params, "shN": shN[:, :count].contiguous()}
+        return float(np.mean([r.mse for r in view_losses(params, views, frame, settings)]))
+
+    whole = max(error(shN.shape[1]), k.mse_min)
+    for degree in range(model.degree):
+        count = (degree + 1) ** 2 - 1
+        if error(count) <= (1 + k.harmonics_gain_min * (shN.shape[1] - count)) * whole:
+            return degree
+    return model.degree
 
 
 def _visible(model: Model, stats: Statistics, settings: KeyframeSettings) -> torch.Tensor:
