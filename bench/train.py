@@ -242,7 +242,7 @@ def every_frame_alone(capture: Capture, frames: range, settings) -> tuple[list[G
     import torch
 
     from gscodec.render.cpu import CpuBackend
-    from gscodec.train.budget import budget_of
+    from gscodec.train.budget import keyframe_budget
     from gscodec.train.initialization import initial_model
     from gscodec.train.keyframe import train_keyframe
     from gscodec.train.views import Views
@@ -251,8 +251,8 @@ def every_frame_alone(capture: Capture, frames: range, settings) -> tuple[list[G
     models, start = [], time.perf_counter()
     for frame in frames:
         views = Views(capture, settings, CpuBackend())
-        budget = budget_of(views, frame, settings.keyframe_steps, settings.budget)
-        model, radius = initial_model(capture, frame, settings.initial_points or budget.points, settings)
+        budget = keyframe_budget(views, frame, settings)
+        model, radius = initial_model(capture, frame, budget.points, settings)
         train_keyframe(model, views, frame, settings, steps=budget.steps, radius=radius)
         models.append(model.gaussians())
     return models, time.perf_counter() - start

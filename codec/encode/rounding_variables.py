@@ -26,9 +26,10 @@ class Latents:
 
     def __init__(self, latents: np.ndarray, integers: np.ndarray, thresholds: tuple, settings: RoundingSettings):
         up, down = thresholds
-        self.integers, self._thresholds = integers, thresholds
-        low, high = integers - 0.5 - down + settings.inside, integers + 0.5 + up - settings.inside
-        self.values = np.ascontiguousarray(np.clip(latents, low, high), np.float32)
+        self.integers = integers
+        self._low, self._high = ((integers + a).astype(np.float32) for a in (-0.5 - down, 0.5 + up))
+        inside = np.clip(latents, self._low + settings.inside, self._high - settings.inside)
+        self.values = np.ascontiguousarray(inside, np.float32)
         self.change = np.zeros(self.values.shape, np.int8)
 
     @property
@@ -38,8 +39,7 @@ class Latents:
 
     def round(self) -> None:
         """Sets `change` from the latents as they are now."""
-        off, (up, down) = self.values - self.integers, self._thresholds
-        self.change = (off > 0.5 + up).astype(np.int8) - (-off > 0.5 + down)
+        self.change = (self.values > self._high).astype(np.int8) - (self.values < self._low)
 
 
 class CanonicalVariable:
@@ -67,7 +67,7 @@ class CanonicalVariable:
                 found = rdo.decision_thresholds(q[own, c], weights[own, c], near, plan.price, settings.rdo)
                 thresholds[:, own, c] = found
         self.latents = Latents((wanted - self._offset) / self._step, q, thresholds, settings.rounding)
-        self._before = self._values()
+        self._before = self._values() if self._curves else None
 
     def _coded(self) -> np.ndarray:
         return self._offset + self._step * self.latents.now
@@ -77,10 +77,12 @@ class CanonicalVariable:
 
     def add(self, values: np.ndarray, t: int) -> None:
         """To `values` [N, C] of the decoded frame `t`, what has changed."""
-        values += self._values() - self._before
+        values += self._values() - self._before if self._curves else self._step * self.latents.change
 
     def by_integers(self, derivative: np.ndarray, t: int) -> np.ndarray:
         """The derivative by them, from that by the values of frame `t`."""
+        if not self._curves:
+            return derivative * self._step
         return derivative * (self._step * companding.slopes(self._coded(), self._curves))
 
     def put(self, channels: dict, trajectories: dict) -> None:

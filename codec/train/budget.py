@@ -2,16 +2,16 @@
 
 A preset is a price, the same for all scenes: of a dB in bits (below which screen gradient a Gaussian is not split, and
 above which contribution it stays) and in seconds (steps for a small picture). How many Gaussians there are follows from
-what is still wrong in the pictures; a larger picture has more of them to place and gets more steps.
+what is still wrong in the pictures; a larger picture has more of them to place, and its keyframe gets more steps.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .settings import BudgetSettings
+from .settings import BudgetSettings, TrainSettings
 from .views import Views
 
 
@@ -28,16 +28,28 @@ class Budget:
     steps: int
 
 
-def budget_of(views: Views, frame: int, steps: int, settings: BudgetSettings) -> Budget:
-    """The budget of `frame`; `steps`: of the preset, for a picture of `pixels`."""
-    covered = np.mean([_covered(views, i, frame) for i in views.train_cameras] or [0])
-    more = min(max((covered / settings.pixels) ** settings.steps_exponent, 1.0), settings.steps_most)
-    return Budget(
-        int(np.clip(settings.points_share * covered, settings.points_min, settings.points_max)), round(more * steps)
-    )
+def keyframe_budget(views: Views, frame: int, settings: TrainSettings) -> Budget:
+    """The budget of the keyframe `frame`."""
+    b, covered = settings.budget, _covered(views, frame)
+    points = settings.initial_points or int(np.clip(b.points_share * covered, b.points_min, b.points_max))
+    return Budget(points, round(min(_larger(covered, b), b.steps_most) * settings.keyframe_steps))
 
 
-def _covered(views: Views, camera: int, frame: int) -> int:
-    """Pixels of a view that show the subject, or all of them."""
-    view = views.view(camera, frame)
-    return view.rgb.shape[0] * view.rgb.shape[1] if view.alpha is None else int(np.count_nonzero(view.alpha))
+def with_frame_budget(settings: TrainSettings, views: Views, frame: int) -> TrainSettings:
+    """Settings with the steps of a tracked frame: a large picture has fewer, since each costs more, and all frames of a
+    group together refine its Gaussians."""
+    share = 1 / min(_larger(_covered(views, frame), settings.budget), settings.budget.steps_most)
+    motion, finetune = (max(1, round(share * n)) for n in (settings.motion_steps, settings.finetune_steps))
+    return replace(settings, motion_steps=motion, finetune_steps=finetune)
+
+
+def _larger(covered: float, settings: BudgetSettings) -> float:
+    """By how much the pictures of a scene are larger than those that a preset's steps are meant for, at least 1."""
+    return max((covered / settings.pixels) ** settings.steps_exponent, 1.0)
+
+
+def _covered(views: Views, frame: int) -> float:
+    """Mean number of pixels of a picture that show the scene: all of them where there are no masks."""
+    pictures = [views.view(camera, frame) for camera in views.train_cameras]
+    counts = [v.rgb.shape[0] * v.rgb.shape[1] if v.alpha is None else np.count_nonzero(v.alpha) for v in pictures]
+    return float(np.mean(counts or [0]))

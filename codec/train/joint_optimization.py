@@ -47,11 +47,13 @@ class _Finetuner:
         """One step on frame `t`, all learning rates times `decay`; returns the image loss."""
         f, group = self.settings.finetune, self.group
         frame = group.frame(t, self.views.backend, self.noise)
-        result = photometric_loss(
-            frame.params, self.views.draw(self.frames[t]), self.settings, self.rng, self.views.backend
-        )
+        target = self.views.draw(self.frames[t])
+        result = photometric_loss(frame.params, target, self.settings, self.rng, self.views.backend)
+        self.views.note(target.index, result.loss)
         self.loss += (result.loss - self.loss) * (f.loss_smoothing if self.loss else 1.0)
         self.statistics.add(result)
+        k = self.settings.keyframe
+        result.grads["shN"].add_(group.key.params["shN"], alpha=k.harmonics_weight / len(group.key))
         residuals, canonical, by_rotations = group.gradients(frame, result.grads)
         self._step_nodes(t, frame, result.grads["means"], by_rotations, decay)
         if self.settings.rate_lambda and self.rng.integers(f.rate_every) == 0:

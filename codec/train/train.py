@@ -18,7 +18,7 @@ from ..model.parametric_group import ParametricGroup
 from ..render.backend import Backend
 from ..render.cpu import CpuBackend
 from ..render.sensitivity import measured_steps
-from .budget import budget_of
+from .budget import keyframe_budget, with_frame_budget
 from .checkpoint import Checkpoint
 from .deformation_graph import Pose
 from .finetune import GroupModel
@@ -84,7 +84,7 @@ def train_groups(
         store.clear()  # an earlier run with other settings may have left some
     state = store.load(first_frame) if first_frame else None  # absent after a cut, too
     if state is not None:
-        run.subject = Subject.restored(state, run.views, settings)
+        run.subject = Subject.restored(state, run.views, run.settings)
     start = first_frame
     for segment in segments(capture.frame_count, settings.gop, random_access):
         while start < segment.stop:
@@ -108,8 +108,9 @@ class _Run:
     """State that the groups of one run share. `subject` is None where the next frame needs a keyframe."""
 
     def __init__(self, capture, settings: TrainSettings, backend: Backend, on_progress):
-        self.capture, self.settings, self.on_progress = capture, settings, on_progress
+        self.capture, self.on_progress = capture, on_progress
         self.views = Views(capture, settings, backend)
+        self.settings = with_frame_budget(settings, self.views, 0)
         self.progress = Progress(0)
         self.subject: Subject | None = None
 
@@ -162,9 +163,9 @@ class _Run:
     def _keyframe(self, frames: range) -> Subject:
         """A new subject from the first of `frames`."""
         s = self.settings
-        budget = budget_of(self.views, frames[0], s.keyframe_steps, s.budget)
+        budget = keyframe_budget(self.views, frames[0], s)
         self.progress.total += budget.steps - s.keyframe_steps
-        model, radius = initial_model(self.capture, frames[0], s.initial_points or budget.points, s)
+        model, radius = initial_model(self.capture, frames[0], budget.points, s)
         on_step = self._report(f"keyframe {frames[0]}")
         loss = train_keyframe(model, self.views, frames[0], s, steps=budget.steps, radius=radius, on_step=on_step)
         return Subject(Tracker.start(model, self.views, s, loss, frames), loss, radius)

@@ -21,7 +21,6 @@ from ..render.sensitivity import params_of
 from .calibration import Exposure, Extrinsics
 from .settings import TrainSettings
 
-CACHE_BYTES = 2 << 30  # of decoded targets: a bound on memory, with no effect on the result
 GREY = (0.5, 0.5, 0.5)  # background of images that are compared
 
 
@@ -62,13 +61,15 @@ class Views:
         self.train_cameras = capture.indices("train")
         self.exposure = Exposure(len(capture.cameras), self.train_cameras, settings, backend)
         self.extrinsics = Extrinsics(len(capture.cameras), self.train_cameras, settings, backend)
-        self._seed = settings.seed
+        self._seed, self._cache_bytes = settings.seed, settings.cache_bytes
         self._poses_learn = settings.calibration.refine_poses
         self._pose_error_min = settings.calibration.pose_error_min
         self._cache: OrderedDict[tuple, View | Target] = OrderedDict()
         self._bytes = 0
         self._order: dict[int, list[int]] = {}
         self._rounds: dict[int, int] = {}
+        self._missed: dict[int, float] = {}
+        self._worst_share, self._smoothing = settings.worst_views, settings.finetune.loss_smoothing
 
     @property
     def largest_side(self) -> int:
@@ -112,11 +113,11 @@ class Views:
         return np.floor(255 * image.clip(0, 1) + 0.5).astype(np.uint8)
 
     def _cached(self, key: tuple, load: Callable[[], View | Target]) -> View | Target:
-        """The result of `load`, cached up to CACHE_BYTES; the least recently used goes first."""
+        """The result of `load`, cached up to `cache_bytes` of the settings; the least recently used goes first."""
         if key not in self._cache:
             self._cache[key] = load()
             self._bytes += self._size(self._cache[key])
-            while self._bytes > CACHE_BYTES and len(self._cache) > 1:
+            while self._bytes > self._cache_bytes and len(self._cache) > 1:
                 _, old = self._cache.popitem(last=False)
                 self._bytes -= self._size(old)
         self._cache.move_to_end(key)
@@ -137,16 +138,27 @@ class Views:
         """Draws views in the order of a run that starts here, so that a resumed run draws the same ones."""
         self._order.clear()
         self._rounds.clear()
+        self._missed.clear()
 
     def draw(self, frame: int, scale: float = 1.0) -> Target:
-        """The next view of `frame`: every camera once, then every camera again. The order depends on the frame and on
-        nothing that was drawn before it."""
+        """The next view of `frame`: every camera once and those that miss most (`note`) once more, in random order. It
+        depends on the frame and on what was noted since `restart_order`."""
         order = self._order.get(frame)
         if not order:
             number = self._rounds[frame] = self._rounds.get(frame, 0) + 1
             rng = np.random.default_rng([self._seed, frame, number])
-            order = self._order[frame] = rng.permutation(self.train_cameras).tolist()
+            order = self._order[frame] = rng.permutation(self.train_cameras + self._worst()).tolist()
         return self.target(order.pop(), frame, scale)
+
+    def note(self, camera: int, loss: float) -> None:
+        """Notes the image loss of a step on a view of `camera`."""
+        before = self._missed.get(camera, loss)
+        self._missed[camera] = before + self._smoothing * (loss - before)
+
+    def _worst(self) -> list[int]:
+        """The share of the cameras whose views still miss most, of those that are known."""
+        count = int(self._worst_share * len(self.train_cameras))
+        return sorted(self._missed, key=lambda c: -self._missed[c])[:count]
 
     @staticmethod
     def _size(t: View | Target) -> int:

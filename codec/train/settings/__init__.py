@@ -63,8 +63,8 @@ class TrainSettings:
     Attributes:
         gop: most frames in a group.
         keyframe_steps: optimisation steps of a keyframe of small pictures (budget.py).
-        motion_steps: steps a frame for tracking.
-        finetune_steps: steps a frame for the joint fine-tuning of a group.
+        motion_steps: steps a frame for tracking, of small pictures.
+        finetune_steps: steps a frame for the joint fine-tuning of a group, of small pictures.
         gaussians_max: bound on the count of Gaussians, and so on the memory; how many there are follows from the scene.
         initial_points: of a keyframe, about; None: as the scene needs (budget.py).
         sh_degree: bound on the degree of spherical harmonics; a keyframe keeps them where they lower the error.
@@ -74,7 +74,9 @@ class TrainSettings:
         rigidity: weight of the as-rigid-as-possible term.
         rate_lambda: share by which the image loss may rise where bits fall by one share.
         quality: quantization that the rate term assumes (0 to 100).
+        worst_views: share of the cameras that are drawn twice in fine-tuning: those whose pictures still miss most.
         seed: of every random number.
+        cache_bytes: of decoded pictures held in memory, with no effect on the result.
     """
 
     gop: int = GOP
@@ -90,7 +92,9 @@ class TrainSettings:
     rigidity: float = 0.1
     rate_lambda: float = 0.4
     quality: float = 56.0
+    worst_views: float = 0.0
     seed: int = 0
+    cache_bytes: int = 2 << 30
     adam: AdamSettings = field(default_factory=AdamSettings)
     initialization: InitializationSettings = field(default_factory=InitializationSettings)
     visual_hull: VisualHullSettings = field(default_factory=VisualHullSettings)
@@ -119,12 +123,10 @@ PRESETS = {
     "slow": {"keyframe_steps": 5000, "motion_steps": 250, "finetune_steps": 500},
 }
 PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
-    "fast": {"gradient_min": 4e-4, "contribution_min": 10.0},
-    "medium": {},
-    "slow": {"gradient_min": 1e-4, "contribution_min": 2.0},
+    "fast": {"gradient_min": 5e-4, "contribution_min": 12.0},
+    "medium": {"gradient_min": 3e-4, "contribution_min": 8.0},
+    "slow": {"gradient_min": 1.5e-4, "contribution_min": 3.0},
 }
-
-
 LOSS = {"fast": 0.5, "medium": 0.3, "slow": 0.2}  # decibels that coding may cost where no quality is named
 
 
