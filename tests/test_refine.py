@@ -9,6 +9,7 @@ from synthetic import blob, coded, moved
 from gscodec import _native
 from gscodec.capture import Capture, View
 from gscodec.encode.coder import GroupCoder
+from gscodec.encode.quality_search import choose_quality
 from gscodec.encode.rounding_variables import Latents
 from gscodec.encode.settings import CompandingSettings, EncodeSettings, RoundingSettings
 from gscodec.fit import fit_groups
@@ -124,3 +125,22 @@ def test_a_trained_group_comes_nearer_to_its_pictures(frames):
     (plain, before), (refined, after) = found
     assert after > before + 0.5
     assert refined < 1.1 * plain
+
+
+def test_a_cleaner_capture_gets_a_finer_quality():
+    """Without a quality, coding costs the decibels that the settings allow, against the pictures of the capture."""
+    truth = [blob(400)]
+    cameras = [
+        replace(c, K=c.K / 8 + np.diag([0, 0, 7 / 8]), width=64, height=64, split="train") for c in codec_cameras(truth)
+    ]
+    even = np.ones((16, 3), np.float32)
+    calibration, chosen = Calibration(np.tile(np.eye(4), (16, 1, 1)), even, 0 * even), []
+    refine = PictureRefinement(pictures_of(truth, cameras, even))
+    coder = GroupCoder(EncodeSettings(layers=1), refine_by_pictures=refine)
+    for noise in (0.05, 0.2):
+        wrong = np.random.default_rng(1).normal(0, noise, truth[0].sh0.shape).astype(np.float32)
+        model = replace(truth[0], sh0=truth[0].sh0 + wrong)
+        group = replace(next(fit_groups([DenseGroup([model])])), calibration=calibration)
+        chosen.append(choose_quality(coder, group, coder.measure(group, 0), 0))
+    clean, noisy = chosen
+    assert 30 < noisy < clean - 3 < 87

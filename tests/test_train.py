@@ -488,6 +488,21 @@ def test_groups_come_out_whole_and_a_stopped_run_goes_on(capture, tmp_path):
     np.testing.assert_array_equal(rest.frame(1).means, groups[1].frame(1).means)
 
 
+def test_fine_tuning_removes_and_adds_gaussians(capture, monkeypatch):
+    """The next group goes on from them."""
+    changes = []
+    append, select = GroupModel.append, GroupModel.select
+    monkeypatch.setattr(GroupModel, "append", lambda g, c, p: (changes.append(len(p)), append(g, c, p))[1])
+    monkeypatch.setattr(GroupModel, "select", lambda g, k: (changes.append(-int((~k).sum())), select(g, k))[1])
+    eager = dataclasses.replace(TINY.keyframe, gradient_min=1e-6, contribution_min=8.0)
+    settings = dataclasses.replace(TINY, finetune_steps=40, gaussians_max=2000, keyframe=eager)
+    first, second = train_groups(capture, settings)
+    assert changes[0] > 0 > changes[1], "some were added, some removed"
+    assert len(second.parents) == len(second.canonical) >= len(first.canonical) + min(second.parents.min(), 0)
+    assert psnr_of(first.frame(2), capture, 2) > 22
+    assert psnr_of(second.frame(1), capture, 4) > 21
+
+
 def test_segments_are_trained_without_a_look_at_others(capture):
     assert segments(5, 3, 0) == [range(5)]
     assert segments(5, 3, 2) == [range(3), range(3, 5)], "a group may be longer than that"
