@@ -118,16 +118,16 @@ class TrainSettings:
 
 
 PRESETS = {
-    "fast": {"keyframe_steps": 800, "motion_steps": 100, "finetune_steps": 60},
+    "fast": {"keyframe_steps": 1200, "motion_steps": 130, "finetune_steps": 120},
     "medium": {},
     "slow": {"keyframe_steps": 5000, "motion_steps": 250, "finetune_steps": 500},
 }
 PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
-    "fast": {"gradient_min": 5e-4, "contribution_min": 12.0},
+    "fast": {"gradient_min": 4e-4, "contribution_min": 10.0},
     "medium": {"gradient_min": 3e-4, "contribution_min": 8.0},
     "slow": {"gradient_min": 1.5e-4, "contribution_min": 3.0},
 }
-LOSS = {"fast": 0.5, "medium": 0.3, "slow": 0.2}  # decibels that coding may cost where no quality is named
+LOSS = {"fast": 0.4, "medium": 0.3, "slow": 0.2}  # decibels that coding may cost where no quality is named
 
 
 def train_settings(preset: str, quality: float | None = None, **changes) -> TrainSettings:
