@@ -9,8 +9,7 @@ const clamp = (v, low, high) => Math.min(Math.max(v, low), high);
 
 const FIELD_OF_VIEW = (40 * Math.PI) / 180; // as `gscodec render`
 const PITCH_MAX = 1.5;
-const NEAR = 0.01; // of a file that names none (spec 14)
-const NEAR_MOST = 0.5; // of the distance to the target: what is looked at stays in front
+const NEAR = 0.01; // spec 14
 
 function upVector(axis) {
   const v = [0, 0, 0];
@@ -28,7 +27,7 @@ export class Camera {
     this.side = [this.up[2], this.up[0], this.up[1]];
     this.ahead = cross(this.up, this.side);
     this.references = references;
-    this.nearest = references.length ? Math.min(...references.map((c) => c.near)) : NEAR;
+    this.nearest = Math.min(...references.map((c) => c.near), references.length ? Infinity : NEAR);
     this.reset();
   }
 
@@ -46,7 +45,7 @@ export class Camera {
     this.reference = this.references[i] ?? null;
   }
 
-  // From a reference camera to the orbit that is nearest to it.
+  // From a reference camera to the nearest orbit.
   #leave() {
     const c = this.reference;
     if (!c) return;
@@ -94,7 +93,7 @@ export class Camera {
     this.distance = clamp(this.distance / factor, 0.02 * this.radius, 50 * this.radius);
   }
 
-  // The view from the same side without looking up or down.
+  // The view from the same side, level.
   level() {
     this.#leave();
     const { pitch } = this;
@@ -104,7 +103,7 @@ export class Camera {
     return view;
   }
 
-  // A wide view from `eye` towards the target, for a head that may turn.
+  // A wide view from `eye` to the target, for a head that turns.
   wide(eye) {
     const z = scale(add(this.target, eye, -1), 1 / length(add(this.target, eye, -1)));
     let x = cross(z, this.up);
@@ -113,7 +112,7 @@ export class Camera {
     return new Float32Array([1000, 1000, 200, 200, 500, 500, ...rows, NEAR]);
   }
 
-  // width, height, fx, fy, cx, cy, 12 of world-to-camera, near plane: the input of the rasterizer.
+  // width, height, fx, fy, cx, cy, 12 of world-to-camera, near: the input of the rasterizer.
   view(width, height) {
     const c = this.reference;
     if (c) {
@@ -124,7 +123,7 @@ export class Camera {
     const f = Math.min(width, height) / 2 / this.tangent;
     const eye = add(this.target, this.#back(), this.distance);
     const rows = this.#axes().flatMap((axis) => [...axis, -dot(axis, eye)]);
-    const near = Math.min(this.nearest, NEAR_MOST * this.distance);
+    const near = Math.min(this.nearest, this.distance / 2);
     return new Float32Array([width, height, f, f, width / 2, height / 2, ...rows, near]);
   }
 }

@@ -119,11 +119,11 @@ def assert_close(a, b, means=1e-6, log_scales=1e-6, angle=1e-5, opacity=1e-6, sh
 
 def encode_sequence(sequence, path, config, settings=None, **options):
     """A dense sequence -> a .gsv file; returns the report. `options` go to StreamOutput (fingerprint)."""
-    settings = settings or EncodeSettings()
+    settings = settings or EncodeSettings(50.0)
     groups = sequence.groups
 
     def fitted(done, _):
-        return fit_groups(groups, start=done, random_access=settings.random_access, quality=settings.quality)
+        return fit_groups(groups, start=done, random_access=settings.random_access, quality=50.0 if settings.quality is None else settings.quality)
 
     return encode_groups(fitted, StreamOutput(path, config, **options), settings)
 

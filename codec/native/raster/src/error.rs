@@ -21,7 +21,7 @@ pub enum RasterError {
         what: &'static str,
         limit: usize,
     },
-    Near(f32),
+    Near,
     NothingRendered,
 }
 
@@ -39,7 +39,7 @@ impl fmt::Display for RasterError {
                 r.width, r.height, r.x, r.y
             ),
             RasterError::TooMany { what, limit } => write!(f, "more than {limit} {what}"),
-            RasterError::Near(near) => write!(f, "near plane at {near}, expected a distance above 0"),
+            RasterError::Near => f.write_str("the near plane is not in front of the camera"),
             RasterError::NothingRendered => {
                 write!(f, "backward without a forward pass of these Gaussians and this view")
             }

@@ -157,7 +157,7 @@ impl View {
     /// An empty or too large image; a region that is not inside the image; a near plane that is not in front.
     pub fn check(&self) -> Result<(), RasterError> {
         if !(self.near > 0.0 && self.near.is_finite()) {
-            return Err(RasterError::Near(self.near));
+            return Err(RasterError::Near);
         }
         check_size(self.region, self.width, self.height)
     }
