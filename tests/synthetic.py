@@ -123,7 +123,8 @@ def encode_sequence(sequence, path, config, settings=None, **options):
     groups = sequence.groups
 
     def fitted(done, _):
-        return fit_groups(groups, start=done, random_access=settings.random_access, quality=50.0 if settings.quality is None else settings.quality)
+        quality = 50.0 if settings.quality is None else settings.quality
+        return fit_groups(groups, start=done, random_access=settings.random_access, quality=quality)
 
     return encode_groups(fitted, StreamOutput(path, config, **options), settings)
 
