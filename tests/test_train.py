@@ -278,7 +278,7 @@ def test_tracking_finds_the_turn(capture):
 
 def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
     x = torch.from_numpy(blob(200).means)
-    graph = NodeGraph.of(x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), FEW_NODES)
+    graph = NodeGraph.of(x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), 32, TINY.graph)
     turn = rotvec_to_quat(torch.tensor([[0.3, -0.2, 0.5]])).repeat(len(graph), 1)
     R = quat_to_matrix(turn)
     nodes = torch.einsum("nij,nj->ni", R, graph.nodes) + 1
@@ -294,7 +294,7 @@ def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
 def test_newcomers_have_nodes_of_their_own_that_change_nothing_for_others():
     x = torch.from_numpy(blob(200).means)
     spawned = 0.2 * torch.from_numpy(blob(60, seed=1).means) + torch.tensor([0.9, 0, 0])  # amid the others
-    graph = NodeGraph.of(x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), FEW_NODES)
+    graph = NodeGraph.of(x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), 32, TINY.graph)
     pose = dataclasses.replace(Pose.rest(graph), nodes=1.1 * graph.nodes)
     before, known = graph.carry(x, pose)[0], len(graph)
     shift = graph.add_nodes(spawned)
@@ -305,7 +305,7 @@ def test_newcomers_have_nodes_of_their_own_that_change_nothing_for_others():
     means, _ = graph.carry(graph.means, pose)
     np.testing.assert_array_equal(means[:200], before)
     np.testing.assert_allclose(means[200:], spawned + 3, atol=1e-5)
-    again = NodeGraph.restored(graph.state(), FEW_NODES)
+    again = NodeGraph.restored(graph.state(), TINY.graph)
     np.testing.assert_array_equal(again.carry(again.means, pose)[0], means)
 
 
@@ -326,7 +326,7 @@ def test_what_jumps_is_found_and_what_is_gone_is_not():
 def test_a_longer_group_has_more_temporal_frequencies():
     key = from_gaussians(blob(50))
     everything = torch.ones(50, dtype=torch.bool)
-    graph = NodeGraph.of(key.params["means"], torch.ones(50), 1.0, everything, dataclasses.replace(FEW_NODES, nodes=8))
+    graph = NodeGraph.of(key.params["means"], torch.ones(50), 1.0, everything, 8, TINY.graph)
     for frames, means, colours in ((4, 4, 4), (20, 10, 6), (30, 15, 9), (31, 16, 10)):
         poses = [Pose.rest(graph)] * frames
         group = GroupModel(graph, None, [key] * frames, poses, steps_for(50, 1.0), everything, TINY)

@@ -65,7 +65,7 @@ def encode(
         f"{out}: {r['frames']} frames, {r['gaussians']} Gaussians, {r['bytes']} bytes, "
         f"{r['kb_per_frame']:.2f} kB/frame, {r['bits_per_gaussian_frame']:.2f} bits per Gaussian and frame"
     )
-    if quality is None and bitrate is None and result.chosen_quality:
+    if result.chosen_quality:
         stdout.print(
             f"quality {result.quality:.1f}, at which coding costs at most {result.loss} dB of what was trained"
         )

@@ -39,8 +39,10 @@ def with_frame_budget(settings: TrainSettings, views: Views, frame: int) -> Trai
     """Settings with the steps of a tracked frame: a large picture has fewer, since each costs more, and all frames of a
     group together refine its Gaussians."""
     share = 1 / min(_larger(_covered(views, frame), settings.budget), settings.budget.steps_most)
-    motion, finetune = (max(1, round(share * n)) for n in (settings.motion_steps, settings.finetune_steps))
-    return replace(settings, motion_steps=motion, finetune_steps=finetune)
+    fewer = lambda steps: max(1, round(share * steps))  # noqa: E731
+    densification = replace(settings.densification, steps=fewer(settings.densification.steps))
+    frame = {"motion_steps": fewer(settings.motion_steps), "finetune_steps": fewer(settings.finetune_steps)}
+    return replace(settings, densification=densification, **frame)
 
 
 def _larger(covered: float, settings: BudgetSettings) -> float:

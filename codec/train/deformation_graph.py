@@ -125,6 +125,7 @@ class NodeGraph:
         sizes: torch.Tensor,
         radius: float,
         moving: torch.Tensor,
+        nodes: int,
         settings: DeformationGraphSettings,
     ) -> NodeGraph:
         """Nodes for the Gaussians of a keyframe, dense where these move and where they are small.
@@ -134,14 +135,15 @@ class NodeGraph:
             sizes: [N], proportional to the distance of nodes.
             radius: of the moving Gaussians, world units.
             moving: [N] bool.
+            nodes: at most.
         """
         low, step = means.min(0).values, settings.lattice * radius
         grid = torch.round((means - low) / step).numpy().astype(np.uint32)
         if (~moving).float().mean() < settings.still_share:  # nodes at rest among moving ones would hold these back
             moving = torch.ones_like(moving)
-        still = int(settings.still_share * settings.nodes) if (~moving).any() else 0
+        still = int(settings.still_share * nodes) if (~moving).any() else 0
         some = [np.zeros((0, 3), np.uint32)]
-        for mask, most in ((moving, settings.nodes - still), (~moving, still)):
+        for mask, most in ((moving, nodes - still), (~moving, still)):
             if mask.any() and most:
                 some.append(grid[mask.numpy()][farthest_points(means[mask].numpy(), most, sizes[mask].numpy())])
         chosen = np.unique(np.concatenate(some), axis=0)

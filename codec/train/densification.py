@@ -53,9 +53,10 @@ def spawn(
     spawned.append(_children(model, parents[gradient[parents] > s.gradient_min], rng, settings))
     if len(spawned) < s.spawn_min:
         return None
-    max_weight = _optimize(spawned, model, frame, views, settings, rng, on_step)
-    k = settings.keyframe
-    keep = (torch.sigmoid(spawned.params["logit_opacities"]) > k.prune_opacity) & (max_weight > k.prune_weight)
+    stats, k = _optimize(spawned, model, frame, views, settings, rng, on_step), settings.keyframe
+    opacities = torch.sigmoid(torch.cat([m.params["logit_opacities"] for m in (model, spawned)]))
+    keep = (opacities > k.prune_opacity) & (stats.max_weight > k.prune_weight)
+    keep = (keep & (stats.contribution(opacities) >= k.contribution_min))[len(model) :]
     if keep.sum() < s.spawn_min:
         return None
     spawned.select(keep)
@@ -65,10 +66,10 @@ def spawn(
 
 def _optimize(
     spawned: Model, others: Model, frame: int, views: Views, settings: TrainSettings, rng: np.random.Generator, on_step
-) -> torch.Tensor:
-    """Optimises `spawned` among the `others`, which stay; returns the largest blending weight of each, [N]."""
+) -> Statistics:
+    """Optimises `spawned` among the `others`, which stay; returns the statistics of all in the second half."""
     steps, k, known = settings.densification.steps, settings.keyframe, len(others)
-    radius, stats = float(others.params["means"].std(0).norm()), Statistics(len(spawned), k.mse_min)
+    radius, stats = float(others.params["means"].std(0).norm()), Statistics(known + len(spawned), k.mse_min)
     spawned.start_optimizer(views.backend, settings.adam)
     for step in range(steps):
         together = {n: torch.cat([others.params[n], spawned.params[n]]) for n in NAMES}
@@ -76,11 +77,10 @@ def _optimize(
         grads = {n: g[known:] for n, g in result.grads.items()}
         spawned.step(grads, k.rates.scaled(radius, k.rate_decay ** (step / steps)))
         if 2 * step >= steps:
-            weight = torch.as_tensor(result.max_weight)[known:]
-            torch.maximum(stats.max_weight, weight, out=stats.max_weight)
+            stats.add(result)
         if on_step:
             on_step(step, result.loss)
-    return stats.max_weight
+    return stats
 
 
 def error_masks(

@@ -37,9 +37,8 @@ class _Finetuner:
         self.canonical_rates = canonical if group.known < len(group.key) else {}
         self.node_rates = {"turn": f.node_rotation_rate, "shift": f.node_translation_rate * radius}
         self.loss = 0.0  # running mean
-        self.noise = self._noise()
-        self.canonical_bits, self.by_rate = group.canonical_rate.gradients(group.key.params, self.generator)
         self.steps = 0
+        self._draw_canonical()
         self.statistics = Statistics(len(group.key), settings.keyframe.mse_min)
         self.bits = sum(self._step_coefficients(0, None, 0.0, 0.0))
 
@@ -49,7 +48,6 @@ class _Finetuner:
         frame = group.frame(t, self.views.backend, self.noise)
         target = self.views.draw(self.frames[t])
         result = photometric_loss(frame.params, target, self.settings, self.rng, self.views.backend)
-        self.views.note(target.index, result.loss)
         self.loss += (result.loss - self.loss) * (f.loss_smoothing if self.loss else 1.0)
         self.statistics.add(result)
         k = self.settings.keyframe
@@ -69,9 +67,8 @@ class _Finetuner:
         """One step of the new canonical Gaussians along the gradients of the image and of the rate term, as that was at
         most `canonical_rate_every` steps ago."""
         s, group = self.settings, self.group
-        if self.steps % s.finetune.canonical_rate_every == 0:
-            self.noise = self._noise()
-            self.canonical_bits, self.by_rate = group.canonical_rate.gradients(group.key.params, self.generator)
+        if self.steps and self.steps % s.finetune.canonical_rate_every == 0:
+            self._draw_canonical()
         self.steps += 1
         weight = s.finetune.canonical_bit_weight * self._bit_weight()
         for n, g in grads.items():
@@ -102,8 +99,13 @@ class _Finetuner:
             group.select(keep)
             self.coefficients.select(keep.numpy())
         self.statistics = Statistics(len(group.key), k.mse_min)
+        self._draw_canonical()
+
+    def _draw_canonical(self) -> None:
+        """The noise and the bits of the canonical Gaussians, held for some steps."""
         self.noise = self._noise()
-        self.canonical_bits, self.by_rate = group.canonical_rate.gradients(group.key.params, self.generator)
+        rate = self.group.canonical_rate
+        self.canonical_bits, self.by_rate = rate.gradients(self.group.key.params, self.generator)
 
     def _noise(self) -> dict[str, torch.Tensor] | None:
         """Uniform noise in place of the quantization of the new canonical Gaussians; None: there is none."""

@@ -85,13 +85,14 @@ def train_keyframe(
     k = settings.keyframe
     rng = np.random.default_rng([settings.seed, frame])
     stats, losses = Statistics(len(model), k.mse_min), []
+    few = k.dropout * min(1.0, k.dropout_views / len(views.train_cameras)) ** 2 if views.capture.has_alpha else 0.0
     densify_every = max(k.densify_every, round(k.densify_share * steps))
     model.start_optimizer(views.backend, settings.adam)
     views.reset_calibration(frame, model.params["means"].numpy().mean(0, dtype=np.float64), radius)
     for step in range(steps):
         target = views.draw(frame, picture_scale(step / steps, views.largest_side, k))
-        dropped = k.dropout * min(1.0, k.dropout_views / len(views.train_cameras)) * step / steps
-        params = _disturbed(model.params, k.position_noise * radius, dropped, rng)
+        dropped = few * step / steps
+        params = _without_some(model.params, dropped, rng) if dropped else model.params
         result = photometric_loss(params, target, settings, rng, views.backend)
         stats.add(result)
         losses.append(result.loss - settings.mask_lambda * result.mask)
@@ -118,23 +119,11 @@ def train_keyframe(
     return float(np.mean(losses[-len(views.train_cameras) :]))
 
 
-def _disturbed(
-    params: dict[str, torch.Tensor], noise: float, dropped: float, rng: np.random.Generator
-) -> dict[str, torch.Tensor]:
-    """The Gaussians of one step, so disturbed that what holds only from where a training camera stands falls apart.
-
-    Args:
-        noise: standard deviation of what is added to the means, world units (HiCoM, Gao et al. 2024).
-        dropped: share of the Gaussians that are left out (DropGaussian, Park et al. 2025).
-    """
-    params = dict(params)
-    if noise:
-        shift = torch.from_numpy(rng.standard_normal(params["means"].shape, np.float32))
-        params["means"] = params["means"] + noise * shift
-    if dropped:
-        gone = torch.from_numpy(rng.random(len(params["means"]), np.float32) < dropped)
-        params["logit_opacities"] = torch.where(gone, REMOVED_LOGIT, params["logit_opacities"])
-    return params
+def _without_some(params: dict[str, torch.Tensor], share: float, rng: np.random.Generator) -> dict[str, torch.Tensor]:
+    """The Gaussians of one step, a random share of them left out, so that what holds only from where a training camera
+    stands falls apart (DropGaussian, Park et al. 2025)."""
+    gone = torch.from_numpy(rng.random(len(params["means"]), np.float32) < share)
+    return {**params, "logit_opacities": torch.where(gone, REMOVED_LOGIT, params["logit_opacities"])}
 
 
 def picture_scale(progress: float, side: int, settings: KeyframeSettings) -> float:

@@ -21,7 +21,7 @@ class Subject:
 
     Attributes:
         tracker: holds them as they are in the last frame.
-        loss: image loss of their keyframe, the reference for cuts.
+        loss: image loss of their keyframe.
         radius: of all Gaussians in the keyframe, world units.
         canonical: Gaussians that all groups since the keyframe refer to; None before the first is fine-tuned.
         parents: [N] index of each Gaussian in the group before.

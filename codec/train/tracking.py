@@ -82,10 +82,11 @@ class Tracker:
             changed = changes.behind(frames[1], changes.copy().advance(frames[1]), means.numpy(), visible)
             moving = changed if changed.any() else moving
         radius = subject_radius(means[moving].numpy())
-        sizes = torch.ones(len(key))
+        sizes, nodes = torch.ones(len(key)), settings.graph.nodes
         if not views.capture.has_alpha:  # there is a background
             sizes = key.params["log_scales"].sort(1).values[:, 1:].mean(1).exp()  # without the thin axis
-        graph = NodeGraph.of(means, sizes, radius, torch.from_numpy(moving), settings.graph)
+            nodes = settings.graph.nodes_of_room
+        graph = NodeGraph.of(means, sizes, radius, torch.from_numpy(moving), nodes, settings.graph)
         own = Model({**key.params, "means": torch.zeros_like(means)})
         gradient = float(torch.quantile(stats.mean_screen_gradient(), s.gradient_quantile))
         return Tracker(graph, own, views, settings, np.array([radius, loss, gradient]), changes)
@@ -180,21 +181,15 @@ class Tracker:
         self.own.select(chosen)
         self.moving = self.moving[chosen]
 
+    @torch.no_grad()
     def adopt(self, group: GroupModel) -> None:
-        """Removes and adds Gaussians as fine-tuning did; new ones as they are in the last frame."""
-        kept = torch.zeros(len(self.own), dtype=torch.bool)
-        kept[group.origin[group.origin >= 0]] = True
-        self.select(kept)
-        new = group.origin < 0
-        if not new.any():
-            return
+        """Goes on from the last frame as fine-tuning left it."""
         frame = group.frame(group.frames - 1, self.views.backend)
-        self.graph = group.graph.copy()
-        means, rotations = (x[new] for x in self.graph.carry(self.graph.means, self.pose))
-        params = {n: p[new] for n, p in frame.params.items()}
-        quats = quat_multiply(quat_conjugate(rotations), params["quats"])
-        self.own.append({**params, "means": params["means"] - means, "quats": quats})
-        self.moving = torch.cat([self.moving, torch.ones(int(new.sum()), dtype=torch.bool)])
+        new = group.origin < 0
+        self.moving = torch.where(new, True, self.moving[group.origin])
+        self.graph, self.pose = group.graph.copy(), frame.pose
+        quats = quat_multiply(quat_conjugate(frame.rotations), frame.params["quats"])
+        self.own = Model({**frame.params, "means": frame.params["means"] - frame.means, "quats": quats})
 
     def densify(self, frame: int, on_step: OnStep = None) -> None:
         """Adds the Gaussians that `frame` needs besides, after `advance`."""

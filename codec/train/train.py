@@ -61,7 +61,8 @@ def train_groups(
     """Trains `capture` from `first_frame` on and yields each group when it is done.
 
     A group continues the Gaussians of the one before (`parents`). It ends before a frame whose image loss is
-    `cut_ratio` times that of the keyframe, and the next group starts with a keyframe. It also ends before a frame in
+    `cut_ratio` times that of the frame before, or `drift_ratio` times that of the keyframe, and the next group starts
+    with a keyframe. It also ends before a frame in
     which a large fraction of the Gaussians begins to change; then the next group continues. Every segment of
     `random_access` frames starts with a keyframe: a segment depends on no frames but its own.
 
@@ -184,8 +185,9 @@ class _Run:
             long_enough = len(track.models) >= g.changed_frames_min
             if long_enough and subject.tracker.changed_fraction(frame, track.moved()) > g.changed_fraction_max:
                 return False
+            known = min(self.settings.cut_ratio * subject.tracker.loss, g.drift_ratio * subject.loss)
             loss = subject.tracker.advance(frame, self._report(f"track {frame}"))
-            if loss is not None and loss > self.settings.cut_ratio * subject.loss + g.cut_loss_floor:
+            if loss is not None and loss > known + g.cut_loss_floor:
                 return True
             if loss is not None:
                 subject.tracker.densify(frame, self._report(f"densify {frame}"))

@@ -68,8 +68,6 @@ class Views:
         self._bytes = 0
         self._order: dict[int, list[int]] = {}
         self._rounds: dict[int, int] = {}
-        self._missed: dict[int, float] = {}
-        self._worst_share, self._smoothing = settings.worst_views, settings.finetune.loss_smoothing
 
     @property
     def largest_side(self) -> int:
@@ -138,27 +136,16 @@ class Views:
         """Draws views in the order of a run that starts here, so that a resumed run draws the same ones."""
         self._order.clear()
         self._rounds.clear()
-        self._missed.clear()
 
     def draw(self, frame: int, scale: float = 1.0) -> Target:
-        """The next view of `frame`: every camera once and those that miss most (`note`) once more, in random order. It
-        depends on the frame and on what was noted since `restart_order`."""
+        """The next view of `frame`: every camera once, in random order. It depends on the frame and on how often it was
+        drawn since `restart_order`."""
         order = self._order.get(frame)
         if not order:
             number = self._rounds[frame] = self._rounds.get(frame, 0) + 1
             rng = np.random.default_rng([self._seed, frame, number])
-            order = self._order[frame] = rng.permutation(self.train_cameras + self._worst()).tolist()
+            order = self._order[frame] = rng.permutation(self.train_cameras).tolist()
         return self.target(order.pop(), frame, scale)
-
-    def note(self, camera: int, loss: float) -> None:
-        """Notes the image loss of a step on a view of `camera`."""
-        before = self._missed.get(camera, loss)
-        self._missed[camera] = before + self._smoothing * (loss - before)
-
-    def _worst(self) -> list[int]:
-        """The share of the cameras whose views still miss most, of those that are known."""
-        count = int(self._worst_share * len(self.train_cameras))
-        return sorted(self._missed, key=lambda c: -self._missed[c])[:count]
 
     @staticmethod
     def _size(t: View | Target) -> int:

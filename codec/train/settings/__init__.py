@@ -70,11 +70,10 @@ class TrainSettings:
         sh_degree: bound on the degree of spherical harmonics; a keyframe keeps them where they lower the error.
         ssim_lambda: share of D-SSIM in the image loss (3D Gaussian Splatting: 0.2).
         mask_lambda: weight of the alpha loss where the capture has masks.
-        cut_ratio: a frame whose image loss exceeds the keyframe's by this factor starts a group of its own.
+        cut_ratio: a frame whose image loss exceeds that of the frame before by this factor starts anew.
         rigidity: weight of the as-rigid-as-possible term.
         rate_lambda: share by which the image loss may rise where bits fall by one share.
         quality: quantization that the rate term assumes (0 to 100).
-        worst_views: share of the cameras that are drawn twice in fine-tuning: those whose pictures still miss most.
         seed: of every random number.
         cache_bytes: of decoded pictures held in memory, with no effect on the result.
     """
@@ -82,17 +81,16 @@ class TrainSettings:
     gop: int = GOP
     keyframe_steps: int = 2000
     motion_steps: int = 200
-    finetune_steps: int = 200
+    finetune_steps: int = 260
     gaussians_max: int = 120_000
     initial_points: int | None = None
     sh_degree: int = 3
     ssim_lambda: float = 0.2
     mask_lambda: float = 0.1
-    cut_ratio: float = 2.0
+    cut_ratio: float = 2.5
     rigidity: float = 0.1
     rate_lambda: float = 0.4
     quality: float = 56.0
-    worst_views: float = 0.0
     seed: int = 0
     cache_bytes: int = 2 << 30
     adam: AdamSettings = field(default_factory=AdamSettings)
@@ -118,7 +116,7 @@ class TrainSettings:
 
 
 PRESETS = {
-    "fast": {"keyframe_steps": 1200, "motion_steps": 130, "finetune_steps": 120},
+    "fast": {"keyframe_steps": 1200, "motion_steps": 130, "finetune_steps": 130},
     "medium": {},
     "slow": {"keyframe_steps": 5000, "motion_steps": 250, "finetune_steps": 500},
 }

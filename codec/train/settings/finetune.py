@@ -32,7 +32,7 @@ class FinetuneSettings:
     node_translation_rate: float = 3e-4  # radii
     canonical_means_rate: float = 1.6e-4  # radii
     canonical_rate_share: float = 1.0  # of the keyframe's rates, for all other canonical attributes
-    canonical_bit_weight: float = 3.0  # of a canonical bit, in bits of residuals
+    canonical_bit_weight: float = 4.0  # of a canonical bit, in bits of residuals
     canonical_noise: bool = True  # uniform noise in place of quantization, on canonical attributes
     rate_decay: float = 0.05  # rates at the last step, times those at the first
     topology_at: float = 0.3  # share of the steps at which Gaussians are removed and added

@@ -77,9 +77,8 @@ class KeyframeSettings:
     rates: LearningRates = field(default_factory=keyframe_rates)
     means_rate_end: float = 1.6e-5  # radii, at the last step
     rate_decay: float = 0.1  # all other rates at the last step, times those at the first
-    position_noise: float = 0.0  # radii, standard deviation of the noise that the means have in each step
-    dropout: float = 0.0  # share of the Gaussians that the last step leaves out, with few views
-    dropout_views: float = 4.0  # with more, the share falls as their number grows
+    dropout: float = 0.4  # share of the Gaussians that the last step leaves out, with masks and few views
+    dropout_views: float = 4.0  # with more, the share falls with the square of their number
     appearance_from: float = 0.3  # share of the steps; exposure, poses and SH wait for colours that are about right
     gaussians_share: float = 0.8  # of gaussians_max; the rest is left for tracking
     full_size_from: float = 0.4  # share of the steps; before it pictures are smaller
@@ -95,7 +94,7 @@ class KeyframeSettings:
     contribution_min: float = 5.0  # increase of the error without a Gaussian, in shares of the error per Gaussian
     mse_min: float = 1e-8  # mean squared error of an image below which shares of it mean nothing
     harmonics_gain_min: float = 0.02  # a coefficient of SH stays if the error grows by this share without it
-    harmonics_weight: float = 0.05  # of half the square of shN in the loss, over the Gaussians: few views say little
+    harmonics_weight: float = 0.15  # of half the square of shN in the loss, over the Gaussians: few views say little
     prune_opacity: float = 0.02  # a Gaussian below it is removed
     prune_weight: float = 0.02  # largest blending weight in any view; a Gaussian below it is hidden and removed
     split_shrink: float = 1.6  # by which the scales of a Gaussian are divided when it is split

@@ -22,7 +22,8 @@ class ChangeDetectionSettings:
 class DeformationGraphSettings:
     """Nodes that carry the Gaussians."""
 
-    nodes: int = 256  # 1000 track as well
+    nodes: int = 256
+    nodes_of_room: int = 640  # where there are no masks: much of what seems to move is what lies behind it
     still_share: float = 0.25  # of the nodes for Gaussians at rest, if these are as large a share of all
     blended: int = 4  # nodes that carry one Gaussian
     edges: int = 8  # neighbours of a node in the rigidity term
@@ -44,7 +45,7 @@ class TrackingSettings:
     # Light changes fast; place and shape are slow, so that the nodes take the motion.
     rates: LearningRates = field(
         default_factory=lambda: keyframe_rates().but(
-            means=3e-5, quats=6e-4, log_scales=6e-3, logit_opacities=2e-2, sh0=5e-2, shN=2.5e-3
+            means=3e-5, quats=6e-4, log_scales=6e-3, logit_opacities=6e-2, sh0=5e-2, shN=2.5e-3
         )
     )
     rate_decay: float = 0.1  # rates at the last step of a round, times those at the first
@@ -70,14 +71,14 @@ class TrackingSettings:
 class DensificationSettings:
     """Gaussians that a tracked frame adds."""
 
-    max_share: float = 0.05  # of the Gaussians, in one frame; 0: none is added
+    max_share: float = 0.1  # of the Gaussians, in one frame; 0: none is added
     spawn_min: int = 8  # fewer are not worth a unit in the stream
     steps: int = 100  # optimisation steps of the new Gaussians among the others
     gradient_min: float = 2.0  # screen gradient of a parent, times that of the keyframe
     child_opacity: float = 0.3
     error_min: float = 40.0  # grey levels: the Gaussians do not show this pixel at all
-    opening: int = 7  # pixels at the size of change detection: edges and highlights are thinner than missing parts
-    error_share_min: float = 0.002  # of the image in half of the views; an error in fewer views is a highlight
+    opening: int = 3  # pixels at the size of change detection: edges are thinner than missing parts
+    error_share_min: float = 0.001  # of the image in half of the views; an error in fewer views is a highlight
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,7 @@ class RelocalizationSettings:
 class GroupSettings:
     """Where a group ends early."""
 
+    drift_ratio: float = 8.0  # image loss over the keyframe's, with few views far too low, from which frames start anew
     cut_loss_floor: float = 0.004  # loss: clean images fit far better than they need to, and no frame is cut for it
     changed_fraction_max: float = 0.15  # of the Gaussians, that begin to change in one frame
     changed_frames_min: int = 4  # frames that a group has before `changed_fraction_max` may end it

@@ -5,7 +5,7 @@ use std::fmt;
 use crate::region::Region;
 
 /// Why a call was refused; nothing was drawn or written then.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum RasterError {
     Shape {
         name: &'static str,
