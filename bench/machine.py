@@ -1,4 +1,4 @@
-"""Result files: each opens with the machine and the commit of the measurement."""
+"""Result files: what was measured, and on which machine, at which commit, beside how much other work."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import os
 import platform
 import subprocess
+import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
@@ -32,10 +33,7 @@ def commit() -> str:
 
 def write_result(path: Path, result: dict) -> None:
     """Writes machine, commit and `result` to `path`, complete or not at all."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with part_file(path) as part:
-        part.write_text(json.dumps({"machine": machine(), "commit": commit(), **result}, indent=1) + "\n")
+    _write(path, {"machine": machine(), "commit": commit(), **result})
 
 
 def update_entries(
@@ -44,13 +42,52 @@ def update_entries(
     key: Callable[[dict], object],
     whole: Callable[[list[dict]], dict] = lambda entries: {"entries": entries},
 ) -> Iterator[dict]:
-    """Yields `entries` and puts each into the list "entries" of the JSON `path` as it comes.
+    """Yields `entries` and puts each into the list "entries" of the JSON `path` as it comes, with how it was measured:
+    machine, commit, seconds, and the cores that other processes kept busy meanwhile. Other entries stay as they are.
 
     Args:
         key: of an entry; an older entry with the same key is replaced.
         whole: list of entries -> content of the file.
     """
+    clock, entries = _Clock(), iter(entries)
     for entry in entries:
+        measured = {**machine(), "commit": commit(), **clock.lap()}
         old = json.loads(path.read_text())["entries"] if path.exists() else []
-        write_result(path, whole([*(e for e in old if key(e) != key(entry)), entry]))
+        _write(path, whole([*(e for e in old if key(e) != key(entry)), {**entry, "measured": measured}]))
         yield entry
+
+
+class _Clock:
+    """Time of this process and of the processes beside it, since the last lap."""
+
+    def __init__(self):
+        self._last = self._now()
+
+    @staticmethod
+    def _now() -> tuple[float, float, float]:
+        """Seconds by the clock, of all cores busy (0 where the system does not tell), and of this process."""
+        stat, busy = Path("/proc/stat"), 0.0
+        if stat.exists():
+            user, nice, system, *_ = (int(x) for x in stat.read_text().split()[1:9])
+            busy = (user + nice + system) / os.sysconf("SC_CLK_TCK")
+        return time.perf_counter(), busy, sum(os.times()[:4])
+
+    def lap(self) -> dict:
+        """Seconds, and cores that other processes kept busy."""
+        before, self._last = self._last, self._now()
+        wall, busy, own = (b - a for a, b in zip(before, self._last, strict=True))
+        return {"seconds": round(wall, 1), "busy_beside": round(max(0.0, busy - own) / max(wall, 1e-9), 2)}
+
+
+def stamp(entries: Iterable[dict]) -> str:
+    """One line for a chart: on what machines its entries were measured, and at which commits."""
+    measured = [e["measured"] for e in entries if "measured" in e]
+    machines = sorted({f"{m['cpu']}, {m['cores']} cores" for m in measured})
+    return "; ".join([*machines, "commit " + ", ".join(sorted({m["commit"] for m in measured}))])
+
+
+def _write(path: Path, result: dict) -> None:
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with part_file(path) as part:
+        part.write_text(json.dumps(result, indent=1) + "\n")

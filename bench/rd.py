@@ -28,7 +28,7 @@ from gscodec.model.gaussians import Gaussians
 from gscodec.model.parametric_group import ParametricGroup
 
 from .baselines import BASELINES, Baseline
-from .machine import commit, update_entries
+from .machine import update_entries
 from .sequences import SINGLE, open_case
 
 OURS = "gscodec"
@@ -108,7 +108,6 @@ def measure(sequence_name: str, codec: str, data: Path, work: Path) -> Iterator[
             "encode_s_per_frame": round(coded.encode_s / coded.frames, 4),
             "decode_ms_per_frame": round(1000 * coded.decode_s / coded.frames, 2),
             "gaussians": len(sequence.frame(0)),
-            "commit": commit(),
         }
 
 

@@ -81,7 +81,7 @@ def test_entries_replace_older_ones_and_bd_rates_follow(tmp_path):
     result = json.loads(path.read_text())
     assert len(result["entries"]) == 8
     assert result["bd_rate"][0]["percent"] == pytest.approx(-95)
-    assert {"machine", "commit", "settings"} <= set(result)
+    assert all({"cpu", "commit", "seconds", "busy_beside"} <= set(e["measured"]) for e in result["entries"])
     assert bd_rates(ours) == []
 
 

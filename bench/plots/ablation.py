@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from ..machine import stamp
+
 WHOLE = "whole recipe"
 PANELS = {"psnr_coded": "PSNR decoded, dB", "kb_per_frame": "kB a frame", "flicker": "flicker"}
 LESS, MORE = "#1f5fb4", "#c76f14"
@@ -27,7 +29,6 @@ def ablation_chart(result: dict):
             axes.set(xlabel=f"{label}, less {whole[key]:.2f} of the whole recipe")
             axes.tick_params(axis="y", length=0, labelleft=key == "psnr_coded")
         row[0].set_title(f"{capture}, {whole['frames']} frames, {whole['preset']}", loc="left", weight="bold")
-    machine = result["machine"]
-    text = f"test cameras; {machine['cpu']}, {machine['cores']} cores; commit {result['commit']}"
+    text = f"test cameras; {stamp(result['entries'])}"
     figure.text(0.995, 0.995, text, ha="right", va="top", fontsize=7, color="#888888")
     return figure

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 from gscodec.metrics import rising
 
+from ..machine import stamp
+
 OURS = "gscodec"
 LOOK = {  # codec -> (name on the chart, colour)
     OURS: ("gscodec", "#c8102e"),
@@ -178,6 +180,5 @@ def _saving(result: dict, sequence: str) -> str:
 
 
 def _footer(figure, result: dict) -> None:
-    machine = result["machine"]
-    text = f"{machine['cpu']}, {machine['cores']} cores; PSNR on every {result['settings']['psnr_every']}th frame"
+    text = f"{stamp(result['entries'])}; PSNR on every {result['settings']['psnr_every']}th frame"
     figure.text(0.995, 0.995, text, ha="right", va="top", fontsize=7, color="#888888")

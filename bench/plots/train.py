@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ..machine import stamp
+
 LOOK = {  # recipe -> name, colour
     "model": ("gscodec, before coding", "#8fb4e3"),
     "gscodec": ("gscodec", "#1f5fb4"),
@@ -29,8 +31,7 @@ def train_chart(result: dict):
             axes.set(xlabel=label, ylabel="PSNR of the subject, dB", xscale="log")
             _panel(axes, [e for e in entries if e[key]], key)
         row[0].set_title(capture, loc="left", weight="bold")
-    machine = result["machine"]
-    text = f"test cameras; {machine['cpu']}, {machine['cores']} cores; commit {result['commit']}"
+    text = f"test cameras; {stamp(result['entries'])}"
     figure.text(0.995, 0.995, text, ha="right", va="top", fontsize=7, color="#888888")
     return figure
 
