@@ -9,7 +9,17 @@ from reference_container import LEVELS, PAIRS, LimitError, Reader, require
 
 GROUP_HEADER, POSITIONS, CHANNELS, LIFETIMES, NODE_POSITIONS, NODE_TRAJECTORIES, TRAJECTORIES = range(7)
 DEATHS, LAYER_CORRECTION = 8, 9
-UNIT_TYPES = (*range(7), DEATHS, LAYER_CORRECTION)
+UNIT_NAMES = {
+    GROUP_HEADER: "group_header",
+    POSITIONS: "positions",
+    CHANNELS: "channels",
+    LIFETIMES: "lifetimes",
+    NODE_POSITIONS: "node_positions",
+    NODE_TRAJECTORIES: "node_trajectories",
+    TRAJECTORIES: "trajectories",
+    DEATHS: "deaths",
+    LAYER_CORRECTION: "layer_correction",
+}
 MUST_DEPEND_ON = {
     CHANNELS: (POSITIONS,),
     LIFETIMES: (POSITIONS, DEATHS),
@@ -23,6 +33,13 @@ ATTRIBUTES = {1: "means", 2: "log_scales", 3: "quats", 4: "logit_opacities", 5: 
 def channel_count(attribute, sh_degree):
     """Clause 3.2: C."""
     return {LOGIT_OPACITIES: 1, SHN: 3 * ((sh_degree + 1) ** 2 - 1)}.get(attribute, 3)
+
+
+def unit_name(key):
+    """(type, layer, attribute) in words."""
+    unit_type, layer, attribute = key
+    of = f" of {ATTRIBUTES.get(attribute, attribute)}" if attribute else ""
+    return f"{UNIT_NAMES[unit_type]} unit{of} in layer {layer}"
 
 
 @dataclass
@@ -61,12 +78,12 @@ def read_units(payload, layers=256):
         require(increasing, f"unit {index}: dependencies {dependencies} are not increasing indices below {index}")
         require(not units or units[-1].layer <= layer, f"unit {index}: layer {layer} after a higher one")
         unit = Unit(unit_type, layer, attribute, dependencies, body)
-        second = unit_type in UNIT_TYPES and any(unit.key() == u.key() for u in units)
-        require(not second, f"unit {index}: second unit of (type, layer, attribute) {unit.key()}")
+        second = unit_type in UNIT_NAMES and any(unit.key() == u.key() for u in units)
+        require(not second, f"unit {index}: a second {unit_name(unit.key())}, expected one" if second else "")
         if index == 0 and unit_type == GROUP_HEADER:
             sizes = [size, *read_opening(Reader(body, 0, len(body), "group_header"))[3]]
         units.append(unit)
-    require(units and units[0].key() == (GROUP_HEADER, 0, 0), "unit 0 is not the group header")
+    require(units and units[0].key() == (GROUP_HEADER, 0, 0), "unit 0 is not the group header, of layer 0")
     return units
 
 
@@ -82,19 +99,19 @@ def check_units(units, header, layers):
         optional |= {(LIFETIMES, k, 0), (LAYER_CORRECTION, k, LOG_SCALES), (LAYER_CORRECTION, k, LOGIT_OPACITIES)}
     found = {}
     for index, unit in enumerate(units):
-        if unit.unit_type not in UNIT_TYPES:
+        if unit.unit_type not in UNIT_NAMES:
             continue  # unknown: skipped
         announced = unit.key() in required | optional
-        require(announced, f"unit {index}: (type, layer, attribute) {unit.key()} is not announced by the header")
+        require(announced, f"unit {index}: the header announces no {unit_name(unit.key())}")
         on = [units[d].key() for d in unit.dependencies]
         needs = [(needed, unit.layer, 0) for needed in MUST_DEPEND_ON.get(unit.unit_type, ())]
         if unit.unit_type == CHANNELS and unit.attribute == QUATS:
             needs.append((CHANNELS, unit.layer, LOG_SCALES))
         for key in needs:
-            require(key not in required or key in on, f"unit {index}: must depend on the unit of type {key[0]}")
+            require(key not in required or key in on, f"unit {index}: must depend on a {unit_name(key)}")
         found[unit.key()] = unit.payload
     missing = sorted(required - found.keys())
-    require(not missing, f"missing unit (type, layer, attribute) {missing}")
+    require(not missing, f"expected a {unit_name(missing[0])}, found none" if missing else "")
     return found
 
 

@@ -136,6 +136,17 @@ def test_an_empty_folder_says_what_was_looked_for(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["empty"], "nothing is left behind"
 
 
+def test_a_stream_without_frames_is_refused(folder, tmp_path):
+    empty = Path(__file__).parent.parent / "spec/vectors/valid/no_groups.gsv"
+    for arguments in (("decode", empty, tmp_path / "d"), ("render", empty, tmp_path / "r"), ("eval", empty, folder)):
+        fails(run(*arguments), "no_groups.gsv has no whole frame")
+    assert not list(tmp_path.iterdir()), "nothing is left behind"
+    told = run("info", empty)
+    assert told.returncode == 0
+    assert "0 frames" in told.stdout
+    assert "per Gaussian" not in told.stdout
+
+
 def test_broken_files(folder, tmp_path):
     data = (folder / "a.gsv").read_bytes()
     broken = tmp_path / "b.gsv"

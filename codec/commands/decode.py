@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .inputs import open_stream_warning
+from .inputs import open_stream_of_frames
 from .options import StreamPath, stdout
 
 
@@ -19,7 +19,7 @@ def decode(
     """Stream to one standard 3DGS .ply per frame."""
     from ..splats import write_sequence, write_splat
 
-    s = open_stream_warning(stream)
+    s = open_stream_of_frames(stream)
     if drc:
         folder.mkdir(parents=True, exist_ok=True)
         for t in range(s.frame_count):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +11,7 @@ import typer
 
 from ..frame_range import frame_range
 from ..progress import Bar
-from .inputs import open_frames
+from .inputs import open_frames, open_stream_of_frames
 from .options import Frames, Json, SequencePath, StreamPath, stdout
 
 
@@ -47,10 +48,13 @@ def evaluate_stream(stream_path: Path, source: Path, *, split: str, frames: str 
     from ..metrics.evaluate import evaluate_capture, evaluate_splats
     from ..splats import detect_input, open_sequence
 
-    whole = open_stream(stream_path)
+    whole = open_stream_of_frames(stream_path)
     on_progress = lambda done, total: bar.update("eval", done, total)  # noqa: E731
     splats = detect_input(source) == "splats"
     reference = open_sequence(source) if splats else open_frames(source, None)
+    if whole.frame_count != reference.frame_count:
+        counts = f"{whole.name} has {whole.frame_count} frames, {source} {reference.frame_count}"
+        print(f"warning: {counts}; those that both have are compared", file=sys.stderr)
     chosen = frame_range(frames, min(whole.frame_count, reference.frame_count))
 
     def measure(stream, size: int) -> dict:
@@ -60,6 +64,8 @@ def evaluate_stream(stream_path: Path, source: Path, *, split: str, frames: str 
         return evaluate_capture(stream.frame, reference.frames(chosen.start, chosen.stop), split=split, **options)
 
     result = measure(whole, whole.byte_count)
+    if splats:
+        result["gaussians_encoded"] = len(reference.frame(chosen.start))
     later = [layer["bytes"] for layer in describe(whole)["layers"]][1:]
     if later:
         result["prefixes"] = []

@@ -31,10 +31,12 @@ def info(
         f"{stream}: {facts['frames']} frames at {facts['fps']:g} fps in {facts['groups']} groups, "
         f"{facts['gaussians']} Gaussians, SH degree {facts['sh_degree']}, level {facts['level']}"
     )
-    stdout.print(
-        f"{facts['bytes']} bytes, {facts['kb_per_frame']:.2f} kB/frame, {facts['mbit_per_s']:.2f} Mbit/s, "
-        f"{facts['bits_per_gaussian_frame']:.3f} bits per Gaussian and frame"
-    )
+    per_gaussian = facts["bits_per_gaussian_frame"]  # None where all frames are empty
+    if facts["frames"]:
+        stdout.print(
+            f"{facts['bytes']} bytes, {facts['kb_per_frame']:.2f} kB/frame, {facts['mbit_per_s']:.2f} Mbit/s"
+            + ("" if per_gaussian is None else f", {per_gaussian:.3f} bits per Gaussian and frame")
+        )
     if len(facts["layers"]) > 1:
         stdout.print("bytes of the layers: " + ", ".join(str(layer["bytes"]) for layer in facts["layers"]))
     for name, u in facts["units"].items():

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..errors import UsageError
 from ..frame_range import frame_range
 
 if TYPE_CHECKING:
@@ -42,4 +43,16 @@ def open_stream_warning(path: Path) -> Stream:
             f"warning: {stream.name} is unfinished or cut short; its {stream.frame_count} whole frames are used",
             file=sys.stderr,
         )
+    return stream
+
+
+def open_stream_of_frames(path: Path) -> Stream:
+    """As `open_stream_warning`, a stream with at least one whole frame.
+
+    Raises:
+        UsageError: it has none.
+    """
+    stream = open_stream_warning(path)
+    if not stream.frame_count:
+        raise UsageError(f"{stream.name} has no whole frame, expected at least one group; encode it (further) first")
     return stream

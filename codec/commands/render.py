@@ -9,7 +9,7 @@ import typer
 
 from ..frame_range import frame_range
 from ..progress import Bar
-from .inputs import open_stream_warning
+from .inputs import open_stream_of_frames
 from .options import Frames, StreamPath, stdout
 
 
@@ -23,7 +23,7 @@ def render(
     """Render a stream on the CPU to a video or images."""
     from ..render.movie import render_stream
 
-    s = open_stream_warning(stream)
+    s = open_stream_of_frames(stream)
     with Bar() as bar:
         count = render_stream(s, dest, camera=camera, size=size, frames=frame_range(frames, s.frame_count), bar=bar)
     stdout.print(f"{dest}: {count} frames")

@@ -14,7 +14,7 @@ def describe(stream: Stream) -> dict:
     """Facts of a whole file.
 
     `units` maps a unit's name to bytes, share of the file and bits per Gaussian and group; `layers` the bytes of
-    each layer.
+    each layer. A file without frames has no rates (None).
     """
     units: dict[str, int] = {}
     layers: dict[int, int] = {}
@@ -36,7 +36,7 @@ def describe(stream: Stream) -> dict:
             name = " ".join(x for x in (u["type"], u["attribute"]) if x)
             units[name] = units.get(name, 0) + u["bytes"]
             layers[u["layer"]] = layers.get(u["layer"], 0) + u["bytes"]
-    total, frames = stream.byte_count, max(stream.frame_count, 1)
+    total, frames = stream.byte_count, stream.frame_count
     units["container"] = total - sum(units.values())
     coded = max(sum(g["gaussians"] for g in groups), 1)
     return {
@@ -45,9 +45,9 @@ def describe(stream: Stream) -> dict:
         "groups": len(groups),
         "gaussians": most,
         "bytes": total,
-        "kb_per_frame": total / frames / 1000,
-        "mbit_per_s": 8e-6 * total / frames * stream.fps,
-        "bits_per_gaussian_frame": 8 * total / max(gaussian_frames, 1),
+        "kb_per_frame": total / frames / 1000 if frames else None,
+        "mbit_per_s": 8e-6 * total / frames * stream.fps if frames else None,
+        "bits_per_gaussian_frame": 8 * total / gaussian_frames if gaussian_frames else None,
         "sh_degree": stream.config["sh_degree"],
         "level": stream.config["level"],
         "up": stream.config["up"],

@@ -85,13 +85,13 @@ pub fn check(units: &[Unit], header: &Header, reference: Option<&Header>, layers
 }
 
 fn missing((kind, layer, attribute): UnitKey) -> String {
-    let attribute = attribute.map_or("", Attribute::name);
+    let attribute = attribute.map_or(String::new(), |a| format!(" {}", a.name()));
     let of = if layer > 0 {
         format!(" of layer {layer}")
     } else {
         String::new()
     };
-    format!("a {} unit {attribute}{of}, found none", kind.name())
+    format!("a {} unit{attribute}{of}, found none", kind.name())
 }
 
 fn claimed((i, u): (usize, &Unit)) -> Option<Damage> {
