@@ -1,0 +1,157 @@
+"""Joint fine-tuning of tiny groups: frequencies, rate terms beside the coder's bits, Gaussians added and removed."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from synthetic import blob, turning
+from synthetic import coded as one_group
+from training import TINY, capture_of, psnr_of
+
+from gscodec import _native
+from gscodec.bitstream.quantization import steps_for
+from gscodec.bitstream.quantized_group import QuantizedTrajectories
+from gscodec.encode.coded_form import coded_form
+from gscodec.encode.measure import measure_group
+from gscodec.encode.quantization_plan import plan_group
+from gscodec.encode.quantize import quantize
+from gscodec.encode.settings import EncodeSettings
+from gscodec.model.parametric_group import ParametricGroup
+from gscodec.render.cpu import CpuBackend
+from gscodec.train.deformation_graph import NodeGraph, Pose
+from gscodec.train.entropy_model import CanonicalRate, laplace_bits
+from gscodec.train.finetune import GroupModel
+from gscodec.train.model import from_gaussians
+from gscodec.train.tracking import Tracker
+from gscodec.train.train import train_groups
+from gscodec.train.views import Views
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return capture_of(turning(300, frames=5))
+
+
+def test_a_longer_group_has_more_temporal_frequencies():
+    key = from_gaussians(blob(50))
+    everything = torch.ones(50, dtype=torch.bool)
+    graph = NodeGraph.of(key.params["means"], torch.ones(50), 1.0, everything, 8, TINY.graph)
+    for frames, means, colours in ((4, 4, 4), (20, 10, 6), (30, 15, 9), (31, 16, 10)):
+        poses = [Pose.rest(graph)] * frames
+        group = GroupModel(graph, None, [key] * frames, poses, steps_for(50, 1.0), everything, TINY)
+        assert len(group.coefficients["means"]) == means
+        assert len(group.coefficients["sh0"]) == colours
+
+
+def test_laplace_bits_are_code_lengths():
+    x = torch.arange(-200, 201).float()
+    for b in (0.1, 0.5, 2.0, 20.0):
+        bits = laplace_bits(x, torch.tensor(np.log(b)))
+        assert torch.exp2(-bits.double()).sum() == pytest.approx(1, abs=1e-3)
+    assert laplace_bits(x, torch.tensor(20.0)).isfinite().all(), "no law is too wide"
+    x = torch.tensor([0.3, 2.0, -7.0, 300.0], requires_grad=True)
+    laplace_bits(x, torch.tensor(-1.0)).sum().backward()
+    assert (x.grad * x.detach() > 0).all(), "every coefficient is pulled to zero, however far away"
+    x = torch.tensor([[-3.2, -0.4, 0.1], [0.45, 0.7, 25.0]], dtype=torch.double, requires_grad=True)
+    log_scale = torch.tensor([[-1.0], [0.7]], dtype=torch.double, requires_grad=True)
+    assert torch.autograd.gradcheck(laplace_bits, (x, log_scale)), "the closed form of its derivatives"
+
+
+def test_rate_term_tracks_the_coders_bits():
+    """The loss and the coder agree on what a set of residual trajectories costs, up to 20 %."""
+    sequence = turning(6000, frames=4)
+    _, integers = one_group(sequence.groups[0], 50, keep_all=True)
+    n = len(integers)
+    rng = np.random.default_rng(0)
+    predicted, coded = [], []
+    for scale in (0.15, 0.4, 1.0, 3.0):
+        c = np.rint(rng.laplace(0, scale, (2, 3, n))).astype(np.int32)
+        trajectories = {"means": QuantizedTrajectories(c, 0.01)}
+        units = _native.encode_group(dataclasses.replace(integers, trajectories=trajectories))[1]
+        coded.append(8 * sum(u["bytes"] for u in units if u["type"] == "trajectories"))
+        x = torch.from_numpy(c).float()
+        log_scale = torch.zeros(2, 1, 1, requires_grad=True)
+        optimizer = torch.optim.Adam([log_scale], lr=0.1)
+        for _ in range(100):
+            optimizer.zero_grad()
+            total = laplace_bits(x, log_scale).sum()
+            total.backward()
+            optimizer.step()
+        predicted.append(total.item())
+    assert np.corrcoef(predicted, coded)[0, 1] > 0.99
+    np.testing.assert_allclose(predicted, coded, rtol=0.2)
+
+
+def test_canonical_rate_is_what_the_coder_pays_and_falls_along_its_gradient():
+    """Estimated and coded bits of each attribute; coded bits after a descent on nothing but the rate."""
+    model, steps = from_gaussians(blob(3000, sh_count=3)), steps_for(62, 1.0)
+    rate, noise = CanonicalRate(model.params["means"], steps, TINY.entropy_model), torch.Generator().manual_seed(0)
+    names = ("quats", "log_scales", "logit_opacities", "sh0", "shN")
+    estimated, before = rate.bits(model.params, noise), coded_bits(rate, model, 62)
+    for name in names:
+        assert estimated[name].item() == pytest.approx(before[name], rel=0.15), name
+    model.start_optimizer(CpuBackend(), TINY.adam)
+    for _ in range(60):
+        rates = {n: 0.1 * steps[n] for n in names}
+        model.step(rate.gradients(model.params, noise)[1], rates)
+    after = coded_bits(rate, model, 62)
+    for name in names:
+        assert after[name] < 0.97 * before[name], name
+
+
+def test_rate_of_one_gaussian_is_finite():
+    model = from_gaussians(blob(1))
+    rate = CanonicalRate(model.params["means"], steps_for(50, 1.0), TINY.entropy_model)
+    _, grads = rate.gradients(model.params, torch.Generator().manual_seed(0))
+    assert all(torch.isfinite(g).all() for g in grads.values())
+
+
+def coded_bits(rate, model, quality):
+    """Bits of each attribute's channels at the steps of `rate`."""
+    group, settings = ParametricGroup(1, model.gaussians()), EncodeSettings(keep_all=True, layers=1)
+    form = coded_form(group, np.full(len(model), -1))
+    importance = measure_group(group, [], settings.plan).with_axes(form.axis_order)
+    q = quantize(form, plan_group(form, importance, quality, settings), settings.rdo)
+    channels = dict(q.integers.channels)
+    for name, x in rate.channels(model.params).items():
+        values = np.rint(x.numpy()[q.form.index].T).astype(np.int32)
+        values -= np.median(values, 1, keepdims=True).astype(np.int32)
+        channels[name] = dataclasses.replace(channels[name], values=np.ascontiguousarray(values))
+    units = _native.encode_group(dataclasses.replace(q.integers, channels=channels))[1]
+    return {u["attribute"]: 8 * u["bytes"] for u in units if u["type"] == "channels"}
+
+
+def test_fine_tuning_removes_and_adds_gaussians(capture, monkeypatch):
+    """The next group goes on from them."""
+    changes = []
+    append, select = GroupModel.append, GroupModel.select
+    monkeypatch.setattr(GroupModel, "append", lambda g, c, p: (changes.append(len(p)), append(g, c, p))[1])
+    monkeypatch.setattr(GroupModel, "select", lambda g, k: (changes.append(-int((~k).sum())), select(g, k))[1])
+    eager = dataclasses.replace(TINY.keyframe, gradient_min=1e-6, contribution_min=8.0)
+    settings = dataclasses.replace(TINY, finetune_steps=40, gaussians_max=2000, keyframe=eager)
+    first, second = train_groups(capture, settings)
+    assert changes[0] > 0 > changes[1], "some were added, some removed"
+    assert len(second.parents) == len(second.canonical) >= len(first.canonical) + min(second.parents.min(), 0)
+    assert psnr_of(first.frame(2), capture, 2) > 22
+    assert psnr_of(second.frame(1), capture, 4) > 21
+
+
+def test_a_group_goes_on_from_what_was_fine_tuned(capture):
+    """The tracker shows the last frame as the group does, whatever fine-tuning changed."""
+    key = from_gaussians(turning(300, frames=5).frame(0))
+    tracker = Tracker.start(key, Views(capture, TINY, CpuBackend()), TINY, 0.01, range(3))
+    models, poses = [tracker.model], [tracker.pose]
+    tracker.advance(1)
+    models.append(tracker.model)
+    poses.append(tracker.pose)
+    everything = torch.ones(len(key), dtype=torch.bool)
+    group = GroupModel(tracker.graph, None, models, poses, steps_for(50, 1.0), everything, TINY)
+    group.turns[1] += 0.1
+    group.key.params["sh0"] += 0.2
+    group.append({n: p[:20].clone() for n, p in group.key.params.items()}, torch.arange(20))
+    tracker.adopt(group)
+    shown, model = group.frame(1, CpuBackend()).params, tracker.model.params
+    for name, values in shown.items():
+        np.testing.assert_allclose(model[name].detach().numpy(), values.detach().numpy(), atol=2e-5, err_msg=name)
+    assert len(tracker.moving) == 320

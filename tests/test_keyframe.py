@@ -1,0 +1,189 @@
+"""Keyframes of tiny captures with known truth: initial points, calibration, densification, harmonics."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from synthetic import blob, turning
+from training import TINY, arc, capture_of, psnr_of, rig, splat_wall
+
+from bench.train import coded
+from gscodec.capture.capture import Capture
+from gscodec.capture.images import View
+from gscodec.encode.settings import EncodeSettings
+from gscodec.model.camera import meeting_point
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.render.cpu import CpuBackend
+from gscodec.render.image import render_image, render_rgba
+from gscodec.train.calibration import Extrinsics
+from gscodec.train.initialization import initial_model
+from gscodec.train.keyframe import Statistics, densify, prune, train_keyframe
+from gscodec.train.model import from_gaussians
+from gscodec.train.plane_sweep import shell, sweep
+from gscodec.train.train import train_groups
+from gscodec.train.views import Views
+from gscodec.train.visual_hull import hull_points, project
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return capture_of(turning(300, frames=5))
+
+
+def test_axes_meet_where_the_cameras_look():
+    np.testing.assert_allclose(meeting_point(rig()), 0, atol=1e-6)
+
+
+def test_hull_lies_on_the_subject(capture):
+    views = [(c, capture.view(i, 0).rgb, capture.view(i, 0).alpha) for i, c in enumerate(capture.cameras)]
+    points, colors = hull_points(capture.cameras, views, 500, TINY.visual_hull)
+    assert 300 < len(points) < 800
+    distance = np.linalg.norm(points, axis=1)
+    assert np.median(distance) == pytest.approx(1.1, abs=0.2), "a sphere of radius 1, and the width of its Gaussians"
+    assert colors.min() >= 0
+    assert colors.max() <= 1
+
+
+def test_sweep_finds_a_textured_wall():
+    """A wall y = 0 of coloured splats, seen from an arc in front of it: the points lie on it, the shell far behind."""
+    wall, cameras = splat_wall(), arc()
+    views = [(c, render_image(wall, c, (0, 0, 0)), None) for c in cameras]
+    points, colors = sweep(views, 1000, 0, TINY.plane_sweep)
+    assert len(points) == len(colors) == 1000
+    assert (np.abs(points[:, 1]) < 0.22).mean() > 0.9, "a plane and a half: they are 0.15 apart there"
+    behind, _ = shell(views, TINY.plane_sweep)
+    assert len(behind) > 5
+    assert (behind[:, 1] > 8).all()
+
+
+def test_initial_points_do_without_shell_or_sweep():
+    """The ablations of the initial points, by settings alone."""
+    wall = splat_wall()
+    cameras = [dataclasses.replace(c, split="train") for c in arc()]
+    read = lambda camera, _: View(render_image(wall, cameras[camera], (0, 0, 0)), None)  # noqa: E731
+    capture = Capture("wall", 25.0, cameras, 1, False, read)
+    no_shell = dataclasses.replace(TINY, plane_sweep=dataclasses.replace(TINY.plane_sweep, shell_points=0))
+    no_sweep = dataclasses.replace(TINY, initialization=dataclasses.replace(TINY.initialization, use_plane_sweep=False))
+    with_shell, without, random = (initial_model(capture, 0, 300, s)[0] for s in (TINY, no_shell, no_sweep))
+    assert len(with_shell) > len(without) == TINY.initial_points
+    opacities = [float(torch.sigmoid(m.params["logit_opacities"][0])) for m in (without, random)]
+    assert opacities == pytest.approx([TINY.initialization.surface_opacity, TINY.initialization.random_opacity])
+
+
+def test_projection_is_the_renderers(capture):
+    camera = capture.cameras[0]
+    g = blob(1)
+    g = dataclasses.replace(
+        g, means=np.array([[0.3, 0.2, 0.1]], np.float32), log_scales=np.full((1, 3), -4, np.float32)
+    )
+    alpha = render_rgba(g, camera)[..., 3]
+    y, x = np.unravel_index(alpha.argmax(), alpha.shape)
+    p, depth = project(camera, g.means)
+    assert depth[0] > 0
+    assert np.abs(p[0] - [x + 0.5, y + 0.5]).max() <= 0.51
+
+
+@pytest.mark.parametrize("masks", [True, False])
+def test_keyframe_learns_a_view_it_has_not_seen(masks):
+    capture = capture_of(turning(300, frames=1), masks=masks)
+    points = 300 if masks else 2000  # a random box has most of its points where nothing is
+    settings = dataclasses.replace(TINY, initial_points=points, gaussians_max=2 * points)
+    model, radius = initial_model(capture, 0, points, settings)
+    losses = []
+    train_keyframe(
+        model,
+        Views(capture, settings, CpuBackend()),
+        0,
+        settings,
+        steps=200,
+        radius=radius,
+        on_step=lambda _, loss: losses.append(loss),
+    )
+    assert np.mean(losses[-20:]) < 0.6 * np.mean(losses[:20])
+    assert len(model) <= settings.gaussians_max
+    if masks:
+        assert psnr_of(model, capture, 0) > 22
+
+
+@pytest.mark.parametrize("darkest", [0.75, 1.0])
+def test_exposure_of_each_camera_is_found(darkest):
+    """Up to what all cameras share; equal ones stay equal."""
+    capture = capture_of(turning(300, frames=1))
+    gains = np.random.default_rng(2).uniform(darkest, 1, len(capture.cameras))
+
+    def dimmed(camera, frame):
+        view = capture.read(camera, frame)
+        return dataclasses.replace(view, rgb=np.rint(gains[camera] * view.rgb).astype(np.uint8))
+
+    views = Views(dataclasses.replace(capture, read=dimmed), TINY, CpuBackend())
+    model, _ = initial_model(capture, 0, 300, TINY)
+    train_keyframe(model, views, 0, TINY, steps=600, radius=1.0)
+    true = np.log(gains[:-1]) - np.log(gains[:-1]).mean()
+    np.testing.assert_allclose(views.exposure.values[:-1, :3], true[:, None] + np.zeros(3), atol=0.07)
+    gain, offset = views.exposure.of(0)
+    shown = render_image(views.exposure.applied_to(model.gaussians(), 0), capture.cameras[0], (0, 0, 0))
+    plain = render_image(model.gaussians(), capture.cameras[0], (0, 0, 0))
+    np.testing.assert_allclose(shown, plain * gain + 255 * offset * (plain.max(2, keepdims=True) > 0), atol=3)
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.03])
+def test_pose_of_each_camera_is_found(wrong):
+    """Up to what all cameras share; right ones stay as they are."""
+    capture = capture_of(turning(300, frames=1))
+    count = len(capture.cameras)
+    told, trained = Extrinsics(count, list(range(count - 1)), TINY, CpuBackend()), slice(0, -1)
+    told.values[trained] = np.random.default_rng(3).uniform(-wrong, wrong, (count - 1, 6))
+    cameras = [told.camera(i, c) for i, c in enumerate(capture.cameras)]
+    told_to = dataclasses.replace(TINY, calibration=dataclasses.replace(TINY.calibration, refine_poses=True))
+    views = Views(dataclasses.replace(capture, cameras=cameras), told_to, CpuBackend())
+    model, _ = initial_model(capture, 0, 300, TINY)
+    train_keyframe(model, views, 0, told_to, steps=400, radius=1.0)
+    left = views.extrinsics.values[trained] + told.values[trained] - told.values[trained].mean(0)
+    assert np.sqrt(np.mean(left**2)) <= max(0.5 * np.sqrt(np.mean(told.values[trained] ** 2)), 0.005)
+
+
+def glossy(gloss: float) -> GaussianSequence:
+    """Two frames of the turning blob, whose colours change by `gloss` with the direction, each in its own way: equal
+    ones would look like cameras of different brightness."""
+    group = turning(300, frames=2).groups[0]
+    shN = gloss * np.random.default_rng(4).choice([-1, 1], (300, 3, 3)).astype(np.float32)
+    frames = [dataclasses.replace(g, shN=shN) for g in group.frames]
+    return GaussianSequence(25.0, [DenseGroup(frames)])
+
+
+@pytest.mark.parametrize(("gloss", "kept"), [(0.0, 0), (0.3, 3)])
+def test_harmonics_stay_where_colours_depend_on_the_view(gloss, kept):
+    """From keyframe to stream; a whole run, since every stage has to carry them."""
+    capture = capture_of(glossy(gloss))
+    settings = dataclasses.replace(TINY, gop=2, keyframe_steps=500)
+    (group,) = train_groups(capture, settings)
+    assert [g.shN.shape[1] for g in map(group.frame, range(2))] == [kept] * 2
+    if kept:
+        plain = dataclasses.replace(group.frame(1), shN=group.frame(1).shN[:, :0])
+        assert psnr_of(group.frame(1), capture, 1) > psnr_of(plain, capture, 1) + 0.5
+    _, decoded, *_ = coded(capture, [group], settings, EncodeSettings(50.0))
+    assert decoded[1].shN.shape[1] == kept
+    assert psnr_of(decoded[1], capture, 1) > psnr_of(group.frame(1), capture, 1) - 1
+
+
+def test_growing_and_pruning_keep_the_moments_in_step():
+    model = from_gaussians(blob(100))
+    model.start_optimizer(CpuBackend(), TINY.adam)
+    model.step({n: torch.ones_like(p) for n, p in model.params.items()}, dict.fromkeys(model.params, 0.0))
+    stats = Statistics(100, 1e-8)
+    stats.screen_gradient += torch.linspace(0, 1, 100)
+    stats.seen += 1
+    stats.max_weight += 0.5
+    densify(model, stats, 105, np.random.default_rng(0), TINY.keyframe)
+    assert len(model) == 105, "no more than the most that is allowed"
+    model.params["logit_opacities"][:10] = -9
+    prune(model, Statistics(len(model), 1e-8), TINY.keyframe)
+    assert len(model) == 95
+    stats = Statistics(95, 1e-8)
+    stats.max_weight += 0.5
+    stats.squared_opacity_gradient[:90] = 1
+    prune(model, stats, TINY.keyframe, thin=True)
+    assert len(model) == 90, "what changes nothing in the picture is not worth its bits"
+    model.step({n: torch.ones_like(p) for n, p in model.params.items()}, {"means": 0.1})
+    assert torch.isfinite(model.params["means"]).all()

@@ -1,0 +1,123 @@
+"""Tracking of tiny captures with known truth: nodes, newcomers, what jumps and what is gone."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from synthetic import blob, turning
+from training import TINY, arc, capture_of, psnr_of, splat_wall
+
+from gscodec.bitstream.quantization import steps_for
+from gscodec.capture.capture import Capture
+from gscodec.capture.images import View
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.model.gaussians import concatenate
+from gscodec.model.rotations import quat_to_matrix, rotvec_to_quat
+from gscodec.render.cpu import CpuBackend
+from gscodec.render.image import render_image
+from gscodec.train.change_detection import Changes
+from gscodec.train.deformation_graph import NodeGraph, Pose
+from gscodec.train.finetune import GroupModel
+from gscodec.train.model import from_gaussians
+from gscodec.train.relocalization import relocalize
+from gscodec.train.tracking import Tracker
+from gscodec.train.views import Views
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return capture_of(turning(300, frames=5))
+
+
+def test_tracking_finds_the_turn(capture):
+    truth = turning(300, frames=5)
+    key = from_gaussians(truth.frame(0))
+    views = Views(capture, TINY, CpuBackend())
+    tracker = Tracker.start(key, views, TINY, 0.01, range(3))
+    models, poses = [tracker.model], [tracker.pose]
+    for frame in (1, 2):
+        tracker.advance(frame)
+        models.append(tracker.model)
+        poses.append(tracker.pose)
+    still = np.abs(truth.frame(2).means - truth.frame(0).means).mean()
+    missed = np.abs(truth.frame(2).means - tracker.model.params["means"].numpy()).mean()
+    assert missed < 0.25 * still, (missed, still)
+    angle = 2 * np.arccos(np.abs(tracker.pose.rotations[:, 0].numpy()).clip(0, 1))
+    assert np.median(angle) == pytest.approx(0.2, abs=0.08), "0.1 rad a frame"
+    group = GroupModel(
+        tracker.graph, None, models, poses, steps_for(50, 1.0), torch.ones(len(key), dtype=torch.bool), TINY
+    )
+    assert psnr_of(group.group(None).frame(2), capture, 2) > psnr_of(truth.frame(0), capture, 2) + 4
+    carried = group.frame(2, CpuBackend()).means.detach().numpy()
+    carried = np.abs(truth.frame(2).means - carried).mean()
+    assert carried < 0.3 * still, "the nodes have found it, not the Gaussians each for itself"
+
+
+def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
+    x = torch.from_numpy(blob(200).means)
+    graph = NodeGraph.of(x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), 32, TINY.graph)
+    turn = rotvec_to_quat(torch.tensor([[0.3, -0.2, 0.5]])).repeat(len(graph), 1)
+    R = quat_to_matrix(turn)
+    nodes = torch.einsum("nij,nj->ni", R, graph.nodes) + 1
+    pose = dataclasses.replace(Pose.rest(graph), nodes=nodes, rotations=turn)
+    means, turned = graph.carry(x, pose)
+    np.testing.assert_allclose(means, x @ R[0].T + 1, atol=1e-5)
+    np.testing.assert_allclose(turned, turn[:1].expand(200, 4), atol=1e-5)
+    assert graph.rigidity(pose) < 1e-5
+    stretched = dataclasses.replace(Pose.rest(graph), nodes=1.2 * graph.nodes)
+    assert graph.rigidity(stretched) > 0.01
+
+
+def test_newcomers_have_nodes_of_their_own_that_change_nothing_for_others():
+    x = torch.from_numpy(blob(200).means)
+    spawned = 0.2 * torch.from_numpy(blob(60, seed=1).means) + torch.tensor([0.9, 0, 0])  # amid the others
+    graph = NodeGraph.of(x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), 32, TINY.graph)
+    pose = dataclasses.replace(Pose.rest(graph), nodes=1.1 * graph.nodes)
+    before, known = graph.carry(x, pose)[0], len(graph)
+    shift = graph.add_nodes(spawned)
+    pose = pose.extended(graph.nodes[known:] - shift)
+    graph.extend(spawned + shift)
+    np.testing.assert_array_equal(graph.batch_of() == 1, np.arange(260) >= 200)
+    pose.nodes[known:] += 3
+    means, _ = graph.carry(graph.means, pose)
+    np.testing.assert_array_equal(means[:200], before)
+    np.testing.assert_allclose(means[200:], spawned + 3, atol=1e-5)
+    again = NodeGraph.restored(graph.state(), TINY.graph)
+    np.testing.assert_array_equal(again.carry(again.means, pose)[0], means)
+
+
+def test_what_jumps_is_found_and_what_is_gone_is_not():
+    """A patch in front of a wall, farther away in the next frame than any gradient reaches, then nowhere."""
+    wall, patch = splat_wall(), splat_wall(800, 2, 0.9, 0.9)
+    at = lambda x: dataclasses.replace(patch, means=patch.means + np.float32([x, -0.6, 0]))  # noqa: E731
+    frames, cameras = [concatenate([wall, at(-0.5)]), concatenate([wall, at(0.5)]), wall], arc()
+    read = lambda camera, t: View(render_image(frames[t], cameras[camera], (0, 0, 0)), None)  # noqa: E731
+    capture = Capture("patch", 25.0, cameras, 3, False, read)
+    views, model, some = Views(capture, TINY, CpuBackend()), from_gaussians(frames[0]), torch.arange(3800) >= 3000
+    changes = Changes.since(views, 0, TINY.change_detection)
+    shift = relocalize(model, some, 1, changes, changes.advance(1), TINY)
+    np.testing.assert_allclose(shift, [1, 0, 0], atol=0.25)
+    assert relocalize(model, some, 2, changes, changes.advance(2), TINY) is None
+
+
+def test_masks_say_where_nothing_is():
+    """A part of the subject is gone in frame 1, everything in frame 2: what is dead ends its lifetime."""
+    left, right = (
+        dataclasses.replace(g, means=0.4 * g.means + np.float32([x, 0, 0]), log_scales=g.log_scales - 1)
+        for g, x in ((blob(100), -0.7), (blob(100, seed=1), 0.7))
+    )
+    whole, none = concatenate([left, right]), left.take(np.zeros(0, int))
+    capture = capture_of(GaussianSequence(25.0, [DenseGroup([g]) for g in (whole, left, none, none)]))
+    tracker = Tracker.start(from_gaussians(whole), Views(capture, TINY, CpuBackend()), TINY, 0.01, range(4))
+    models, poses = [tracker.model], [tracker.pose]
+    for frame in (1, 2, 3):
+        loss = tracker.advance(frame)
+        models.append(tracker.model)
+        poses.append(tracker.pose)
+    assert loss is None
+    group = GroupModel(tracker.graph, None, models, poses, steps_for(50, 1.0), torch.zeros(200, dtype=torch.bool), TINY)
+    shown = [len(group.group(None).visible(t)) for t in range(4)]
+    assert shown[0] == 200
+    assert 80 < shown[1] < 120
+    assert shown[2:] == [0, 0]
