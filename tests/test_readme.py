@@ -1,0 +1,81 @@
+"""The figures of the README are those of bench/results."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / "README.md").read_text()
+RESULTS = ROOT / "bench" / "results"
+
+
+def result(name):
+    return json.loads((RESULTS / f"{name}.json").read_text())
+
+
+def rows(heading):
+    """Cells of the table whose first cell starts with `heading`, without its head."""
+    lines = README.split("\n")
+    first = next(i for i, line in enumerate(lines) if line.startswith(f"| {heading}"))
+    table = []
+    for line in lines[first + 2 :]:
+        if not line.startswith("|"):
+            return table
+        table.append([cell.strip() for cell in line.strip("|").split("|")])
+    return table
+
+
+def agrees(cell, value):
+    """Whether `value`, rounded as `cell` is, is what it says."""
+    return cell == "-" if value is None else float(cell) == pytest.approx(value, abs=0.51 * 10 ** -decimals(cell))
+
+
+def decimals(cell):
+    return len(re.search(r"(?:\.(\d+))?$", cell)[1] or "")
+
+
+def trained(capture, preset, recipe="gscodec"):
+    found = [
+        e
+        for e in result("train")["entries"]
+        if (e["capture"], e["preset"], e["recipe"], e["frames"][0], e["frames"][2]) == (capture, preset, recipe, 0, 1)
+        and e["quality"] is None
+    ]
+    assert len(found) == 1, (capture, preset, recipe)
+    return found[0]
+
+
+def test_table_of_training():
+    capture, keys = "", ("kb_per_frame", "psnr_fg", "psnr_corrected", "ssim")
+    table = rows("capture | preset")
+    assert len(table) >= 3
+    for name, preset, *figures in table:
+        capture = capture if name == "the same" else name.split(",")[0]
+        e, model = trained(capture, preset), trained(capture, preset, "model")
+        values = [*(e[k] for k in keys), model["psnr_fg"], e["gaussians"], e["seconds_per_frame"]]
+        assert all(map(agrees, figures, values)), (name, preset, figures, values)
+
+
+def test_tables_of_streams():
+    captures = rows("capture, medium preset")
+    keys = ("kb_per_frame", "psnr", "psnr_fg", "ssim", "vmaf", "gaussians")
+    demo, lumberjack = result("demo"), trained("lumberjack", "medium")
+    demo = [*(demo[k] for k in keys), demo["encode_seconds"] / demo["frames"]]
+    lumberjack = [*(lumberjack[k] for k in keys), lumberjack["seconds_per_frame"]]
+    for (name, *figures), values in zip(captures, (demo, lumberjack), strict=True):
+        assert all(map(agrees, figures, values)), (name, figures, values)
+    keys = ("kb_per_frame", "bits_per_gaussian_frame", "codec_psnr", "codec_psnr_fg")
+    for (name, *figures), found in zip(rows("splats, no training"), map(result, ("statue", "statue40")), strict=True):
+        values = [*(found[k] for k in keys), found["encode_seconds"] / found["frames"]]
+        assert all(map(agrees, figures, values)), (name, figures, values)
+
+
+def test_table_of_the_player():
+    streams = result("player")["streams"]
+    names = ("demo", "statue", "statue_all")
+    for (name, *figures), found in zip(rows("512 x 512, CPU path"), map(streams.get, names), strict=True):
+        shown = ("gaussians", "first_picture_ms", "fps_clock", "fps_free")
+        values = [*(found[k] for k in shown), found["decode"]["wasm_ms"], found["decode"]["ratio"]]
+        assert all(map(agrees, (f.replace(",", "") for f in figures), values)), (name, figures, values)
