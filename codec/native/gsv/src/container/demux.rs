@@ -196,7 +196,11 @@ impl Demuxer {
         let start = self.position - head;
         let fail = |expected: &str| Err(Error::bitstream(start as usize, name(&kind), expected));
         if std::mem::take(&mut self.first) && &kind != b"ftyp" {
-            return Err(Error::bitstream(start as usize, "", "a .gsv file, which starts with an ftyp box"));
+            return Err(Error::bitstream(
+                start as usize,
+                "",
+                "a .gsv file, which starts with an ftyp box",
+            ));
         }
         let body = match size {
             0 if &kind == b"mdat" => u64::MAX,
