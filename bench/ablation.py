@@ -53,7 +53,7 @@ VARIANTS = {
     "no rigidity": Variant(run_with(rigidity=0.0)),
     "no rate term": Variant(run_with(rate_lambda=0.0)),
     "no fine-tuning": Variant(run_with(finetune_steps=0)),
-    "no cuts": Variant(run_with(cut_ratio=math.inf)),
+    "no cuts": Variant(lambda s: stage_with("group", drift_ratio=math.inf)(replace(s, cut_ratio=math.inf))),
     "cut ratio 1.5": Variant(run_with(cut_ratio=1.5)),
     "cut ratio 3": Variant(run_with(cut_ratio=3.0)),
     "colours held in tracking": Variant(stage_with("tracking", rates=TRACKING.rates.but(sh0=0.0, shN=0.0))),

@@ -350,7 +350,7 @@ def decode(data):
     groups = []
     for i, sample in enumerate(samples):
         back = read_reference(read_units(sample.payload, layers=1)[0].payload)
-        require(back <= i, f"group {i}: it refers to {back} groups before, which is before the first")
+        require(back <= i, f"group {i}: it refers to the group {back} before it, which is before the first")
         require(not back or not sample.sync, f"group {i}: it is predicted, but its sample is a sync sample")
         reference = groups[i - back] if back else None
         group = decode_group(sample.payload, config.level, sample.frames, reference)

@@ -34,7 +34,11 @@ def decode_positions(payload, count, grid_bits, what):
         codes = decode_tree(payload, count, grid_bits, what)
     else:
         reader = Reader(payload, 0, len(payload), what)
-        first = reader.take(reader.u32())
+        size = reader.u32()
+        require(
+            size <= reader.end - reader.position, f"{reader.what}: the first tree has {size} bytes, more than are left"
+        )
+        first = reader.take(size)
         second = reader.take(reader.end - reader.position)
         codes = decode_tree(first, count // 2, grid_bits, what) + decode_tree(
             second, count - count // 2, grid_bits, what

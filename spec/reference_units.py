@@ -39,7 +39,7 @@ def unit_name(key):
     """(type, layer, attribute) in words."""
     unit_type, layer, attribute = key
     of = f" of {ATTRIBUTES.get(attribute, attribute)}" if attribute else ""
-    return f"{UNIT_NAMES[unit_type]} unit{of} in layer {layer}"
+    return f"{UNIT_NAMES.get(unit_type, unit_type)} unit{of} in layer {layer}"
 
 
 @dataclass
@@ -79,7 +79,7 @@ def read_units(payload, layers=256):
         require(not units or units[-1].layer <= layer, f"unit {index}: layer {layer} after a higher one")
         unit = Unit(unit_type, layer, attribute, dependencies, body)
         second = unit_type in UNIT_NAMES and any(unit.key() == u.key() for u in units)
-        require(not second, f"unit {index}: a second {unit_name(unit.key())}, expected one" if second else "")
+        require(not second, f"unit {index}: a second {unit_name(unit.key())}, expected one")
         if index == 0 and unit_type == GROUP_HEADER:
             sizes = [size, *read_opening(Reader(body, 0, len(body), "group_header"))[3]]
         units.append(unit)
@@ -111,7 +111,7 @@ def check_units(units, header, layers):
             require(key not in required or key in on, f"unit {index}: must depend on a {unit_name(key)}")
         found[unit.key()] = unit.payload
     missing = sorted(required - found.keys())
-    require(not missing, f"expected a {unit_name(missing[0])}, found none" if missing else "")
+    require(not missing, f"expected units that are missing: {', '.join(map(unit_name, missing))}")
     return found
 
 
@@ -175,10 +175,10 @@ def read_grid(r):
 def read_layers(r, reference):
     """Clause 4: the layers. `reference`: the Header of the reference of a predicted group, else None."""
     layer_count = r.u8()
-    require(1 <= layer_count <= 16, f"group_header: layer_count is {layer_count}, expected 1 to 16")
+    require(1 <= layer_count <= 16, f"group_header: {layer_count} layers, expected 1 to 16")
     if reference:
         wanted = len(reference.layers)
-        require(layer_count == wanted, f"group_header: layer_count is {layer_count}, that of the reference {wanted}")
+        require(layer_count == wanted, f"group_header: {layer_count} layers, the reference has {wanted}")
     layers = []
     for k in range(layer_count):
         count, map_width_log2 = r.u32(), r.u8()
@@ -188,7 +188,10 @@ def read_layers(r, reference):
         if reference:
             layer.births, before = r.u32(), reference.layers[k].count
             survivors = count - layer.births
-            require(0 <= survivors <= before, f"group_header: {survivors} survivors of {before} Gaussians")
+            require(
+                0 <= survivors <= before,
+                f"group_header: {survivors} survivors of {before} Gaussians besides {layer.births} births",
+            )
             layer.candidates = before if survivors < before else 0
         layers.append(layer)
     return layers
@@ -200,7 +203,7 @@ def read_channels(r, sh_degree):
     attribute_count, channels = r.u8(), {}
     require(
         attribute_count == len(expected),
-        f"group_header: attribute_count is {attribute_count}, expected {len(expected)}",
+        f"group_header: {attribute_count} attributes, expected {len(expected)}",
     )
     for wanted in expected:
         attribute = r.u8()

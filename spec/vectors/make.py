@@ -266,7 +266,7 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "unit_header_late": (B, "header", lambda: units_file(lambda u: u.insert(0, unit_dict(200)))),
     "unit_header_layer": (B, "layer", change_unit(0, layer=1)),
     "unit_header_twice": (B, "group_header", lambda: units_file(lambda u: u.append(dict(u[0])))),
-    "unit_twice": (B, "unit", lambda: units_file(lambda u: u.append(dict(find_unit(u, 2, 5))))),
+    "unit_twice": (B, "sh0", lambda: units_file(lambda u: u.append(dict(find_unit(u, 2, 5))))),
     "unit_too_many": (B, "255", insert(*(unit_dict(128 + i // 250, attribute=i % 250) for i in range(250)))),
     "unit_layer_order": (B, "layer", insert(unit_dict(200, layer=2), unit_dict(201, layer=1))),
     "unit_layer_unannounced": (B, "layer", change_unit(6, 5, layer=1)),
@@ -293,7 +293,7 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "unit_sizes_wrong": (B, "header", lambda: sizes_file(lambda h: h[:7] + bytes([h[7] ^ 1]) + h[8:])),
     "unit_sizes_cut": (B, "4 more", lambda: sizes_file(lambda h: h[: 3 + 2 * h[3]])),
     # Group header
-    "predicted_first": (B, "group", lambda: make_file([(encode(UNCHANGED, encode(REFERENCE)), 6, False)])),
+    "predicted_first": (B, "before it", lambda: make_file([(encode(UNCHANGED, encode(REFERENCE)), 6, False)])),
     "predicted_sync": (B, "sync", lambda: predicted_file(REFERENCE, UNCHANGED, sync=True)),
     "predicted_from_predicted": (
         B,
@@ -301,8 +301,8 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
         lambda: predicted_file(REFERENCE, UNCHANGED, UNCHANGED),
     ),
     "predicted_reference_0": (B, "reference", change_predicted(lambda h: h[:3] + b"\0\0" + h[5:])),
-    "predicted_layer_count": (B, "layer", change_predicted(lambda h: h[:5] + b"\2" + h[6:])),
-    "predicted_many_births": (B, "group_header", change_predicted(lambda h: h[:11] + u32(10**6) + h[15:])),
+    "predicted_layer_count": (B, "layers", change_predicted(lambda h: h[:5] + b"\2" + h[6:])),
+    "predicted_many_births": (B, "births", change_predicted(lambda h: h[:11] + u32(10**6) + h[15:])),
     "predicted_many_survivors": (
         B,
         "survivors",
@@ -339,7 +339,7 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "header_shift": (B, "shift", header(flags=8, shifts=[0, 16, 0, 0, 0])),
     "header_shift_positions": (B, "shift", header(flags=8, shifts=[HEADER["grid_bits"], 0, 0, 0, 0])),
     "predicted_shifts": (B, "flags", change_predicted(lambda h: h[:2] + bytes([h[2] | 8]) + h[3:])),
-    "header_layers": (B, "layer", header(layer_count=17, layer_counts=[(40, 2)] * 17)),
+    "header_layers": (B, "layers", header(layer_count=17, layer_counts=[(40, 2)] * 17)),
     "header_layers_missing": (B, "positions", header(layer_count=2, layer_counts=[(40, 2), (40, 2)])),
     "header_no_layers": (B, "layer", header(layer_count=0, layer_counts=[])),
     "header_frames_0": (B, "frames", header(frames=0)),
@@ -351,7 +351,7 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "header_grid_bits_22": (B, "grid_bits", header(grid_bits=22)),
     "header_sh_degree": (B, "sh_degree", header(sh_degree=4)),
     "header_map_width": (B, "map_width_log2", header(layer_counts=[(40, 3)])),
-    "header_attribute_count": (B, "attribute", header(channels=HEADER["channels"][:3])),
+    "header_attribute_count": (B, "attributes", header(channels=HEADER["channels"][:3])),
     "header_attribute_order": (B, "attribute", header(channels=[HEADER["channels"][i] for i in (1, 0, 2, 3)])),
     "header_step_nan": (B, "step", header(channels=[(2, [(NAN, 0.0)] * 3), *HEADER["channels"][1:]])),
     "header_step_0": (B, "step", header(channels=[(2, [(0.0, 0.0)] * 3), *HEADER["channels"][1:]])),
@@ -370,7 +370,7 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "header_rotation_step": (B, "rotation_step", header(rotation_step=0.0)),
     "header_translation_step": (B, "translation_step", header(translation_step=NAN)),
     "header_truncated": (B, "4 more", change_unit(0, payload=pack_header()[:-1])),
-    "header_left_over": (B, "group", change_unit(0, payload=pack_header() + b"\0")),
+    "header_left_over": (B, "group_header", change_unit(0, payload=pack_header() + b"\0")),
     # Limits
     "limit_gaussians": (L, "Gaussians", header(layer_counts=[(65537, 8)])),
     "limit_gaussians_huge": (L, "Gaussians", header(layer_counts=[(2**32 - 1, 15)])),
@@ -394,7 +394,7 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "payload_escape": (B, "sh0", change_payload(2, 5, lambda p: b"\xef" + bytes(63))),
     "payload_value": (B, "sh0", change_payload(2, 5, lambda p: b"\xee\x70" + bytes(62))),
     "payload_symbol": (B, "sh0", change_payload(2, 5, lambda p: b"\xff\xff" + bytes(62))),
-    "payload_first_tree": (B, "positions", lambda: change_first_tree(u32(2**32 - 1))),
+    "payload_first_tree": (B, "first", lambda: change_first_tree(u32(2**32 - 1))),
     "payload_lifetime": (B, "lifetimes", change_payload(3, 0, lambda p: bytes.fromhex("342f5d0a5e4842"))),
 }
 
