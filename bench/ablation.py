@@ -17,7 +17,7 @@ from pathlib import Path
 from gscodec.capture import Capture
 from gscodec.encode.settings import EncodeSettings
 from gscodec.errors import UsageError
-from gscodec.train.settings import TrackingSettings, TrainSettings, train_settings
+from gscodec.train.settings import MOTIONS, TrackingSettings, TrainSettings, train_settings
 
 from . import train
 from .machine import ROOT, update_entries
@@ -51,6 +51,12 @@ VARIANTS = {
     "no D-SSIM": Variant(run_with(ssim_lambda=0.0)),
     "no mask term": Variant(run_with(mask_lambda=0.0), (LUMBERJACK,)),
     "no rigidity": Variant(run_with(rigidity=0.0)),
+    "nodes alone": Variant(run_with(motion_field=MOTIONS["nodes"])),
+    "field alone": Variant(  # the nodes have no variables of their own
+        lambda s: stage_with("finetune", node_rotation_rate=0.0, node_translation_rate=0.0)(
+            stage_with("tracking", node_rotation_rate=0.0, node_translation_rate=0.0)(s)
+        )
+    ),
     "no rate term": Variant(run_with(rate_lambda=0.0)),
     "no fine-tuning": Variant(run_with(finetune_steps=0)),
     "no cuts": Variant(lambda s: stage_with("group", drift_ratio=math.inf)(replace(s, cut_ratio=math.inf))),

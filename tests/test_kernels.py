@@ -5,7 +5,6 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from bench.baselines.hashgrid import HashGrid  # noqa: E402
 from gscodec import _native  # noqa: E402
 from gscodec.errors import UsageError  # noqa: E402
 from gscodec.model.camera import Camera  # noqa: E402
@@ -14,6 +13,7 @@ from gscodec.render.cpu import CpuBackend  # noqa: E402
 from gscodec.render.optimizer import Adam, AdamSettings, TrajectoryAdam  # noqa: E402
 from gscodec.render.reference import image_loss_reference  # noqa: E402
 from gscodec.train.entropy_model import laplace_bits  # noqa: E402
+from gscodec.train.hash_grid import HashGrid  # noqa: E402
 from gscodec.train.model import Model  # noqa: E402
 
 

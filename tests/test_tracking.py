@@ -20,7 +20,9 @@ from gscodec.train.change_detection import Changes
 from gscodec.train.deformation_graph import NodeGraph, Pose
 from gscodec.train.finetune import GroupModel
 from gscodec.train.model import from_gaussians
+from gscodec.train.motion_field import MotionField
 from gscodec.train.relocalization import relocalize
+from gscodec.train.settings import AdamSettings, MotionFieldSettings
 from gscodec.train.tracking import Tracker
 from gscodec.train.views import Views
 
@@ -56,7 +58,9 @@ def test_tracking_finds_the_turn(capture):
 
 def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
     x = torch.from_numpy(blob(200).means)
-    graph = NodeGraph.of(x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), 32, TINY.graph)
+    graph = NodeGraph.of(
+        x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), dataclasses.replace(TINY.graph, nodes=32)
+    )
     turn = rotvec_to_quat(torch.tensor([[0.3, -0.2, 0.5]])).repeat(len(graph), 1)
     R = quat_to_matrix(turn)
     nodes = torch.einsum("nij,nj->ni", R, graph.nodes) + 1
@@ -72,7 +76,9 @@ def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
 def test_newcomers_have_nodes_of_their_own_that_change_nothing_for_others():
     x = torch.from_numpy(blob(200).means)
     spawned = 0.2 * torch.from_numpy(blob(60, seed=1).means) + torch.tensor([0.9, 0, 0])  # amid the others
-    graph = NodeGraph.of(x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), 32, TINY.graph)
+    graph = NodeGraph.of(
+        x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), dataclasses.replace(TINY.graph, nodes=32)
+    )
     pose = dataclasses.replace(Pose.rest(graph), nodes=1.1 * graph.nodes)
     before, known = graph.carry(x, pose)[0], len(graph)
     shift = graph.add_nodes(spawned)
@@ -121,3 +127,21 @@ def test_masks_say_where_nothing_is():
     assert shown[0] == 200
     assert 80 < shown[1] < 120
     assert shown[2:] == [0, 0]
+
+
+def test_the_motion_field_is_zero_at_first_and_learns_a_motion_that_nodes_share():
+    nodes = torch.from_numpy(np.random.default_rng(3).uniform(-1, 1, (40, 3)).astype(np.float32))
+    field = MotionField(nodes, 2.0, 6, MotionFieldSettings(), seed=0)
+    field.start_optimizer(CpuBackend(), AdamSettings())
+    assert not any(x.any() for t in range(6) for x in field(t)), "the nodes begin as they were tracked"
+    for step in range(300):
+        t = step % 6
+        turn, shift = field(t)
+        wanted = torch.tensor([0.1 * t, 0.0, 0.2])
+        ((turn - 0.05 * t) ** 2 + (shift - wanted - 0.1 * nodes) ** 2).sum().backward()
+        field.step(0.1 ** (step / 300))
+    for t in range(6):
+        turn, shift = field(t)
+        assert (turn - 0.05 * t).abs().max() < 0.1
+        assert (shift - torch.tensor([0.1 * t, 0.0, 0.2]) - 0.1 * nodes).abs().max() < 0.1
+    assert all(torch.equal(a, b) for a, b in zip(field(2), field(2), strict=True))

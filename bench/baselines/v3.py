@@ -19,13 +19,12 @@ import torch
 
 from gscodec.model.rotations import quat_multiply, rotvec_to_quat
 from gscodec.render.cpu import CpuBackend
+from gscodec.train.hash_grid import HashGrid
 from gscodec.train.initialization import initial_model
 from gscodec.train.keyframe import train_keyframe
 from gscodec.train.model import Model
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, photometric_loss
-
-from .hashgrid import HashGrid
 
 POINTS = 8000  # of the keyframe, to start from
 STEPS = (90, 225)  # per frame, motion and fine-tuning: the time of our preset medium, in the proportion 800 : 2000

@@ -14,7 +14,7 @@ from ..errors import UsageError
 from ..fingerprint import inputs, program
 from ..model.gaussians import GOP
 from ..progress import Bar
-from .options import Frames, Gop, Preset, Quality, RandomAccess, SequencePath, StreamPath, stdout
+from .options import Frames, Gop, Motion, Preset, Quality, RandomAccess, SequencePath, StreamPath, stdout
 
 if TYPE_CHECKING:
     from ..encode.encode import EncodeReport
@@ -30,6 +30,7 @@ def encode(
         str | None, typer.Option(metavar="RATE", help="Bits per second instead of a quality: 8M, 500k.")
     ] = None,
     preset: Preset = "medium",
+    motion: Motion = "field",
     frames: Frames = None,
     gop: Gop = GOP,
     keep_all: Annotated[bool, typer.Option("--keep-all", help="Keep Gaussians that nobody can see.")] = False,
@@ -55,7 +56,7 @@ def encode(
 
     with Bar() as bar:
         settings = EncodeSettings(quality, _bits(bitrate), keep_all, random_access, layers, refine)
-        result = encode_input(seq, out, settings, TrainOptions(preset, frames, gop, ray), bar)
+        result = encode_input(seq, out, settings, TrainOptions(preset, frames, gop, motion, ray), bar)
     if report:
         report.write_text(json.dumps(result.to_json(), indent=1))
     if result.groups == 0:

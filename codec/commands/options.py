@@ -19,6 +19,9 @@ RandomAccess = Annotated[
     int, typer.Option(metavar="N", help="Frames from one independent group to the next at most; 0: no prediction.")
 ]
 Preset = Annotated[str, typer.Option(help="Training budget: fast, medium or slow.")]
+Motion = Annotated[
+    str, typer.Option(help="What learns the motion: field (hash grid and MLP beside the nodes) or nodes alone.")
+]
 Quality = Annotated[
     float | None, typer.Option(help="0 (small) to 100 (fine).", show_default="as the capture needs; 50 for splats")
 ]

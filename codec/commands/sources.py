@@ -57,12 +57,14 @@ class TrainOptions:
 
     Attributes:
         preset: fast, medium or slow. frames: "A:B", None: all. gop: most frames in a group.
+        motion: field or nodes, see `train_settings`.
         cluster: address of the Ray cluster that trains; None: this machine.
     """
 
     preset: str
     frames: str | None
     gop: int
+    motion: str = "field"
     cluster: str | None = None
 
 
@@ -167,7 +169,7 @@ def capture_source(path: Path, out: Path, settings: EncodeSettings, options: Tra
 
     limit_torch_threads()
     capture = open_frames(path, options.frames)
-    recipe = train_settings(options.preset, settings.quality, gop=options.gop)
+    recipe = train_settings(options.preset, settings.quality, motion=options.motion, gop=options.gop)
     settings = replace(settings, loss=LOSS[options.preset])
     work, trained = out.with_name(out.name + ".work"), capture.indices("train")
     if options.cluster:

@@ -16,7 +16,7 @@ from ..fingerprint import inputs, program, sentence
 from ..model.gaussians import GOP
 from ..progress import Bar
 from .inputs import open_frames
-from .options import Frames, Gop, Preset, Quality, RandomAccess, stdout
+from .options import Frames, Gop, Motion, Preset, Quality, RandomAccess, stdout
 
 if TYPE_CHECKING:
     from .sources import TrainOptions
@@ -26,6 +26,7 @@ def train(
     capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture (folder or transforms.json).")],
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the .ply files go.")],
     preset: Preset = "medium",
+    motion: Motion = "field",
     frames: Frames = None,
     gop: Gop = GOP,
     random_access: RandomAccess = 60,
@@ -35,7 +36,7 @@ def train(
     from .sources import TrainOptions
 
     with Bar() as bar:
-        options = TrainOptions(preset, frames, gop)
+        options = TrainOptions(preset, frames, gop, motion)
         count = train_to_folder(capture, folder, options, random_access=random_access, quality=quality, bar=bar)
     stdout.print(f"{folder}: {count} frames")
 
@@ -57,7 +58,7 @@ def train_to_folder(
 
     limit_torch_threads()
     capture = open_frames(source, options.frames)
-    recipe = train_settings(options.preset, quality, gop=options.gop)
+    recipe = train_settings(options.preset, quality, motion=options.motion, gop=options.gop)
     work, unfinished = folder / "work", folder / "unfinished.json"
     settings = {"frames": options.frames, "random_access": random_access, "training": asdict(recipe)}
     made_by = {"program": program(), "input": inputs(source), "settings": settings}

@@ -125,7 +125,6 @@ class NodeGraph:
         sizes: torch.Tensor,
         radius: float,
         moving: torch.Tensor,
-        nodes: int,
         settings: DeformationGraphSettings,
     ) -> NodeGraph:
         """Nodes for the Gaussians of a keyframe, dense where these move and where they are small.
@@ -135,9 +134,8 @@ class NodeGraph:
             sizes: [N], proportional to the distance of nodes.
             radius: of the moving Gaussians, world units.
             moving: [N] bool.
-            nodes: at most.
         """
-        low, step = means.min(0).values, settings.lattice * radius
+        low, step, nodes = means.min(0).values, settings.lattice * radius, settings.nodes
         grid = torch.round((means - low) / step).numpy().astype(np.uint32)
         if (~moving).float().mean() < settings.still_share:  # nodes at rest among moving ones would hold these back
             moving = torch.ones_like(moving)

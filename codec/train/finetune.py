@@ -22,6 +22,7 @@ from ..render.backend import Backend
 from .deformation_graph import NodeGraph, Pose
 from .entropy_model import CanonicalRate
 from .model import NAMES, REMOVED_LOGIT, Model
+from .motion_field import MotionField
 from .settings import TrainSettings
 
 
@@ -73,6 +74,7 @@ class GroupModel:
         free: [N] bool, Gaussians whose coefficients are optimised.
         log_scales: attribute -> [K] f32, log of the Laplace scale of its coefficients.
         turns, shifts: T times [M, 3], corrections of the poses of the nodes: rotation vectors, world units.
+        field: of the group, adds to them; None: there is none.
         origin: [N] index of each Gaussian in the last frame of tracking; -1: it was added here.
     """
 
@@ -91,6 +93,7 @@ class GroupModel:
         self.origin = torch.arange(len(graph.means))
         self.turns = [torch.zeros_like(p.nodes) for p in self._tracked_poses]
         self.shifts = [torch.zeros_like(p.nodes) for p in self._tracked_poses]
+        self.field: MotionField | None = None
         counts = torch.tensor([len(m) for m in tracked])
         self.start = (counts[:, None] <= torch.arange(counts[-1])).sum(0)
         tracked = [_padded(m, tracked[-1]) for m in tracked]
@@ -183,8 +186,9 @@ class GroupModel:
         """Corrected pose of the nodes at frame `t`, differentiable in the correction [M, 3] and [M, 3] behind it."""
         tracked, turn, shift = self._tracked_poses[t], self.turns[t].clone(), self.shifts[t].clone()
         turn, shift = turn.requires_grad_(), shift.requires_grad_()
-        rotations = quat_normalize(quat_multiply(rotvec_to_quat(turn), tracked.rotations))
-        return replace(tracked, rotations=rotations, nodes=tracked.nodes + shift), turn, shift
+        by_field = (0.0, 0.0) if self.field is None else self.field(t)
+        rotations = quat_normalize(quat_multiply(rotvec_to_quat(turn + by_field[0]), tracked.rotations))
+        return replace(tracked, rotations=rotations, nodes=tracked.nodes + shift + by_field[1]), turn, shift
 
     def frame(self, t: int, backend: Backend, noise: dict[str, torch.Tensor] | None = None) -> Frame:
         """Frame `t`.

@@ -18,6 +18,7 @@ from ..render.optimizer import Adam
 from .deformation_graph import Pose
 from .keyframe import Statistics
 from .model import Model
+from .motion_field import MotionField
 from .views import Target, photometric_loss
 
 if TYPE_CHECKING:
@@ -43,12 +44,22 @@ class FrameFit:
         }
         self._carriers, self._adam = carriers, Adam(backend, s.node_adam)
         self._rates = {"angular_velocity": s.node_rotation_rate, "velocity": s.node_translation_rate * tracker.radius}
+        self._field, f = None, tracker.settings.motion_field
+        if f.tracking:
+            self._field = MotionField(tracker.graph.nodes, tracker.radius, 1, f, tracker.settings.seed)
+            self._field.start_optimizer(backend, s.node_adam)
         self.own = Model(tracker.own.params)
         self.own.start_optimizer(backend, tracker.settings.adam)
         self.statistics = Statistics(len(self.own), tracker.settings.keyframe.mse_min)
 
     def _pose(self) -> Pose:
-        return replace(self.tracker.pose, **self._nodes).next()
+        if self._field is None:
+            return replace(self.tracker.pose, **self._nodes).next()
+        turn, shift = self._field()
+        turn = self._nodes["angular_velocity"] + self._carriers * turn
+        return replace(
+            self.tracker.pose, angular_velocity=turn, velocity=self._nodes["velocity"] + self._carriers * shift
+        ).next()
 
     def step(self, target: Target, decay: float, *, full: bool, first: bool) -> float:
         """One view; returns its image loss without the mask term.
@@ -79,6 +90,8 @@ class FrameFit:
         torch.autograd.backward(heads, [grads["means"], grads["quats"], torch.ones(())])
         by_nodes = {n: p.grad * self._carriers for n, p in self._nodes.items()}
         self._adam.step(self._nodes, by_nodes, {n: r * decay for n, r in self._rates.items()})
+        if self._field is not None:
+            self._field.step(decay)
 
     @torch.no_grad()
     def result(self) -> tuple[Model, Pose]:

@@ -1,5 +1,6 @@
-"""Fine-tuning, the optimisation: canonical attributes, node motion and residual coefficients of a group against all its
-frames.
+"""Fine-tuning, the optimisation: canonical attributes, motion and residual coefficients of a group against all its
+frames. A field over place and time (motion_field.py) corrects the tracked motion of the nodes, beside variables of each
+node and frame.
 
 The loss is that of the image and a rate term (V3's residual-entropy loss, made differentiable): the entropy of the
 coefficients under noise-relaxed quantization at the step sizes of the stream, with a learned Laplace scale for each
@@ -17,6 +18,7 @@ import torch
 from ..render.optimizer import Adam, TrajectoryAdam
 from .finetune import Frame, GroupModel
 from .keyframe import Statistics, split_or_clone
+from .motion_field import MotionField
 from .settings import TrainSettings
 from .views import Views, photometric_loss
 
@@ -32,6 +34,10 @@ class _Finetuner:
         self.coefficients = TrajectoryAdam(backend, f.coefficient_adam)
         self.scales, self.nodes = Adam(backend, f.coefficient_adam), Adam(backend, f.coefficient_adam)
         group.key.start_optimizer(backend, settings.adam)
+        if settings.motion_field.finetune:
+            nodes = group.graph.nodes
+            group.field = MotionField(nodes, radius, group.frames, settings.motion_field, settings.seed)
+            group.field.start_optimizer(backend, f.coefficient_adam)
         canonical = settings.keyframe.rates.scaled(radius, f.canonical_rate_share)
         canonical["means"] = f.canonical_means_rate * radius
         self.canonical_rates = canonical if group.known < len(group.key) else {}
@@ -142,7 +148,7 @@ class _Finetuner:
     ) -> None:
         """One step of the nodes at frame `t`, along the gradients by where they carry the Gaussians and that of the
         rigidity of the graph."""
-        if not self.node_rates["turn"]:
+        if not self.node_rates["turn"] and self.group.field is None:
             return
         rigidity = self.settings.rigidity * self.group.graph.rigidity(frame.pose)
         heads, seeds = [frame.means, frame.rotations, rigidity], [by_means, by_rotations, torch.ones(())]
@@ -150,6 +156,8 @@ class _Finetuner:
         values = {f"turn {t}": self.group.turns[t], f"shift {t}": self.group.shifts[t]}
         grads = {f"turn {t}": frame.turn.grad, f"shift {t}": frame.shift.grad}
         self.nodes.step(values, grads, {n: decay * self.node_rates[n.split()[0]] for n in values})
+        if self.group.field is not None:
+            self.group.field.step(decay)
 
     def _bit_weight(self) -> float:
         """Weight of a bit in the image loss.

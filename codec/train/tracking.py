@@ -9,8 +9,8 @@ Gaussians behind pixels that do not change (change_detection.py) stay as they ar
 New Gaussians (densification.py) have nodes of their own, unless they lie beside others; those that move too fast for
 the gradient are searched for (relocalization.py). Gaussians that have faded, or lie outside of the masks, are removed.
 
-A hash grid and an MLP (V3) on top of the nodes improved nothing here, and the stream carries nodes: there is none. V3's
-recipe, with its grid, is a baseline in bench/baselines/v3.py.
+A hash grid and an MLP move the nodes beside their own variables (motion_field.py), so that far motion is reached in
+fewer steps.
 """
 
 from __future__ import annotations
@@ -82,11 +82,10 @@ class Tracker:
             changed = changes.behind(frames[1], changes.copy().advance(frames[1]), means.numpy(), visible)
             moving = changed if changed.any() else moving
         radius = subject_radius(means[moving].numpy())
-        sizes, nodes = torch.ones(len(key)), settings.graph.nodes
+        sizes = torch.ones(len(key))
         if not views.capture.has_alpha:  # there is a background
             sizes = key.params["log_scales"].sort(1).values[:, 1:].mean(1).exp()  # without the thin axis
-            nodes = settings.graph.nodes_of_room
-        graph = NodeGraph.of(means, sizes, radius, torch.from_numpy(moving), nodes, settings.graph)
+        graph = NodeGraph.of(means, sizes, radius, torch.from_numpy(moving), settings.graph)
         own = Model({**key.params, "means": torch.zeros_like(means)})
         gradient = float(torch.quantile(stats.mean_screen_gradient(), s.gradient_quantile))
         return Tracker(graph, own, views, settings, np.array([radius, loss, gradient]), changes)

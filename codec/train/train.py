@@ -111,7 +111,7 @@ class _Run:
     def __init__(self, capture, settings: TrainSettings, backend: Backend, on_progress):
         self.capture, self.on_progress = capture, on_progress
         self.views = Views(capture, settings, backend)
-        self.settings = with_frame_budget(settings, self.views, 0)
+        self.settings = with_frame_budget(settings if capture.has_alpha else settings.of_room(), self.views, 0)
         self.progress = Progress(0)
         self.subject: Subject | None = None
 

@@ -8,7 +8,7 @@ optimisation steps of the stage. Learning rates are those of Adam, in units of t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from ...errors import UsageError
 from ...model.gaussians import GOP
@@ -28,7 +28,9 @@ from .tracking import (
     DeformationGraphSettings,
     DensificationSettings,
     GroupSettings,
+    MotionFieldSettings,
     RelocalizationSettings,
+    RoomSettings,
     TrackingSettings,
 )
 
@@ -46,9 +48,11 @@ __all__ = [
     "InitializationSettings",
     "KeyframeSettings",
     "LearningRates",
+    "MotionFieldSettings",
     "PlaneSweepSettings",
     "RefinementSettings",
     "RelocalizationSettings",
+    "RoomSettings",
     "TrackingSettings",
     "TrainSettings",
     "VisualHullSettings",
@@ -88,7 +92,7 @@ class TrainSettings:
     ssim_lambda: float = 0.2
     mask_lambda: float = 0.1
     cut_ratio: float = 2.5
-    rigidity: float = 0.1
+    rigidity: float = 0.3
     rate_lambda: float = 0.4
     quality: float = 56.0
     seed: int = 0
@@ -102,6 +106,7 @@ class TrainSettings:
     keyframe: KeyframeSettings = field(default_factory=KeyframeSettings)
     change_detection: ChangeDetectionSettings = field(default_factory=ChangeDetectionSettings)
     graph: DeformationGraphSettings = field(default_factory=DeformationGraphSettings)
+    motion_field: MotionFieldSettings = field(default_factory=MotionFieldSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     densification: DensificationSettings = field(default_factory=DensificationSettings)
     relocalization: RelocalizationSettings = field(default_factory=RelocalizationSettings)
@@ -109,10 +114,21 @@ class TrainSettings:
     entropy_model: EntropyModelSettings = field(default_factory=EntropyModelSettings)
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
     group: GroupSettings = field(default_factory=GroupSettings)
+    room: RoomSettings = field(default_factory=RoomSettings)
 
     def __post_init__(self):
         if self.gop < 1:
             raise UsageError(f"--gop {self.gop} is out of range, expected at least 1 frame in a group")
+
+    def of_room(self) -> TrainSettings:
+        """The settings for a capture without masks."""
+        field = self.motion_field.tracking and self.room.field_in_tracking
+        return replace(
+            self,
+            rigidity=self.room.rigidity * self.rigidity,
+            graph=replace(self.graph, nodes=round(self.room.nodes * self.graph.nodes)),
+            motion_field=replace(self.motion_field, tracking=field),
+        )
 
 
 PRESETS = {
@@ -128,10 +144,17 @@ PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
 LOSS = {"fast": 0.4, "medium": 0.3, "slow": 0.2}  # decibels that coding may cost where no quality is named
 
 
-def train_settings(preset: str, quality: float | None = None, **changes) -> TrainSettings:
+MOTIONS = {  # --motion
+    "field": MotionFieldSettings(),
+    "nodes": MotionFieldSettings(tracking=False, finetune=False),
+}
+
+
+def train_settings(preset: str, quality: float | None = None, *, motion: str = "field", **changes) -> TrainSettings:
     """Settings of a preset, with changes.
 
     Args:
+        motion: what moves the nodes, "field" (a hash grid and an MLP beside their own variables) or "nodes".
         quality: of the stream; None: it is found when the first group is coded, and training assumes the usual one.
 
     Raises:
@@ -139,6 +162,9 @@ def train_settings(preset: str, quality: float | None = None, **changes) -> Trai
     """
     if preset not in PRESETS:
         raise UsageError(f"--preset {preset} does not exist, expected one of {', '.join(PRESETS)}")
+    if motion not in MOTIONS:
+        raise UsageError(f"--motion {motion} does not exist, expected one of {', '.join(MOTIONS)}")
     if quality is not None:
         changes["quality"] = quality
-    return TrainSettings(**{**PRESETS[preset], "keyframe": KeyframeSettings(**PRICES[preset]), **changes})
+    recipe = {"keyframe": KeyframeSettings(**PRICES[preset]), "motion_field": MOTIONS[motion]}
+    return TrainSettings(**{**PRESETS[preset], **recipe, **changes})

@@ -23,7 +23,6 @@ class DeformationGraphSettings:
     """Nodes that carry the Gaussians."""
 
     nodes: int = 256
-    nodes_of_room: int = 640  # where there are no masks: much of what seems to move is what lies behind it
     still_share: float = 0.25  # of the nodes for Gaussians at rest, if these are as large a share of all
     blended: int = 4  # nodes that carry one Gaussian
     edges: int = 8  # neighbours of a node in the rigidity term
@@ -33,6 +32,32 @@ class DeformationGraphSettings:
     added_nodes: int = 16  # for Gaussians that come in together
     extent_max: float = 2.0  # of the lattice of the stream along each axis, in extents of the keyframe
     places_max: int = 16  # tried for new nodes to rest
+
+
+@dataclass(frozen=True)
+class MotionFieldSettings:
+    """Hash grid and MLP that move the nodes (`motion_field.py`)."""
+
+    tracking: bool = True  # a field of each frame beside the nodes' own variables
+    finetune: bool = True  # a field of the whole group beside them
+    levels: int = 5
+    features: int = 4  # of each level
+    log2_table: int = 12  # entries of a level, at most
+    coarsest: int = 2  # cells along an axis of the first level
+    finest: int = 32  # and of the last: about the spacing of the nodes
+    width: int = 32  # of the two hidden layers
+    temporal_frequencies: int = 8  # cosines of the time in the group
+    grid_rate: float = 2e-2
+    mlp_rate: float = 2e-3
+
+
+@dataclass(frozen=True)
+class RoomSettings:
+    """What differs in a capture without masks: something moves beside, or before, much that stands still."""
+
+    nodes: float = 2.5  # times those of a subject: much of what seems to move is what lies behind it
+    rigidity: float = 1 / 3  # times that of a subject
+    field_in_tracking: bool = False  # it drags what stands still with what moves beside it
 
 
 @dataclass(frozen=True)

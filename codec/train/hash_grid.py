@@ -1,4 +1,4 @@
-"""Multi-resolution hash grid (Instant-NGP, Mueller et al. 2022) of V3's motion field: native, and a plain reference.
+"""Multi-resolution hash grid (Instant-NGP, Mueller et al. 2022) of the motion field: native, and a plain reference.
 
 [N, 3] in [0, 1] -> [N, levels * features]. Levels grow geometrically from base_resolution to max_resolution cells on a
 side; a level whose vertices fit the table is dense, the others are hashed. The MLP after it runs in torch.
@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gscodec import _native
-from gscodec.errors import UsageError
+from .. import _native
+from ..errors import UsageError
 
 PRIMES = (1, 2654435761, 805459861)
 
