@@ -60,7 +60,6 @@ VARIANTS = {
     "no rate term": Variant(run_with(rate_lambda=0.0)),
     "no fine-tuning": Variant(run_with(finetune_steps=0)),
     "no cuts": Variant(lambda s: stage_with("group", drift_ratio=math.inf)(replace(s, cut_ratio=math.inf))),
-    "cut ratio 1.5": Variant(run_with(cut_ratio=1.5)),
     "cut ratio 3": Variant(run_with(cut_ratio=3.0)),
     "colours held in tracking": Variant(stage_with("tracking", rates=TRACKING.rates.but(sh0=0.0, shN=0.0))),
     "full-size pictures only": Variant(stage_with("tracking", small_scale=1.0)),

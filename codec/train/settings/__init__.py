@@ -91,7 +91,7 @@ class TrainSettings:
     sh_degree: int = 3
     ssim_lambda: float = 0.2
     mask_lambda: float = 0.1
-    cut_ratio: float = 2.5
+    cut_ratio: float = 1.5
     rigidity: float = 0.3
     rate_lambda: float = 0.4
     quality: float = 56.0
@@ -126,6 +126,8 @@ class TrainSettings:
         return replace(
             self,
             rigidity=self.room.rigidity * self.rigidity,
+            cut_ratio=self.room.cut_ratio * self.cut_ratio,
+            group=replace(self.group, drift_ratio=self.room.drift_ratio * self.group.drift_ratio),
             graph=replace(self.graph, nodes=round(self.room.nodes * self.graph.nodes)),
             motion_field=replace(self.motion_field, tracking=field),
         )

@@ -57,6 +57,8 @@ class RoomSettings:
 
     nodes: float = 2.5  # times those of a subject: much of what seems to move is what lies behind it
     rigidity: float = 1 / 3  # times that of a subject
+    cut_ratio: float = 5 / 3  # times that of a subject, since few views of a room fit its keyframe far too well
+    drift_ratio: float = 4.0  # times that of a subject, for the same reason
     field_in_tracking: bool = False  # it drags what stands still with what moves beside it
 
 
@@ -121,7 +123,7 @@ class RelocalizationSettings:
 class GroupSettings:
     """Where a group ends early."""
 
-    drift_ratio: float = 8.0  # image loss over the keyframe's, with few views far too low, from which frames start anew
-    cut_loss_floor: float = 0.004  # loss: clean images fit far better than they need to, and no frame is cut for it
+    drift_ratio: float = 2.0  # image loss over the keyframe's from which frames start anew
+    cut_loss_floor: float = 0.002  # loss: clean images fit far better than they need to, and no frame is cut for it
     changed_fraction_max: float = 0.15  # of the Gaussians, that begin to change in one frame
     changed_frames_min: int = 4  # frames that a group has before `changed_fraction_max` may end it
