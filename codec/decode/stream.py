@@ -157,7 +157,6 @@ class Stream:
         """The whole file as a sequence with the groups of the stream; groups and frames are decoded when read."""
         return GaussianSequence(self.fps, _Groups(self), self.cameras)
 
-
     def identities(self) -> list[np.ndarray]:
         """[N] int of each group: the same number is the same Gaussian, in groups that are predicted from each other."""
         found, known = [], 0

@@ -85,7 +85,7 @@ def splat_size(path: Path) -> tuple[int, int]:
 
 
 def write_splat(path: str | Path, gaussians: Gaussians, up: str = "-y") -> None:
-    """Writes one frame in the format of the name's ending: .ply, .compressed.ply, .sog, .../meta.json, .spz, .glb, .drc.
+    """Writes one frame in the format of the name's ending, one of ENDINGS, or .../meta.json.
 
     Args:
         up: axis of the scene that points up, which a .glb needs.

@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import UsageError
 from ..model.gaussian_sequence import GaussianSequence
 from ..model.gaussians import Gaussians
-from .spacetime import SpacetimeGaussians
+from .spacetime import FADE_MIN, SpacetimeGaussians
 
 VALUES_MAX = 60_000_000  # Gaussians times frames that are fitted at once, 56 bytes each
 HIDDEN = 0.002  # opacity that a Gaussian is to have next to its lifetime
@@ -95,27 +95,31 @@ def _polynomial(dt: np.ndarray, values: np.ndarray, weights: np.ndarray, powers:
 
 
 def _fade(opacity, weights, shown, times) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Highest opacities, their times and the widths, [N] each: a parabola through the logarithm of the opacities, which
-    is low next to a lifetime."""
-    value, weight = np.log(np.maximum(opacity, 1e-6)), weights**2
-    best = weight.max(0)
+    """Highest opacities, their times and the widths, [N] each: a parabola through the logarithm of the opacities. Where
+    it would show a Gaussian next to its lifetime, it is fitted to a low opacity there as well."""
     near = np.zeros_like(shown)
     for k in range(1, EDGE + 1):
         near[k:] |= shown[:-k]
         near[:-k] |= shown[k:]
     near &= ~shown
-    value = np.where(near, np.log(HIDDEN), value)
-    weight = np.where(near, HIDDEN_WEIGHT * best, weight)
+    value, weight = np.log(np.maximum(opacity, 1e-6)), weights**2
     middle = (weights * times[:, None]).sum(0) / weights.sum(0)
-    a, b, c = _polynomial(times[:, None] - middle, value[..., None], weight, 3)[..., 0]
+    dt = times[:, None] - middle
+    free = _polynomial(dt, value[..., None], weight, 3)[..., 0]
+    value = np.where(near, np.log(HIDDEN), value)
+    weight = np.where(near, HIDDEN_WEIGHT * weight.max(0), weight)
+    bound = _polynomial(dt, value[..., None], weight, 3)[..., 0]
+    left = np.where(near, free[0] + dt * (free[1] + dt * free[2]), -np.inf).max(0, initial=-np.inf)
+    a, b, c = np.where(left > np.log(FADE_MIN), bound, free)
     falls = c < -1 / WIDEST**2
-    widths = np.where(falls, 1 / np.sqrt(np.maximum(-c, WIDEST**-2)), np.inf)
-    shift = np.where(falls, -b / (2 * np.minimum(c, -(WIDEST**-2))), 0)
+    c = np.minimum(c, -(WIDEST**-2))
+    shift = np.where(falls, -b / (2 * c), 0)
     far = np.abs(shift) > 1  # still rising or falling when the clip ends: the peak stays near
     shift = np.clip(shift, -1, 1)
     mean = (weights * opacity).sum(0) / weights.sum(0)
-    peaks = np.where(falls, np.exp(a + b * shift + c * shift**2), mean)
+    peaks = np.where(falls, np.exp(np.minimum(a + b * shift + c * shift**2, 0)), mean)
     peaks = np.where(falls & far, opacity.max(0), peaks)
+    widths = np.where(falls, 1 / np.sqrt(-c), np.inf)
     return np.clip(peaks, 1e-4, 1 - 1e-4), middle + shift, np.maximum(widths, NARROWEST)
 
 

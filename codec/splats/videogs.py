@@ -50,7 +50,7 @@ def find_checkpoints(path: Path) -> list[Path]:
 
 def find_packed(path: Path) -> Path | None:
     """The folder of packed maps in, or at, `path`: images rather than videos, which are coded with loss."""
-    inside = [path, path / "feature_image", *sorted(path.glob("feature_video/*"))]
+    inside = [path, path / "feature_image", *sorted(path.glob("feature_video/*")), *sorted(path.glob("png_all_*"))]
     ranges = lambda p: (p / RANGES).is_file() or (p / RANGES_FLAT).is_file()  # noqa: E731
     return next((p for p in inside if (p / INFO).is_file() and ranges(p)), None)
 
