@@ -1,6 +1,7 @@
 """Moving scenes: Spacetime Gaussians from and to streams, by the library and by the command line."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +20,9 @@ from gscodec.model.parametric_group import ParametricGroup
 from gscodec.splats import open_sequence, read_splat, spacetime_fit, write_sequence
 from gscodec.splats.spacetime import SpacetimeGaussians, spacetime_groups
 from gscodec.splats.spacetime_fit import fit_spacetime
-from gscodec.splats.splatv import read_splatv, write_splatv
+from gscodec.splats.splatv import ROW, read_splatv, splatv_header, write_splatv
 
+GOLDEN = Path(__file__).parent / "data" / "splats" / "spacetime.splatv"  # test_splat_formats.py says whose
 FRAMES = 12
 
 
@@ -54,6 +56,16 @@ def test_a_splatv_comes_back(tmp_path):
     assert len(read_splatv(tmp_path / "a.splatv")) == 80  # what fills the texture is left out
     for t in (0, 5, 11):
         same_frames(back.frame(t), given.at(t / FRAMES).take(given.shown(t / FRAMES)), t, 0.01)
+
+
+def test_a_splatv_is_what_others_write(tmp_path):
+    theirs = np.fromfile(GOLDEN, ROW, 5, offset=splatv_header(GOLDEN).start)
+    write_splatv(tmp_path / "a.splatv", read_splatv(GOLDEN), 50, 30.0)
+    ours = np.fromfile(tmp_path / "a.splatv", ROW, 5, offset=splatv_header(tmp_path / "a.splatv").start)
+    drawn = theirs[theirs["quats"].any(1)]
+    for name in ROW.names:
+        np.testing.assert_array_equal(ours[: len(drawn)][name], drawn[name], name)
+    assert not ours[len(drawn) :]["quats"].any()  # what fills the line of the texture is not drawn
 
 
 def test_the_fit_finds_the_scene():

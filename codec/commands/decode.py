@@ -62,8 +62,8 @@ def _to_splatv(s: Stream, path: Path, chosen: range) -> str:
     psnr = evaluate_splats(shown, sequence, frames=some)["codec_psnr"]
     if psnr < SPLATV_LEAST:
         raise UsageError(
-            f"{path}: the motion is no .splatv, whose Gaussians have cubic paths, one colour and one fade: it would show "
-            f"the stream at {psnr:.1f} dB, expected {SPLATV_LEAST:g} or more; decode to .ply or encode fewer frames"
+            f"{path}: the motion is no .splatv, whose Gaussians have cubic paths, one colour and one fade: it would "
+            f"show the stream at {psnr:.1f} dB, expected {SPLATV_LEAST:g} or more; decode to .ply"
         )
     write_splatv(path, scene, s.frame_count, s.fps, s.cameras)
     return f"{path}: {len(scene)} Gaussians over {s.frame_count} frames, {psnr:.1f} dB to the stream"

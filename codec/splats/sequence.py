@@ -1,8 +1,9 @@
 """A folder, a file or a zip of splats -> GaussianSequence with lazy frames; sequence_writer.py is its mirror.
 
-A folder with sequence.json has its groups, lifetimes and nodes in it. A folder without it comes from another tool:
-either index i is verified to be the same Gaussian from frame to frame (tracked), or the Gaussians are matched, or each
-frame is a group of its own. VideoGS and .splatv have their own groups, in which index i is one Gaussian. Frames are read when they are asked for; a few stay in memory.
+A folder with sequence.json has its groups, lifetimes and nodes in it. VideoGS and .splatv have their own groups, in
+which index i is one Gaussian. Anything else: either index i is verified to be the same Gaussian from frame to frame
+(tracked), or the Gaussians are matched, or each frame is a group of its own. Frames are read when they are asked for; a
+few stay in memory.
 """
 
 from __future__ import annotations
