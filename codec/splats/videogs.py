@@ -76,18 +76,34 @@ class PackedFrame:
         return 8 * int(np.ceil(np.sqrt(self.count) / 8))
 
 
+class OpenVideos:
+    """The videos of one group at a time; thread-safe."""
+
+    def __init__(self):
+        self._folder, self._videos, self._lock = None, {}, threading.Lock()
+
+    def of(self, path: Path) -> Video:
+        """The video at `path`; those of other folders are closed."""
+        with self._lock:
+            if self._folder != path.parent:
+                self._folder, self._videos = path.parent, {}
+            if path not in self._videos:
+                self._videos[path] = Video(path)
+            return self._videos[path]
+
+
 class PackedFrames(Sequence):
     """Frames of a group, read when they are asked for; thread-safe."""
 
-    def __init__(self, frames: list[PackedFrame]):
-        self._frames, self._videos, self._lock = frames, {}, threading.Lock()
+    def __init__(self, frames: list[PackedFrame], videos: OpenVideos):
+        self._frames, self._videos = frames, videos
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def __getitem__(self, t):
         if isinstance(t, slice):
-            return PackedFrames(self._frames[t])
+            return PackedFrames(self._frames[t], self._videos)
         return _gaussians(self._frames[t], self._plane)
 
     def _plane(self, frame: PackedFrame, plane: int) -> np.ndarray:
@@ -105,9 +121,7 @@ class PackedFrames(Sequence):
             raise CaptureError(
                 f"{frame.folder}: neither {frame.name}_{plane}.png nor {plane}.mp4, VideoGS packs either"
             )
-        with self._lock:
-            video = self._videos.setdefault(path, None) or Video(path)
-            self._videos[path] = video
+        video = self._videos.of(path)
         if (video.width, video.height) != (frame.side, frame.side):
             return np.zeros((video.height, video.width))
         return video.frame(frame.place)[..., 1]
@@ -148,7 +162,7 @@ def open_packed(folder: Path, gop: int) -> tuple[list[DenseGroup], list[str]]:
     Raises:
         CaptureError: a JSON file is damaged or does not fit the other.
     """
-    ranges, groups, names = _ranges(folder), [], []
+    ranges, groups, names, videos = _ranges(folder), [], [], OpenVideos()
     try:
         spans = {int(k): [int(n) for n in v["name_index"]] for k, v in json.loads((folder / INFO).read_text()).items()}
         spans = {k: (first, last) for k, (first, last) in sorted(spans.items())}
@@ -167,7 +181,7 @@ def open_packed(folder: Path, gop: int) -> tuple[list[DenseGroup], list[str]]:
             )
         same = np.arange(frames[0].count, dtype=np.int32)
         for a in range(0, len(frames), gop):
-            groups.append(DenseGroup(PackedFrames(frames[a : a + gop]), parents=same if a else None))
+            groups.append(DenseGroup(PackedFrames(frames[a : a + gop], videos), parents=same if a else None))
         names += [str(n) for n in own]
     if not groups:
         raise CaptureError(f"{folder / INFO}: no groups, expected at least one")
