@@ -26,6 +26,7 @@ MAGIC = 0x674B
 HEADER_MAX = 1 << 20  # bytes of JSON
 FRAMES, FPS = 50, 30.0  # over the time from 0 to 1, where the file does not say; frame t is at t / FRAMES
 FRAMES_MAX = 100_000
+FAR = 1e9  # a position beyond it is no position
 SCALE_MIN = 6e-8  # the least f16; a scale of 0 has no logarithm
 ROW = np.dtype(
     [
@@ -62,6 +63,7 @@ def read_splatv(path: Path) -> SpacetimeGaussians:
     rows = np.fromfile(path, ROW, count, offset=head.start)
     parts = {n: rows[n].astype(np.float64) for n in ROW.names}
     finite = np.all([np.isfinite(parts[n].reshape(count, -1)).all(1) for n in ROW.names if n != "width"], 0)
+    finite &= (np.abs(parts["means"]) < FAR).all(1)
     drawn = finite & ~np.isnan(parts["width"]) & (np.abs(parts["quats"]) + np.abs(parts["turn"])).any(1)
     if not drawn.any():
         raise CaptureError(f"{path}: none of its {count} Gaussians has a finite position and an orientation")
