@@ -36,7 +36,18 @@ ALLOWED = {  # part -> parts that it may import, besides itself
 ANYTHING = {"cli", "commands"}
 MAY_IMPORT_BENCH = {"commands.bench", "commands.chart"}
 PLAYER_ENTRIES = ("cli", "decode", "decode.report", "render.movie", "splats")
-STUDIO = {"torch", "cv2", "OpenImageIO", "skimage", "DracoPy", "imageio_ffmpeg", "scipy", "ray", "matplotlib"}
+STUDIO = {
+    "torch",
+    "cv2",
+    "OpenImageIO",
+    "skimage",
+    "DracoPy",
+    "imageio_ffmpeg",
+    "scipy",
+    "ray",
+    "matplotlib",
+    "zstandard",
+}
 
 
 @cache

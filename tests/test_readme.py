@@ -9,6 +9,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
 RESULTS = ROOT / "bench" / "results"
+SPLATS = ("statue", "statue40", "splatv")
 
 
 def result(name):
@@ -67,7 +68,7 @@ def test_tables_of_streams():
     for (name, *figures), values in zip(captures, (demo, lumberjack), strict=True):
         assert all(map(agrees, figures, values)), (name, figures, values)
     keys = ("kb_per_frame", "bits_per_gaussian_frame", "codec_psnr", "codec_psnr_fg")
-    for (name, *figures), found in zip(rows("splats, no training"), map(result, ("statue", "statue40")), strict=True):
+    for (name, *figures), found in zip(rows("splats, no training"), map(result, SPLATS), strict=True):
         values = [*(found[k] for k in keys), found["encode_seconds"] / found["frames"]]
         assert all(map(agrees, figures, values)), (name, figures, values)
 

@@ -113,9 +113,9 @@ def test_a_failed_write_leaves_nothing(tmp_path):
 def test_unknown_and_missing_files(tmp_path):
     with pytest.raises(CaptureError, match="no such file, expected a splat"):
         read_splat(tmp_path / "a.ply")
-    (tmp_path / "a.splat").touch()
+    (tmp_path / "a.xyz").touch()
     with pytest.raises(CaptureError, match="not a known splat format"):
-        read_splat(tmp_path / "a.splat")
+        read_splat(tmp_path / "a.xyz")
 
 
 # -- .compressed.ply

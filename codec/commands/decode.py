@@ -1,29 +1,69 @@
-"""`gscodec decode`: stream -> one standard 3DGS .ply per frame, or the points alone as Draco files."""
+"""`gscodec decode`: stream -> one splat per frame (standard 3DGS .ply, .spz, .glb, Draco points), or one .splatv."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ..errors import UsageError
+from ..frame_range import frame_range
 from .inputs import open_stream_of_frames
-from .options import StreamPath, stdout
+from .options import Frames, StreamPath, stdout
+
+if TYPE_CHECKING:
+    from ..decode import Stream
+
+FORMATS = ("ply", "spz", "glb", "drc")
+SPLATV_LEAST = 30.0  # dB to the stream, below which a .splatv does not show the same scene
+COMPARED = 4  # frames
 
 
 def decode(
     stream: StreamPath,
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the .ply files go.")],
-    drc: Annotated[bool, typer.Option("--drc", help="Only the points, as Draco files.")] = False,
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the frames, or one NAME.splatv for all.")],
+    form: Annotated[str, typer.Option("--format", help="Of each frame: ply, spz, glb or drc (points alone).")] = "ply",
+    frames: Frames = None,
+    drc: Annotated[bool, typer.Option("--drc", hidden=True, help="The same as --format drc.")] = False,
 ) -> None:
-    """Stream to one standard 3DGS .ply per frame."""
+    """Stream to one standard 3DGS .ply (.spz, .glb) per frame, or to one .splatv."""
     from ..splats import write_sequence, write_splat
 
+    form = "drc" if drc else form.lower().lstrip(".")
+    if form not in FORMATS:
+        raise UsageError(f"--format {form}: expected {', '.join(FORMATS)}; a .splatv is named as the output instead")
     s = open_stream_of_frames(stream)
-    if drc:
-        folder.mkdir(parents=True, exist_ok=True)
-        for t in range(s.frame_count):
-            write_splat(folder / f"{t:06d}.drc", s.frame(t))
-    else:
+    chosen = frame_range(frames, s.frame_count)
+    if folder.suffix.lower() == ".splatv":
+        stdout.print(_to_splatv(s, folder, chosen))
+        return
+    if form == "ply" and len(chosen) == s.frame_count:
         write_sequence(s.sequence(), folder)
-    stdout.print(f"{folder}: {s.frame_count} frames")
+    else:
+        folder.mkdir(parents=True, exist_ok=True)
+        for t in chosen:
+            write_splat(folder / f"{t:06d}.{form}", s.frame(t), s.config["up"])
+    stdout.print(f"{folder}: {len(chosen)} frames")
+
+
+def _to_splatv(s: Stream, path: Path, chosen: range) -> str:
+    """Writes the whole stream as one .splatv; what to say of it."""
+    from ..metrics.evaluate import evaluate_splats
+    from ..splats.spacetime_fit import fit_spacetime
+    from ..splats.splatv import write_splatv
+
+    if len(chosen) < s.frame_count:
+        raise UsageError("--frames: a .splatv is made of the whole stream; encode fewer frames instead")
+    sequence = s.sequence()
+    scene = fit_spacetime(sequence, s.identities())
+    some = sorted({round(i * (s.frame_count - 1) / (COMPARED - 1)) for i in range(COMPARED)})
+    shown = lambda t: scene.at(t / s.frame_count).take(scene.shown(t / s.frame_count))  # noqa: E731
+    psnr = evaluate_splats(shown, sequence, frames=some)["codec_psnr"]
+    if psnr < SPLATV_LEAST:
+        raise UsageError(
+            f"{path}: the motion is no .splatv, whose Gaussians have cubic paths, one colour and one fade: it would "
+            f"show the stream at {psnr:.1f} dB, expected {SPLATV_LEAST:g} or more; decode to .ply"
+        )
+    write_splatv(path, scene, s.frame_count, s.fps, s.cameras)
+    return f"{path}: {len(scene)} Gaussians over {s.frame_count} frames, {psnr:.1f} dB to the stream"

@@ -60,6 +60,7 @@ def evaluate_stream(stream_path: Path, source: Path, *, split: str, frames: str 
     def measure(stream, size: int) -> dict:
         options = {"size": size, "progress": on_progress}
         if splats:
+            options["stream_frames"] = whole.frame_count
             return evaluate_splats(stream.frame, reference, frames=chosen, **options)
         return evaluate_capture(stream.frame, reference.frames(chosen.start, chosen.stop), split=split, **options)
 

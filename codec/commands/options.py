@@ -9,7 +9,8 @@ import typer
 from rich.console import Console
 
 SequencePath = Annotated[
-    Path, typer.Argument(metavar="SEQ", help="A capture (folder or transforms.json) or a splat, or a folder of splats.")
+    Path,
+    typer.Argument(metavar="SEQ", help="A capture (folder or transforms.json), or splats: file, folder, zip."),
 ]
 StreamPath = Annotated[Path, typer.Argument(metavar="OUT.gsv", help="A .gsv file.")]
 Frames = Annotated[str | None, typer.Option(metavar="A:B", help="Only frames A to B-1.")]

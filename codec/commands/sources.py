@@ -117,6 +117,7 @@ def splat_source(path: Path, settings: EncodeSettings, frames: str | None, gop: 
 
 
 _MODES = {
+    "scene": "index i is the same Gaussian in all frames of a group",
     "tracked": "index i is the same Gaussian in every frame",
     "matched": "Gaussians were matched from frame to frame",
     "independent": "frames do not match each other, each is coded alone",
@@ -148,16 +149,37 @@ def _restricted(sequence, frames: str | None):
     chosen = frame_range(frames, sequence.frame_count)
     if len(chosen) == sequence.frame_count:
         return sequence
-    groups, start = [], 0
+    groups, start, place = [], 0, None  # place: index in the last cut group of each Gaussian that it had before
     for g in sequence.groups:
         a, b = max(chosen[0] - start, 0), min(chosen[-1] + 1 - start, len(g))
         if a < b:
-            life = None if g.lifetimes is None else np.clip(g.lifetimes - a, 0, b - a)
-            whole = (a, b) == (0, len(g)) and isinstance(g, ParametricGroup)
-            cut = DenseGroup([g.frame(t) for t in range(a, b)], life, g.parents if groups else None)
-            groups.append(replace(g, parents=g.parents if groups else None) if whole else cut)
+            parents = _moved_parents(g.parents, place) if groups else None
+            place = None
+            if (a, b) == (0, len(g)):
+                groups.append(replace(g, parents=parents))
+            else:
+                cut, place = _cut(g, parents, a, b)
+                groups.append(cut)
         start += len(g)
     return sequence.with_groups(groups)
+
+
+def _cut(g, parents: np.ndarray | None, a: int, b: int) -> tuple[DenseGroup, np.ndarray | None]:
+    """Frames a to b - 1 of a group, with the Gaussians that live in them, and the new index of each, -1: gone."""
+    if g.lifetimes is None:
+        return DenseGroup([g.frame(t) for t in range(a, b)], None, parents), None
+    life = np.clip(g.lifetimes - a, 0, b - a)
+    kept = life[:, 0] < life[:, 1]
+    frames = [g.frame(t).take(kept) for t in range(a, b)]
+    place = np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32)
+    return DenseGroup(frames, life[kept], None if parents is None else parents[kept]), place
+
+
+def _moved_parents(parents: np.ndarray | None, place: np.ndarray | None) -> np.ndarray | None:
+    """Parents by the new indices of the group before."""
+    if parents is None or place is None or not len(place):
+        return parents
+    return np.where(parents >= 0, place[np.maximum(parents, 0)], -1).astype(np.int32)
 
 
 def capture_source(path: Path, out: Path, settings: EncodeSettings, options: TrainOptions, bar: Bar) -> Source:

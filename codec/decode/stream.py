@@ -157,6 +157,19 @@ class Stream:
         """The whole file as a sequence with the groups of the stream; groups and frames are decoded when read."""
         return GaussianSequence(self.fps, _Groups(self), self.cameras)
 
+    def identities(self) -> list[np.ndarray]:
+        """[N] int of each group: the same number is the same Gaussian, in groups that are predicted from each other."""
+        found, known = [], 0
+        for i in range(len(self.groups)):
+            q = self.group(i).quantized()
+            own = np.arange(known, known + len(q))
+            if q.reference:
+                own = np.where(q.parents >= 0, found[i - q.reference][np.maximum(q.parents, 0)], own)
+            found.append(own)
+            known += len(q)
+        _, numbers = np.unique(np.concatenate(found) if found else np.zeros(0, int), return_inverse=True)
+        return np.split(numbers, np.cumsum([len(f) for f in found])[:-1]) if found else []
+
 
 class _Groups(Sequence):
     """Groups of a stream as ParametricGroups, decoded when read."""

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..model.attributes import ATTRIBUTES
 from ..model.camera import Camera
+from ..model.gaussians import Gaussians
 from ..model.parametric_group import ParametricGroup
 from ..render.sensitivity import Importance, measure
 from .settings import PlanSettings
 
+HIDDEN = -30.0  # logit opacity that no view shows
+GOLDEN = (5**0.5 - 1) / 2  # steps of this share of a group visit its frames evenly, in no order that views have
+
 
 def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanSettings) -> Importance:
-    """Importance of the N Gaussians, from the first, the middle and the last frame.
+    """Importance of the N Gaussians, from the first, the middle and the last frame. Where Gaussians come and go, each
+    view shows another frame: three frames would miss some of them.
 
     Args:
         cameras: from which the subject was captured, if it was.
@@ -22,6 +29,17 @@ def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanS
         own = [a for a in ATTRIBUTES if a.name != "shN" or g.sh_degree]
         sizes = {a.name: a.channels * (g.shN.shape[1] if a.name == "shN" else 1) for a in own}
         return Importance({n: np.zeros((0, c)) for n, c in sizes.items()}, np.zeros((0, 3)), np.zeros(0))
-    shown = [group.frame(t) for t in sorted({0, frames // 2, frames - 1})]
+    few = [group.frame(t) for t in sorted({0, frames // 2, frames - 1})]
+    around = np.concatenate([f.means for f in few])
     views = settings.more_views if frames == 1 or len(g) <= settings.few else settings.views
-    return measure(shown, cameras, views)
+    if group.lifetimes is not None:
+        times = [int(frames * ((i + 0.5) * GOLDEN % 1)) for i in range(views)]
+        return measure(lambda i: _shown(group, times[i]), around, cameras, views)
+    return measure(lambda i: few[i % len(few)], around, cameras, views)
+
+
+def _shown(group: ParametricGroup, t: int) -> Gaussians:
+    """All Gaussians at frame `t`; those outside of their lifetime are transparent."""
+    g, life = group.frame(t), group.lifetimes
+    shown = (life[:, 0] <= t) & (t < life[:, 1])
+    return replace(g, logit_opacities=np.where(shown, g.logit_opacities, np.float32(HIDDEN)))

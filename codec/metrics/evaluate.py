@@ -132,6 +132,7 @@ def evaluate_splats(
     frames: Sequence[int] | None = None,
     *,
     size: int | None = None,
+    stream_frames: int | None = None,
     progress: Progress | None = None,
 ) -> dict:
     """Measures decoded Gaussians against the encoded ones, both rendered from the 16 codec cameras.
@@ -139,7 +140,8 @@ def evaluate_splats(
     Args:
         frame_source: frame -> Gaussians as shown.
         frames: the frames to compare; all by default.
-        size: bytes of the stream, for the rates over all frames of the sequence.
+        size: bytes of the stream, for the rates.
+        stream_frames: frames that the stream has; None: those of the sequence.
 
     Returns:
         The keys of evaluate_capture with codec_psnr and codec_psnr_fg instead of psnr, psnr_fg, ssim, vmaf and flicker.
@@ -166,7 +168,7 @@ def evaluate_splats(
             if progress:
                 progress(i * len(cameras) + n + 1, len(picked) * len(cameras))
         rows.append({"frame": t} | {k: _mean(x[k] for x in images) for k in images[0]})
-    return _report(sequence.frame_count, counts, size, rows)
+    return _report(stream_frames or sequence.frame_count, counts, size, rows)
 
 
 def _draw(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

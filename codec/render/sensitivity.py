@@ -70,21 +70,28 @@ def sensitivity_cameras(means: np.ndarray, given: list[Camera] = (), count: int 
 
 
 def measure(
-    frames: list[Gaussians], cameras: list[Camera] = (), views: int = VIEWS, *, backend: Backend | None = None
+    shown: Callable[[int], Gaussians],
+    means: np.ndarray,
+    cameras: list[Camera] = (),
+    views: int = VIEWS,
+    *,
+    backend: Backend | None = None,
 ) -> Importance:
-    """Sensitivity over `frames` (the same N >= 1 Gaussians).
+    """Sensitivity over several frames of the same N >= 1 Gaussians.
 
     Args:
+        shown: view -> the Gaussians that it shows.
+        means: [M, 3] positions in all frames, around which the views stand.
         cameras: of the capture.
         views: rendered, all frames together.
         backend: a new CpuBackend if None.
     """
     signs = np.random.default_rng(0)
     backend = backend or CpuBackend()
-    cameras = sensitivity_cameras(np.concatenate([g.means for g in frames]), cameras, views)
-    total, removal = {}, np.zeros(len(frames[0]))
+    cameras = sensitivity_cameras(means, cameras, views)
+    total, removal = {}, 0.0
     for i, camera in enumerate(cameras):
-        g = frames[i % len(frames)]
+        g = shown(i)
         probe = (2.0 * signs.integers(0, 2, (camera.height, camera.width, 3)) - 1).astype(np.float32)
         share = 1 / (len(cameras) * probe.size)
         for name, d in derivatives(backend, g, camera, lambda _, probe=probe: probe).items():
@@ -177,7 +184,7 @@ def measured_steps(
     """
     if not len(g):
         return nominal
-    measured = measure([g], cameras, backend=backend)
+    measured = measure(lambda _: g, g.means, cameras, backend=backend)
     weights, values = measured.weights | {"quats": measured.scene_rotations}, channel_values(g)
     steps = steps_for_error(weights, {n: values[n] for n in weights}, error_for(quality), subject_radius(g.means))
     for n in (n for n in steps if BY_NAME[n].decorrelated):

@@ -1,8 +1,9 @@
-"""A folder of splats -> GaussianSequence with lazy frames; sequence_writer.py is its mirror.
+"""A folder, a file or a zip of splats -> GaussianSequence with lazy frames; sequence_writer.py is its mirror.
 
-A folder with sequence.json has its groups, lifetimes and nodes in it. A folder without it comes from another tool:
-either index i is verified to be the same Gaussian from frame to frame (tracked), or the Gaussians are matched, or each
-frame is a group of its own. Frames are read when they are asked for; a few stay in memory.
+A folder with sequence.json has its groups, lifetimes and nodes in it. VideoGS and .splatv have their own groups, in
+which index i is one Gaussian. Anything else: either index i is verified to be the same Gaussian from frame to frame
+(tracked), or the Gaussians are matched, or each frame is a group of its own. Frames are read when they are asked for; a
+few stay in memory.
 """
 
 from __future__ import annotations
@@ -10,11 +11,9 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import threading
 import warnings
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,14 +23,19 @@ from ..capture.detect import LOOKED_FOR, find_capture
 from ..errors import CaptureError, UsageError
 from ..model.camera import NEAR, Camera
 from ..model.gaussian_sequence import DenseGroup, GaussianSequence
-from ..model.gaussians import GOP, Gaussians
+from ..model.gaussians import GOP
 from ..model.parametric_group import ParametricGroup
 from . import parametric_file
-from .files import EXPECTED, is_splat, read_means, read_splat, splat_size
+from .archive import unpacked
+from .files import EXPECTED, is_splat, read_means, splat_size
+from .lazy_frames import Frames
+from .spacetime import spacetime_groups
+from .splatv import read_splatv, splatv_header
 from .tracking import relate
+from .videogs import find_checkpoints, find_packed, open_packed
 
 FPS = 30.0  # of folders without sequence.json
-KEEP = 4  # frames in memory
+SCENES = "a .splatv, VideoGS's checkpoint, feature_image or feature_video, or a zip of any of these"
 
 
 @dataclass(frozen=True)
@@ -39,8 +43,9 @@ class SplatSequence(GaussianSequence):
     """A sequence read from files.
 
     Attributes:
-        mode: "stored" (groups of sequence.json), "tracked" (index i is verified to be the same Gaussian), "matched"
-            (Gaussians of some frames were reordered) or "independent" (groups of one frame).
+        mode: "stored" (groups of sequence.json), "scene" (groups of a .splatv or of VideoGS), "tracked" (index i is
+            verified to be the same Gaussian), "matched" (Gaussians of some frames were reordered) or "independent"
+            (groups of one frame).
         names: file name of each frame.
         training: what `gscodec train` has left besides (`SequenceWriter`); None: others made the splats.
     """
@@ -50,72 +55,19 @@ class SplatSequence(GaussianSequence):
     training: dict | None = None
 
 
-class Frames(Sequence):
-    """Lazy frames of a folder: reads and reorders a frame when asked for, keeps the last few; thread-safe."""
-
-    def __init__(self, paths: list[Path], orders: dict[int, np.ndarray], hidden: dict[int, tuple] | None = None):
-        """
-        Args:
-            orders: frame -> [N] int, index in the file of each Gaussian.
-            hidden: frame -> ([N] bool, Gaussians outside their lifetime; their logit opacities [H]).
-        """
-        self._paths, self._orders, self._hidden = paths, orders, hidden or {}
-        self._kept: OrderedDict[int, Gaussians] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def __len__(self) -> int:
-        return len(self._paths)
-
-    def __getitem__(self, t):
-        if isinstance(t, slice):
-            return FrameRange(self, range(len(self))[t])
-        t = range(len(self))[t]
-        with self._lock:
-            kept = self._kept.get(t)
-        if kept is not None:
-            return kept
-        read = self._read(t)
-        with self._lock:
-            self._kept[t] = read
-            while len(self._kept) > KEEP:
-                self._kept.popitem(last=False)
-        return read
-
-    def _read(self, t: int) -> Gaussians:
-        g = read_splat(self._paths[t])
-        if t in self._orders:
-            g = g.take(self._orders[t])
-        if t in self._hidden:
-            where, values = self._hidden[t]
-            if len(where) != len(g) or where.sum() != len(values):
-                raise CaptureError(f"{self._paths[t]}: {len(g)} Gaussians, sequence.json has lifetimes of {len(where)}")
-            opacities = g.logit_opacities.copy()
-            opacities[where] = values
-            g = replace(g, logit_opacities=opacities)
-        return g
-
-
-class FrameRange(Sequence):
-    """A range of the frames of a `Frames`, as lazy as it."""
-
-    def __init__(self, frames: Frames, index: range):
-        self._frames, self._index = frames, index
-
-    def __len__(self) -> int:
-        return len(self._index)
-
-    def __getitem__(self, t):
-        if isinstance(t, slice):
-            return FrameRange(self._frames, self._index[t])
-        return self._frames[self._index[t]]
-
-
 def splat_paths(path: Path) -> list[Path]:
     """The frames of a folder in natural order (2 before 10), or the one frame that `path` itself is."""
     if not path.is_dir() or (path / "meta.json").is_file():
         return [path] if is_splat(path) else []
+    if found := find_checkpoints(path):
+        return found
     found = [p for p in path.iterdir() if is_splat(p)]
     return sorted(found, key=lambda p: [int(w) if w.isdigit() else w for w in re.split(r"(\d+)", p.name)])
+
+
+def is_scene(path: Path) -> bool:
+    """Whether `path` is a moving scene by itself: a .splatv, or a folder of VideoGS's packed maps."""
+    return path.suffix.lower() == ".splatv" or (path.is_dir() and find_packed(path) is not None)
 
 
 def detect_input(path: str | Path) -> str:
@@ -130,11 +82,13 @@ def detect_input(path: str | Path) -> str:
     path = Path(path)
     if not path.exists():
         raise CaptureError(f"{path}: no such file or folder, expected a capture or a folder of splats")
+    if path.suffix.lower() == ".zip":
+        path = unpacked(path)
     if find_capture(path):
         return "capture"
-    if splat_paths(path):
+    if is_scene(path) or splat_paths(path):
         return "splats"
-    looked = "; ".join([*LOOKED_FOR, f"splats, one per frame: {EXPECTED}"])
+    looked = "; ".join([*LOOKED_FOR, f"splats, one per frame: {EXPECTED}", SCENES])
     raise CaptureError(f"{path}: neither a capture nor splats; looked for {looked}")
 
 
@@ -145,7 +99,7 @@ def open_sequence(
     fps: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> SplatSequence:
-    """Opens a folder of splats (or a single one) as a sequence.
+    """Opens a folder of splats (or a single one, a moving scene or a zip) as a sequence.
 
     Args:
         gop: frames of a group at most, where there is no sequence.json.
@@ -159,9 +113,14 @@ def open_sequence(
     path = Path(path)
     if gop < 1 or (fps is not None and not fps > 0):
         raise UsageError(f"gop {gop} and fps {fps} must be positive")
+    if path.suffix.lower() == ".zip" and path.is_file():
+        path = unpacked(path)
     paths = splat_paths(path) if path.exists() else []
+    if not paths and path.exists() and is_scene(path):
+        groups, names, rate = _scene(path, gop)
+        return SplatSequence(fps or rate, groups, mode="scene", names=names)
     if not paths:
-        raise CaptureError(f"{path}: no splats, expected one file per frame: {EXPECTED}")
+        raise CaptureError(f"{path}: no splats, expected one file per frame: {EXPECTED}; or {SCENES}")
     if path.is_dir() and (path / "sequence.json").is_file():
         return _stored(path, paths, fps)
     sizes = [splat_size(p) for p in paths]
@@ -173,6 +132,15 @@ def open_sequence(
         spans = [frames[a : min(a + gop, stop)] for a in range(start, stop, gop)]
         groups += [DenseGroup(f, parents=same if k else None) for k, f in enumerate(spans)]
     return SplatSequence(fps or FPS, groups, mode=mode, names=[p.name for p in paths])
+
+
+def _scene(path: Path, gop: int) -> tuple[list[DenseGroup], list[str], float]:
+    """Groups of a file or a folder for which `is_scene` holds, the names of their frames, and frames a second."""
+    if path.suffix.lower() != ".splatv":
+        return *open_packed(find_packed(path), gop), FPS
+    head = splatv_header(path)
+    groups = spacetime_groups(read_splatv(path), np.arange(head.frames) / head.frames, gop)
+    return groups, [f"{path.name}:{t}" for t in range(head.frames)], head.fps
 
 
 def _tracks(
