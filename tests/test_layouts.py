@@ -191,11 +191,11 @@ def truncated(root):
     path.write_bytes(path.read_bytes()[:90])
 
 
-def fisheye(root):
+def thin_prism(root):
     (root / "frame9/sparse/0/cameras.bin").unlink()
     (root / "frame9/sparse/0/images.bin").unlink()
     (root / "frame9/sparse/0").rmdir()
-    colmap_bin(root / "frame9/sparse/0", number=5)
+    colmap_bin(root / "frame9/sparse/0", number=10)
 
 
 def one_row_less(root):
@@ -231,7 +231,7 @@ def overwrite(name, text):
     ("write", "harm", "message"),
     [
         (frame_folders, truncated, r"images.bin: damaged .*, expected a COLMAP model"),
-        (frame_folders, fisheye, r"camera model 5 is not supported, undistort to PINHOLE first"),
+        (frame_folders, thin_prism, r"camera model 10 is not supported, undistort to PINHOLE first"),
         (n3dv, one_row_less, r"poses_bounds.npy: 2 cameras, expected as many as there are videos: 3"),
         (n3dv, overwrite("poses_bounds.npy", "x"), r"poses_bounds.npy: not a numpy file"),
         (actorshq, overwrite("calibration.csv", "name,w\na,1\n"), r"expected a line for each camera with the columns"),

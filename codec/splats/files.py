@@ -8,10 +8,10 @@ import numpy as np
 
 from ..errors import CaptureError, UsageError
 from ..model.gaussians import Gaussians
+from ..ply_table import read_header, read_table
 from .compressed_ply import gaussians_of_compressed, is_compressed, write_compressed_ply
 from .drc import read_drc, write_drc
 from .ply import FIELDS, gaussians_of, sh_count, stack, write_ply
-from .ply_table import read_header, read_table
 from .sog import SH_BANDS, read_sog, read_sog_meta, write_sog
 
 ENDINGS = (".ply", ".compressed.ply", ".sog", ".drc")
