@@ -199,10 +199,12 @@ def _mask_file(root: Path, image: Path, f: dict) -> Path:
 
 
 def _common_times(entries: list[Entry]) -> list[float]:
-    """The frames that at least half of the training cameras have; cameras that lack one of them are left out later."""
-    trained = [e for e in entries if e.split == "train"] or entries
-    count = Counter(t for _, t in {(e.camera, e.time) for e in trained})
-    return sorted(t for t, n in count.items() if 2 * n >= max(count.values()))
+    """The frames that most cameras have, or those of a single training camera (D-NeRF); cameras that lack one of them
+    are left out later."""
+    trained = [e for e in entries if e.split == "train"]
+    alone = len({e.camera for e in trained}) == 1
+    count = Counter(t for _, t in {(e.camera, e.time) for e in (trained if alone else entries)})
+    return sorted(t for t, n in count.items() if 2 * n > max(count.values()))
 
 
 def _by_camera(entries: list[Entry]) -> dict[str, list[Entry]]:
