@@ -108,7 +108,8 @@ def feed_of(source: Video | Sequence[Path], masks: Path) -> Feed:
         stems = [f"{t:06}" for t in range(source.frame_count)]
     else:
         stems = [image.stem for image in source]
-    return Feed(source, numbered(masks), [masks / f"{stem}.png" for stem in stems])
+    there = numbered(masks)
+    return Feed(source, there, there if len(there) == len(stems) else [masks / f"{stem}.png" for stem in stems])
 
 
 def assemble(
