@@ -93,9 +93,9 @@ def make_masks(
 
 
 def _check(capture: Capture, plates: Path | None, overwrite: bool) -> None:
-    if any(f.has_alpha and not f.masked_by_files for f in capture.footage):
+    if any(f.has_alpha and not f.masks for f in capture.footage):
         raise UsageError(f"{capture.name}: its images have an alpha channel, which is their mask; none is to be made")
-    there = next((m for f in capture.footage for m in f.mask_files if m.is_file()), None)
+    there = next((m for f in capture.footage for m in (*f.masks, *f.mask_files) if m.is_file()), None)
     if there is not None and not overwrite:
         raise UsageError(f"{there}: there are masks already; delete them, or say --overwrite to replace them")
     if capture.moves:

@@ -67,7 +67,7 @@ def describe_capture(path: Path, frame: int = 0) -> tuple[Capture, dict]:
 def _masks(capture: Capture) -> str | None:
     if not capture.has_alpha:
         return None
-    return "files" if any(f.masked_by_files for f in capture.footage) else "alpha"
+    return "files" if any(f.masks for f in capture.footage) else "alpha"
 
 
 def _camera(capture: Capture, frame: int, i: int, matches: list[Matches]) -> dict:

@@ -40,6 +40,7 @@ class Feed:
 
     Attributes:
         path: of the video or the first image.
+        masks: the mask file of each frame, empty where there are none.
         width, height: of the video or the first image; later images are checked against the camera.
         has_alpha: views have an alpha channel, of their own or from masks.
 
@@ -64,7 +65,7 @@ class Feed:
         there = [m for m in masks if m is not None]
         if there and len(there) < len(self):
             raise CaptureError(f"{there[0].parent}: {len(there)} masks for {len(self)} frames")
-        self._masks = there
+        self.masks = there
         self.has_alpha = alpha or bool(there)
 
     def __len__(self) -> int:
@@ -78,20 +79,16 @@ class Feed:
     def view(self, t: int) -> View:
         """Frame `t` as it was recorded, with its mask."""
         view = self.picture(t)
-        if not self._masks:
+        if not self.masks:
             return view
-        alpha = read_mask(self._masks[t], labels=self._labels)
+        alpha = read_mask(self.masks[t], labels=self._labels)
         if alpha.shape != view.rgb.shape[:2]:
-            raise CaptureError(f"{self._masks[t]}: mask is {_size(alpha.shape)}, its image {_size(view.rgb.shape)}")
+            raise CaptureError(f"{self.masks[t]}: mask is {_size(alpha.shape)}, its image {_size(view.rgb.shape)}")
         return View(view.rgb, alpha)
 
     def picture(self, t: int) -> View:
         """Frame `t` as it was recorded, without the mask of a file."""
         return View(self._source.frame(t)) if isinstance(self._source, Video) else read_image(self._source[t])
-
-    @property
-    def masked_by_files(self) -> bool:
-        return bool(self._masks)
 
     def name(self, t: int) -> Path:
         """The file that has frame `t`."""
