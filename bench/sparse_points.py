@@ -61,13 +61,8 @@ def measure(capture: Capture, preset: str, frame: int) -> dict:
     models, seconds = every_frame_alone(capture, range(frame, frame + 1), train_settings(preset))
     cpu = round(time.process_time() - start, 1)
     found = evaluate_capture(lambda _: models[0], part(capture, range(frame, frame + 1)), "test")
-    keys = ("psnr", "psnr_fg", "psnr_corrected", "ssim")
-    return {
-        **{k: found[k] for k in keys},
-        "seconds": round(seconds, 1),
-        "cpu_seconds": cpu,
-        "gaussians": len(models[0]),
-    }
+    quality = {k: round(found[k], 3) for k in ("psnr", "psnr_fg", "psnr_corrected", "ssim")}
+    return {**quality, "seconds": round(seconds, 1), "cpu_seconds": cpu, "gaussians": len(models[0])}
 
 
 def main() -> None:

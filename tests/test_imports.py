@@ -27,7 +27,7 @@ ALLOWED = {  # part -> parts that it may import, besides itself
     "bitstream": BASE | {"model"},
     "render": BASE | {"model", "bitstream"},
     "decode": BASE | {"model", "bitstream", "render"},
-    "capture": BASE | {"model", "ply_table", "atomic_write"},
+    "capture": BASE | {"model", "ply_table"},
     "splats": BASE | {"model", "capture", "atomic_write", "ply_table"},
     "metrics": BASE | {"model", "render", "capture", "splats"},
     "fit": BASE | {"model", "bitstream", "farthest_point_sampling", "threads"},

@@ -205,3 +205,13 @@ def test_growing_and_pruning_keep_the_moments_in_step():
     assert len(model) == 90, "what changes nothing in the picture is not worth its bits"
     model.step({n: torch.ones_like(p) for n, p in model.params.items()}, {"means": 0.1})
     assert torch.isfinite(model.params["means"]).all()
+
+
+def test_many_points_leave_room_for_the_hull():
+    plain = capture_of(turning(3000, frames=1))
+    means = np.random.default_rng(0).uniform(-0.2, 0.2, (5000, 3)).astype(np.float32)
+    capture = dataclasses.replace(plain, points=Points(means, np.zeros((5000, 3), np.uint8)))
+    found = initial_model(capture, 0, 300, TINY)[0].params["means"].numpy()
+    own = (np.abs(found) <= 0.2).all(1).sum()
+    assert own >= 210
+    assert 260 < len(found) < 420

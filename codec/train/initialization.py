@@ -35,8 +35,9 @@ def initial_model(capture, frame: int, count: int, settings: TrainSettings) -> t
         v = capture.view(camera, frame)
         views.append((capture.camera(camera, frame), v.rgb, v.alpha))
     known = [c for c, _, _ in views]
-    own = known_points(capture.points if s.use_points else None, views, count, settings.seed)
-    left = max(count - len(own[0]), 1)
+    most = int(s.points_share_max * count)
+    own = known_points(capture.points if s.use_points else None, views, most, settings.seed)
+    left = count - len(own[0])
     if all(alpha is not None for _, _, alpha in views):
         hull = hull_points(known, views, left, settings.visual_hull)
         if len(hull[0]):

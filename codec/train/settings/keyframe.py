@@ -12,6 +12,7 @@ class InitializationSettings:
     """Initial points of a keyframe, and which source they come from."""
 
     use_points: bool = True  # the sparse points of the capture, where it has some
+    points_share_max: float = 0.7  # of the points to start from; sparse points leave out what has no texture
     use_plane_sweep: bool = True  # False: a capture without masks starts from random points
     sweep_min_share: float = 0.1  # of initial_points: with fewer, the scene has too little texture for a plane sweep
     surface_opacity: float = 0.5  # of points on a surface that was found
