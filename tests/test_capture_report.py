@@ -60,7 +60,9 @@ def test_the_sheet_shows_pictures_masks_and_rig(tmp_path):
     assert sheet.dtype == np.uint8
     for colour in (COLOURS["train"], COLOURS["test"], BORDER):
         assert shows(sheet, colour), colour
-    assert not shows(sheet, COLOURS["val"])
+    plain = contact_sheet(describe_capture(write_wall(tmp_path / "plain"))[0])
+    assert not shows(plain, COLOURS["test"])
+    assert not shows(plain, BORDER)
     first = sheet[30:200, 10:300].astype(float).mean((0, 2))
     assert first[-100:].mean() > 1.5 * first[:100].mean(), "what the mask leaves out is dark"
 

@@ -15,7 +15,7 @@ from ..model.camera import Camera, meeting_point
 from .capture import Capture
 
 WIDTH, PANEL, LINE, GAP = 1600, 620, 18, 6  # pixels
-THUMBNAIL = 340  # pixels, widest
+THUMBNAIL = 400  # pixels, widest
 PAPER, INK, FAINT = (250, 250, 248), (40, 40, 40), (205, 205, 205)
 COLOURS = {"train": (46, 98, 180), "test": (222, 120, 20), "val": (120, 120, 120)}
 BORDER = (235, 30, 120)
@@ -33,7 +33,7 @@ def contact_sheet(capture: Capture, frame: int = 0) -> np.ndarray:
     cameras = [capture.camera(i, frame) for i in range(len(capture.cameras))]
     aspect = max(c.height / c.width for c in cameras)
     columns = _columns(len(cameras), aspect)
-    width = (WIDTH - GAP) // columns - GAP
+    width = min((WIDTH - GAP) // columns - GAP, THUMBNAIL)
     height = round(width * aspect)
     rows = -(-len(cameras) // columns)
     top = GAP + rows * (height + LINE + GAP)
