@@ -20,8 +20,8 @@ import numpy as np
 
 from gscodec.errors import CaptureError
 from gscodec.model.rotations import quat_multiply, rotate
+from gscodec.ply_table import read_table, write_table
 from gscodec.splats.ply import FIELDS
-from gscodec.splats.ply_table import read_table, write_table
 
 AXES = ("x", "-x", "y", "-y", "z", "-z")
 JITTER = {"quats": 0.004, "log_scales": 0.01, "logit_opacities": 0.03, "sh0": 0.004}

@@ -20,6 +20,7 @@ from .commands.decode import decode
 from .commands.encode import encode
 from .commands.eval import evaluate
 from .commands.info import info
+from .commands.masks import masks
 from .commands.play import play
 from .commands.render import render
 from .commands.train import train
@@ -32,7 +33,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (encode, train, decode, render, play, info):
+for command in (encode, train, decode, render, play, info, masks):
     app.command()(command)
 app.command(name="eval")(evaluate)
 app.add_typer(bench, name="bench")

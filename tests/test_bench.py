@@ -25,9 +25,9 @@ from gscodec.errors import CaptureError, UsageError
 from gscodec.fit import fit_groups
 from gscodec.model.gaussian_sequence import DenseGroup
 from gscodec.model.parametric_group import ParametricGroup
+from gscodec.ply_table import read_table
 from gscodec.render import sensitivity
 from gscodec.splats import write_splat
-from gscodec.splats.ply_table import read_table
 from gscodec.train.settings import train_settings
 
 BENCH = ROOT / "bench"

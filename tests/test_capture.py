@@ -323,7 +323,12 @@ def test_damaged_and_missing_images(rig):
         ('{"frames": [{}]}', r"frames\[0\] has no file_path"),
         ('{"frames": [{"file_path": "a", "frame": "x"}]}', r"frame or time of frames\[0\] is not a number"),
         ('{"fps": "fast", "frames": [{"file_path": "a"}]}', r"fps, frame or time is not a number"),
-        ('{"camera_model": "OPENCV_FISHEYE", "frames": [{}]}', "camera_model OPENCV_FISHEYE is not supported"),
+        (
+            '{"camera_model": "EQUIRECTANGULAR", "frames": [{}]}',
+            "camera_model EQUIRECTANGULAR is not supported, expected OPENCV, .*OPENCV_FISHEYE; undistort it first",
+        ),
+        ('{"ply_file_path": 3, "frames": [{"file_path": "a"}]}', "ply_file_path is 3, expected the name of a .ply"),
+        ('{"ply_file_path": "a.ply", "frames": [{"file_path": "a"}]}', "a.ply: no such file, expected a .ply"),
     ],
 )
 def test_bad_transforms_files(tmp_path, text, message):

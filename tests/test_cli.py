@@ -44,7 +44,7 @@ def fails(result, *words, code=1):
 def test_help_names_every_command():
     result = run("--help")
     assert result.returncode == 0
-    for command in ("encode", "train", "decode", "render", "play", "info", "eval", "bench", "chart"):
+    for command in ("encode", "train", "decode", "render", "play", "info", "masks", "eval", "bench", "chart"):
         assert command in result.stdout
         assert run(command, "--help").returncode == 0
 

@@ -11,6 +11,7 @@ from training import TINY, arc, capture_of, psnr_of, rig, splat_wall
 from bench.train import coded
 from gscodec.capture.capture import Capture
 from gscodec.capture.images import View
+from gscodec.capture.points import Points
 from gscodec.encode.settings import EncodeSettings
 from gscodec.model.camera import meeting_point
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
@@ -69,6 +70,23 @@ def test_initial_points_do_without_shell_or_sweep():
     assert len(with_shell) > len(without) == TINY.initial_points
     opacities = [float(torch.sigmoid(m.params["logit_opacities"][0])) for m in (without, random)]
     assert opacities == pytest.approx([TINY.initialization.surface_opacity, TINY.initialization.random_opacity])
+
+
+@pytest.mark.parametrize("masks", [True, False])
+def test_a_keyframe_starts_from_the_captures_points(masks):
+    """Those that the pictures do not refute; what else is known of the surface comes besides."""
+    plain = capture_of(turning(3000, frames=1), masks)
+    means = np.float32([(0, 0, 0.1), (0, 0.1, 0), (0, 0, 1.6), (50, 0, 0)])  # two in all masks, one outside, one unseen
+    points = Points(means, np.uint8([(255, 0, 0), (0, 255, 0), (0, 0, 255), (9, 9, 9)]))
+    capture = dataclasses.replace(plain, points=points)
+    model, _ = initial_model(capture, 0, 300, TINY)
+    kept = means[: 2 if masks else 3]
+    found = model.params["means"].numpy()[: len(kept)]
+    assert {tuple(x) for x in found.tolist()} == {tuple(x) for x in kept.tolist()}
+    assert len(model) >= 0.6 * len(initial_model(plain, 0, 300, TINY)[0])
+    told = dataclasses.replace(TINY, initialization=dataclasses.replace(TINY.initialization, use_points=False))
+    without = initial_model(capture, 0, 300, told)[0].params["means"]
+    assert torch.equal(without, initial_model(plain, 0, 300, TINY)[0].params["means"])
 
 
 def test_projection_is_the_renderers(capture):
@@ -187,3 +205,13 @@ def test_growing_and_pruning_keep_the_moments_in_step():
     assert len(model) == 90, "what changes nothing in the picture is not worth its bits"
     model.step({n: torch.ones_like(p) for n, p in model.params.items()}, {"means": 0.1})
     assert torch.isfinite(model.params["means"]).all()
+
+
+def test_many_points_leave_room_for_the_hull():
+    plain = capture_of(turning(3000, frames=1))
+    means = np.random.default_rng(0).uniform(-0.2, 0.2, (5000, 3)).astype(np.float32)
+    capture = dataclasses.replace(plain, points=Points(means, np.zeros((5000, 3), np.uint8)))
+    found = initial_model(capture, 0, 300, TINY)[0].params["means"].numpy()
+    own = (np.abs(found) <= 0.2).all(1).sum()
+    assert own >= 210
+    assert 260 < len(found) < 420

@@ -80,3 +80,11 @@ def test_table_of_the_player():
         shown = ("gaussians", "first_picture_ms", "fps_clock", "fps_free")
         values = [*(found[k] for k in shown), found["decode"]["wasm_ms"], found["decode"]["ratio"]]
         assert all(map(agrees, (f.replace(",", "") for f in figures), values)), (name, figures, values)
+
+
+def test_table_of_sparse_points():
+    found = result("points")
+    for name, *figures in rows("frame 0 of"):
+        none, points = (found[f"{name}, frame 0, fast, {k}"] for k in ("none", "points"))
+        values = [points["points"], none["psnr"], points["psnr"], none["ssim"], points["ssim"]]
+        assert all(map(agrees, figures, values)), (name, figures, values)

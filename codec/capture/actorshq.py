@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import CaptureError, require
 from ..model.camera import Camera
 from .capture import Capture
-from .rig import Feed, Track, assemble, numbered, pinhole, rigid, usable
+from .rig import Feed, Track, assemble, feed_of, numbered, pinhole, rigid, usable
 
 NUMBERS = ("w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
 FPS = 25.0
@@ -33,7 +33,7 @@ def open_actorshq(calibration: Path) -> Capture:
         images = numbered(root / "rgbs" / name)
         if not images:
             raise CaptureError(f"no images in {root / 'rgbs' / name}")
-        return [_camera(name, line)], Feed(images, numbered(root / "masks" / name))
+        return [_camera(name, line)], feed_of(images, root / "masks" / name)
 
     return assemble(root.resolve().name, *usable(calibration, made, make), FPS)
 

@@ -9,12 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..errors import UsageError
 from ..model.camera import Camera
 from .images import View, resize_area
+from .points import Points
+
+if TYPE_CHECKING:
+    from .rig import Feed
 
 MARGIN = 24  # pixels of background kept around the subject
 STILL = 1e-6  # a camera whose values change by less, relatively, stands still
@@ -34,6 +39,8 @@ class Capture:
         first_frame: source frame that is frame 0 here.
         poses: (camera index, frame of the source) -> the camera in that frame, of which K (at the source's size) and
             viewmat are used; thread-safe. None: no camera moves.
+        points: sparse points that came with the capture, None: there are none.
+        footage: what each camera has recorded; empty where the capture is not read from files.
     """
 
     name: str
@@ -44,6 +51,8 @@ class Capture:
     read: Callable[[int, int], View]
     first_frame: int = 0
     poses: Callable[[int, int], Camera] | None = None
+    points: Points | None = None
+    footage: Sequence[Feed] = ()
 
     def view(self, camera_index: int, frame: int) -> View:
         """The image of a camera at a frame, at the camera's size.
@@ -126,7 +135,7 @@ def differs(a: Camera, b: Camera, scale: float) -> bool:
     Args:
         scale: length that errors of positions are relative to, world units.
     """
-    if a.distortion.shape != b.distortion.shape:
+    if a.distortion.shape != b.distortion.shape or a.fisheye != b.fisheye:
         return True
     pairs = ((a.viewmat[:3, :3], b.viewmat[:3, :3], 1.0), (a.viewmat[:3, 3], b.viewmat[:3, 3], scale))
     pairs += ((a.K, b.K, a.width), (a.distortion, b.distortion, 1.0))

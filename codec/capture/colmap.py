@@ -9,7 +9,8 @@ two kinds of captures:
   frames.
 
 A camera whose known poses agree stands still, and one known pose is enough. A camera that moves needs a pose in every
-frame. Masks are in masks/ under the same names. Poses are world-to-camera, OpenCV axes, pixel centres at half-integers.
+frame. Masks are in masks/ under the same names. The points of the (first) model are those of the capture. Poses are
+world-to-camera, OpenCV axes, pixel centres at half-integers.
 """
 
 from __future__ import annotations
@@ -25,18 +26,25 @@ import numpy as np
 from ..errors import CaptureError
 from ..model.camera import Camera
 from .capture import Capture, differs, extent
+from .colmap_points import read_colmap_points
 from .images import SUFFIXES
 from .rig import Feed, Track, assemble, by_number, numbered, pinhole, rigid, usable
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
-# number and name of the camera model -> which parameter is fx, fy, cx, cy, k1, k2, p1, p2 (None: 0)
+# number and name of the camera model -> which parameter is fx, fy, cx, cy and then OpenCV's distortion: k1, k2, p1, p2,
+# k3 ... k6, or k1, k2, k3, k4 of a fisheye lens
 LENSES = {
     0: ("SIMPLE_PINHOLE", (0, 0, 1, 2)),
     1: ("PINHOLE", (0, 1, 2, 3)),
     2: ("SIMPLE_RADIAL", (0, 0, 1, 2, 3)),
     3: ("RADIAL", (0, 0, 1, 2, 3, 4)),
     4: ("OPENCV", (0, 1, 2, 3, 4, 5, 6, 7)),
+    5: ("OPENCV_FISHEYE", (0, 1, 2, 3, 4, 5, 6, 7)),
+    6: ("FULL_OPENCV", tuple(range(12))),
+    8: ("SIMPLE_RADIAL_FISHEYE", (0, 0, 1, 2, 3)),
+    9: ("RADIAL_FISHEYE", (0, 0, 1, 2, 3, 4)),
 }
+FISHEYE = (5, 8, 9)
 NUMBERS = {name: number for number, (name, _) in LENSES.items()}
 
 
@@ -45,6 +53,7 @@ class _Lens:
     width: int
     height: int
     params: list[float]  # fx, fy, cx, cy, k1 ...
+    fisheye: bool
 
 
 @dataclass(frozen=True)
@@ -78,12 +87,12 @@ class _Model:
         fx, fy, cx, cy, *distortion = lens.params
         unit = 0 < np.linalg.norm(i.quat) < np.inf
         R = Rotation.from_quat(np.roll(i.quat, -1)).as_matrix() if unit else np.zeros((3, 3))  # which `rigid` refuses
-        terms = np.array((distortion + [0.0] * 4)[:4])
+        terms = np.array(distortion + [0.0] * (4 - len(distortion)))
         try:
             K, viewmat = pinhole(fx, fy, cx, cy), rigid(R, i.translation)
         except CaptureError as e:
             raise CaptureError(f"{self.folder}, image {image}: {e}") from e
-        return Camera(_name(image), K, viewmat, lens.width, lens.height, terms)
+        return Camera(_name(image), K, viewmat, lens.width, lens.height, terms, fisheye=lens.fisheye)
 
 
 def find_model(folder: Path) -> Path | None:
@@ -115,7 +124,8 @@ def open_colmap(root: Path) -> Capture:
         made, make = _one_folder(root, model)
     else:
         made, make = _frame_folders(frames_of(root), model)
-    return assemble(root.resolve().name, *usable(found, dict(sorted(made.items(), key=_by_number)), make))
+    tracks, feeds = usable(found, dict(sorted(made.items(), key=_by_number)), make)
+    return assemble(root.resolve().name, tracks, feeds, points=read_colmap_points(found))
 
 
 def _by_number(item: tuple[str, object]) -> list:
@@ -129,7 +139,8 @@ def _frame_folders(frames: list[Path], first: _Model):
     def make(name: str, image: str) -> tuple[Track, Feed]:
         paths = [_there(f / "images" / image) for f in frames]
         masks = [_mask(f / "masks", Path(image)) for f in frames]
-        return _track([m and m.camera(image) for m in models], paths), Feed(paths, masks)
+        files = [m or (f / "masks" / image).with_suffix(".png") for m, f in zip(masks, frames, strict=True)]
+        return _track([m and m.camera(image) for m in models], paths), Feed(paths, masks, files)
 
     return {_name(image): image for image in first.images}, make
 
@@ -145,8 +156,9 @@ def _one_folder(root: Path, model: _Model):
         paths = paths or [_there(root / "images" / images[0])]
         names = [p.relative_to(root / "images") for p in paths]
         masks = [_mask(root / "masks", n) for n in names]
+        files = [m or (root / "masks" / n).with_suffix(".png") for m, n in zip(masks, names, strict=True)]
         known = [model.camera(n.as_posix()) for n in names]
-        return _track(known if any(known) else [model.camera(images[0])], paths), Feed(paths, masks)
+        return _track(known if any(known) else [model.camera(images[0])], paths), Feed(paths, masks, files)
 
     return made, make
 
@@ -202,7 +214,9 @@ def _read_model(folder: Path) -> _Model:
 
 def _lens(number: int, width: int, height: int, params: list[float]) -> _Lens:
     which = LENSES[number][1]
-    return _Lens(width, height, [params[i] for i in which])
+    if len(params) <= max(which):
+        raise ValueError(f"camera model {LENSES[number][0]} has {len(params)} parameters, expected {max(which) + 1}")
+    return _Lens(width, height, [params[i] for i in which], number in FISHEYE)
 
 
 def _known(number: int | None, shown: object) -> int:

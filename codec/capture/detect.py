@@ -8,19 +8,24 @@ from ..errors import CaptureError
 from .actorshq import open_actorshq
 from .capture import Capture
 from .colmap import find_model, open_colmap
+from .dynamic3dgs import TRAIN, open_dynamic3dgs
 from .easyvolcap import find_calibration, open_easyvolcap
 from .n3dv import open_n3dv
 from .qualisys import open_qualisys
 from .transforms import open_transforms
+from .zju_mocap import FILE, open_zju_mocap
 
 
 def _transforms(path: Path) -> list[tuple[Path, str]]:
     if path.is_file():
-        return [(path, "train")] if path.suffix == ".json" else []
+        return [(path, "train")] if path.suffix == ".json" and path.name != TRAIN else []
     if (path / "transforms.json").is_file():
         return [(path / "transforms.json", "train")]
-    train, test = path / "transforms_train.json", path / "transforms_test.json"
-    return [(p, s) for p, s in ((train, "train"), (test, "test")) if p.is_file()] if train.is_file() else []
+    train = path / "transforms_train.json"
+    if not train.is_file():
+        return []
+    test = next((p for s in ("test", "val") if (p := path / f"transforms_{s}.json").is_file()), None)
+    return [(train, "train"), *([(test, "test")] if test else [])]
 
 
 def _qualisys(path: Path) -> Path | None:
@@ -35,17 +40,29 @@ def _open_qualisys(path: Path, calibration: Path) -> Capture:
     return open_qualisys(root.parent if root.name == "calibration" else root, calibration)
 
 
-def _file(path: Path, *names: str) -> Path | None:
-    """The first of the files `names` of the folder `path`, if all are there."""
-    return path / names[0] if all((path / n).is_file() for n in names) else None
+def _file(path: Path, name: str) -> Path | None:
+    """`path`, if it is a file `name`, or the one in the folder `path`."""
+    if path.is_file():
+        return path if path.name == name else None
+    return path / name if (path / name).is_file() else None
 
 
 # layout -> its files in words, path -> calibration or None, (path, calibration) -> Capture
 LAYOUTS = {
     "transforms": (
-        "transforms.json or transforms_train.json (nerfstudio, instant-ngp)",
+        "transforms.json or transforms_train.json (nerfstudio, instant-ngp, D-NeRF)",
         _transforms,
         lambda _, files: open_transforms(files),
+    ),
+    "dynamic3dgs": (
+        "train_meta.json with ims/ (Dynamic 3D Gaussians)",
+        lambda path: _file(path, TRAIN),
+        lambda _, calibration: open_dynamic3dgs(calibration),
+    ),
+    "zju_mocap": (
+        "annots.npy (ZJU-MoCap)",
+        lambda path: _file(path, FILE),
+        lambda _, calibration: open_zju_mocap(calibration),
     ),
     "n3dv": (
         "poses_bounds.npy with a video for each camera (Neural 3D Video)",

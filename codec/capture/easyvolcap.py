@@ -17,7 +17,7 @@ import numpy as np
 from ..errors import CaptureError, require
 from ..model.camera import Camera
 from .capture import Capture
-from .rig import Feed, Track, assemble, by_number, find_video, numbered, pinhole, rigid, usable
+from .rig import Feed, Track, assemble, by_number, feed_of, find_video, numbered, pinhole, rigid, usable
 from .video import Video
 
 
@@ -82,7 +82,7 @@ def open_easyvolcap(root: Path, calibration: Path) -> Capture:
 
     def feed(name: str) -> Feed:
         images = numbered(root / "images" / name)
-        return Feed(images or Video(find_video([root / "videos"], name)), numbered(root / "masks" / name))
+        return feed_of(images or Video(find_video([root / "videos"], name)), root / "masks" / name)
 
     def moving(name: str, folder: Path) -> tuple[Track, Feed]:
         pair, footage = _pair(folder), feed(name)

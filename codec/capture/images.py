@@ -84,9 +84,12 @@ def read_image(path: Path) -> View:
     return View(_u8(rgb), None if alpha is None else _u8(alpha))
 
 
-def read_mask(path: Path) -> np.ndarray:
-    """[H, W] u8 coverage: the alpha channel of the file if it has one, else its first colour channel."""
+def read_mask(path: Path, *, labels: bool = False) -> np.ndarray:
+    """[H, W] u8 coverage: the alpha channel of the file if it has one, else its first colour channel. Of `labels`, 255
+    where any channel is not 0."""
     view = read_image(path)
+    if labels:
+        return np.where((view.rgb > 0).any(-1), 255, 0).astype(np.uint8)
     return np.ascontiguousarray(view.rgb[..., 0]) if view.alpha is None else view.alpha
 
 

@@ -3,6 +3,7 @@
 A row of poses_bounds.npy (LLFF, Mildenhall et al. 2019) has a [3, 5] matrix and two depths, which are not used. The
 matrix is camera-to-world with the axes down, right and back; its last column has height, width and focal length in
 pixels. Rows are in the order of the videos' names. The first camera is the test camera, as in papers on the dataset.
+Sparse points are those that 4DGS (Wu et al. 2024) leaves beside it: points3D_downsample2.ply, or the same without 2.
 """
 
 from __future__ import annotations
@@ -14,8 +15,11 @@ import numpy as np
 from ..errors import CaptureError
 from ..model.camera import Camera
 from .capture import Capture
-from .rig import VIDEOS, Feed, Track, assemble, numbered, pinhole, rigid, usable
+from .points import read_ply_points
+from .rig import VIDEOS, Feed, Track, assemble, feed_of, numbered, pinhole, rigid, usable
 from .video import Video
+
+POINTS = ("points3D_downsample2.ply", "points3D_downsample.ply")
 
 
 def open_n3dv(poses: Path) -> Capture:
@@ -37,9 +41,12 @@ def open_n3dv(poses: Path) -> Capture:
     first = next(iter(made))
 
     def make(name: str, item: tuple[np.ndarray, Path]) -> tuple[Track, Feed]:
-        return [_camera(name, item[0], "test" if name == first else "train")], Feed(Video(item[1]))
+        camera = _camera(name, item[0], "test" if name == first else "train")
+        return [camera], feed_of(Video(item[1]), poses.parent / "masks" / name)
 
-    return assemble(poses.parent.resolve().name, *usable(poses, made, make))
+    found = next((p for f in POINTS if (p := poses.parent / f).is_file()), None)
+    points = read_ply_points(found) if found else None
+    return assemble(poses.parent.resolve().name, *usable(poses, made, make), points=points)
 
 
 def _camera(name: str, m: np.ndarray, split: str) -> Camera:

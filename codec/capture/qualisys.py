@@ -19,7 +19,7 @@ import numpy as np
 from ..errors import CaptureError
 from ..model.camera import Camera
 from .capture import Capture
-from .rig import Feed, Track, assemble, find_video, numbered, pinhole, rigid, usable
+from .rig import Feed, Track, assemble, feed_of, find_video, pinhole, rigid, usable
 from .video import Video
 
 UNIT = 64  # calibration units per pixel
@@ -43,7 +43,7 @@ def open_qualisys(root: Path, calibration: Path) -> Capture:
 
     def make(name: str, element: ET.Element) -> tuple[Track, Feed]:
         camera = _camera(element, name)
-        return [camera], Feed(Video(find_video(folders, name)), numbered(root / "masks" / name))
+        return [camera], feed_of(Video(find_video(folders, name)), root / "masks" / name)
 
     return assemble(root.resolve().name, *usable(calibration, elements, make))
 

@@ -19,6 +19,7 @@ from ..errors import CaptureError
 from ..model.camera import NEAR, Camera, meeting_point
 from .capture import Capture, differs, extent
 from .images import SUFFIXES, View, image_size, read_image, read_mask
+from .points import Points
 from .undistort import Undistortion
 from .video import Video
 
@@ -34,9 +35,12 @@ class Feed:
     Args:
         source: a video, or the image file of each frame.
         masks: the mask file of each frame, or nothing; None for a frame that lacks its own.
+        mask_files: for each frame where its mask is read from, or would be.
+        labels: masks number what a pixel shows, 0 is the background.
 
     Attributes:
         path: of the video or the first image.
+        masks: the mask file of each frame, empty where there are none.
         width, height: of the video or the first image; later images are checked against the camera.
         has_alpha: views have an alpha channel, of their own or from masks.
 
@@ -44,8 +48,15 @@ class Feed:
         CaptureError: an image is missing or not readable, or only some frames have masks.
     """
 
-    def __init__(self, source: Video | Sequence[Path], masks: Sequence[Path | None] = ()):
-        self._source = source
+    def __init__(
+        self,
+        source: Video | Sequence[Path],
+        masks: Sequence[Path | None] = (),
+        mask_files: Sequence[Path] = (),
+        *,
+        labels: bool = False,
+    ):
+        self._source, self._labels, self.mask_files = source, labels, mask_files
         if isinstance(source, Video):
             self.path, self.width, self.height, alpha = source.path, source.width, source.height, False
         else:
@@ -54,7 +65,7 @@ class Feed:
         there = [m for m in masks if m is not None]
         if there and len(there) < len(self):
             raise CaptureError(f"{there[0].parent}: {len(there)} masks for {len(self)} frames")
-        self._masks = there
+        self.masks = there
         self.has_alpha = alpha or bool(there)
 
     def __len__(self) -> int:
@@ -66,30 +77,53 @@ class Feed:
         return self._source.fps if isinstance(self._source, Video) else FPS
 
     def view(self, t: int) -> View:
-        """Frame `t` as it was recorded."""
-        if isinstance(self._source, Video):
-            view = View(self._source.frame(t))
-        else:
-            view = read_image(self._source[t])
-        if not self._masks:
+        """Frame `t` as it was recorded, with its mask."""
+        view = self.picture(t)
+        if not self.masks:
             return view
-        alpha = read_mask(self._masks[t])
+        alpha = read_mask(self.masks[t], labels=self._labels)
         if alpha.shape != view.rgb.shape[:2]:
-            raise CaptureError(f"{self._masks[t]}: mask is {_size(alpha.shape)}, its image {_size(view.rgb.shape)}")
+            raise CaptureError(f"{self.masks[t]}: mask is {_size(alpha.shape)}, its image {_size(view.rgb.shape)}")
         return View(view.rgb, alpha)
+
+    def picture(self, t: int) -> View:
+        """Frame `t` as it was recorded, without the mask of a file."""
+        return View(self._source.frame(t)) if isinstance(self._source, Video) else read_image(self._source[t])
 
     def name(self, t: int) -> Path:
         """The file that has frame `t`."""
         return self.path if isinstance(self._source, Video) else self._source[t]
 
 
-def assemble(name: str, tracks: Sequence[Track], feeds: Sequence[Feed], fps: float | None = None) -> Capture:
+def feed_of(source: Video | Sequence[Path], masks: Path) -> Feed:
+    """The footage of a camera whose masks are files in a folder of its own, in the order of their numbers.
+
+    Raises:
+        CaptureError: as of `Feed`.
+    """
+    if isinstance(source, Video):
+        stems = [f"{t:06}" for t in range(source.frame_count)]
+    else:
+        stems = [image.stem for image in source]
+    there = numbered(masks)
+    return Feed(source, there, there if len(there) == len(stems) else [masks / f"{stem}.png" for stem in stems])
+
+
+def assemble(
+    name: str,
+    tracks: Sequence[Track],
+    feeds: Sequence[Feed],
+    fps: float | None = None,
+    *,
+    points: Points | None = None,
+) -> Capture:
     """The capture of what `usable` found. It ends with the shortest feed; a camera whose feed is less than half as long
     as the median is left out.
 
     Args:
         tracks: each camera, with or without distortion. feeds: what each camera has recorded.
         fps: frames a second; None: as the first feed says.
+        points: sparse points that came with the capture.
 
     Raises:
         CaptureError: the feeds have no frames.
@@ -114,7 +148,8 @@ def assemble(name: str, tracks: Sequence[Track], feeds: Sequence[Feed], fps: flo
     alpha = any(f.has_alpha for f in feeds)
     moving = any(len(track) > 1 for track in tracks)
     cameras = [track[0] for track in pinholes]
-    return Capture(name, fps or feeds[0].fps, cameras, frame_count, alpha, read, poses=poses if moving else None)
+    fps, poses_of = fps or feeds[0].fps, poses if moving else None
+    return Capture(name, fps, cameras, frame_count, alpha, read, poses=poses_of, points=points, footage=feeds)
 
 
 def _with_near(tracks: Sequence[Track]) -> list[Track]:

@@ -1,9 +1,10 @@
 """transforms.json (instant-ngp, nerfstudio) -> Capture.
 
 The format lists images, a capture has cameras with all their frames: entries are grouped by `camera` and ordered by
-`frame` or `time`. Each entry has its own pose and may have its own intrinsics, so cameras may move. Poses are OpenGL
-camera-to-world (x right, y up, z back) and become OpenCV world-to-camera. `near`, in the head or in an entry, is a near
-plane in the units of the poses.
+`frame` or `time`. Each entry has its own pose and may have its own intrinsics, so cameras may move (D-NeRF: one camera
+that is elsewhere in each frame). Poses are OpenGL camera-to-world (x right, y up, z back) and become OpenCV
+world-to-camera. `near`, in the head or in an entry, is a near plane in the units of the poses. `ply_file_path` names
+sparse points in the world of the poses.
 """
 
 from __future__ import annotations
@@ -20,9 +21,13 @@ from ..errors import CaptureError
 from ..model.camera import NEAR, Camera
 from .capture import Capture
 from .images import SUFFIXES, image_size
+from .points import Points, read_ply_points
 from .rig import FPS, Feed, Track, assemble, pinhole, rigid, usable
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")  # OpenCV's order
+FISHEYE_DISTORTION = ("k1", "k2", "k3", "k4")
+MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+FISHEYE = "OPENCV_FISHEYE"
 
 
 @dataclass
@@ -52,22 +57,24 @@ def open_transforms(files: list[tuple[Path, str]]) -> Capture:
     Raises:
         CaptureError: no camera can be used; names file, camera and frame.
     """
-    entries, fps = [], FPS
+    entries, fps, points = [], FPS, None
     for path, split in files:
         data = _load(path)
         entries += _entries(data, path, split)
         fps = _fps(data, path)
+        points = points or _points(data, path)
     source = files[0][0]
     times = _common_times(entries)
 
     def make(name: str, own: list[Entry]) -> tuple[Track, Feed]:
         of_camera = _at_times(own, times)
-        return _track(name, of_camera), Feed([e.image for e in of_camera], [e.mask for e in of_camera])
+        files = [e.mask or _mask_file(source.parent, e.image, e.values) for e in of_camera]
+        return _track(name, of_camera), Feed([e.image for e in of_camera], [e.mask for e in of_camera], files)
 
     tracks, feeds = usable(source, _by_camera(entries), make)
     if not any(track[0].split == "train" for track in tracks):
         raise CaptureError(f"{source}: all {len(tracks)} cameras are test cameras, training needs split 'train' too")
-    return assemble(source.parent.resolve().name, tracks, feeds, fps)
+    return assemble(source.parent.resolve().name, tracks, feeds, fps, points=points)
 
 
 def _load(path: Path) -> dict:
@@ -77,10 +84,22 @@ def _load(path: Path) -> dict:
         raise CaptureError(f"{path}: not valid JSON ({e})") from e
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
         raise CaptureError(f"{path}: no 'frames', expected a transforms.json with a list of images and poses")
-    model = data.get("camera_model", "OPENCV")
-    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE"):
-        raise CaptureError(f"{path}: camera_model {model} is not supported, undistort to OPENCV or PINHOLE first")
+    for where in (data, *data["frames"]):
+        model = where.get("camera_model", "OPENCV") if isinstance(where, dict) else "OPENCV"
+        if model not in (*MODELS, FISHEYE):
+            known = ", ".join((*MODELS, FISHEYE))
+            raise CaptureError(f"{path}: camera_model {model} is not supported, expected {known}; undistort it first")
     return data
+
+
+def _points(data: dict, path: Path) -> Points | None:
+    """The points that `ply_file_path` names; None where it is not there."""
+    name = data.get("ply_file_path")
+    if name is None:
+        return None
+    if not isinstance(name, str):
+        raise CaptureError(f"{path}: ply_file_path is {name!r}, expected the name of a .ply file")
+    return read_ply_points(path.parent / name)
 
 
 def _fps(data: dict, path: Path) -> float:
@@ -166,17 +185,25 @@ def _mask(root: Path, image: Path, f: dict) -> Path | None:
     """mask_path of the entry, or the same name under masks/ instead of the first folder (images/)."""
     if "mask_path" in f:
         return root / f["mask_path"]
-    parts = Path(f["file_path"]).parts
-    if len(parts) < 2 or not (root / "masks").is_dir():
+    here = _mask_file(root, image, f)
+    if not (root / "masks").is_dir():
         return None
-    here = (root / "masks").joinpath(*[p for p in parts if p != "."][1:])
     found = [m for s in ("", *SUFFIXES) if (m := here.with_name(image.stem + (s or image.suffix))).is_file()]
     return found[0] if found else None
 
 
+def _mask_file(root: Path, image: Path, f: dict) -> Path:
+    """Where the mask of an image is looked for, as .png."""
+    parts = [p for p in Path(f["file_path"]).parts if p not in (".", "..", "/")]
+    return (root / "masks").joinpath(*(parts[1:] or parts)).with_name(image.stem + ".png")
+
+
 def _common_times(entries: list[Entry]) -> list[float]:
-    """The frames that most cameras have; cameras that lack one of them are left out later."""
-    count = Counter(t for _, t in {(e.camera, e.time) for e in entries})
+    """The frames that most cameras have, or those of a single training camera (D-NeRF); cameras that lack one of them
+    are left out later."""
+    trained = [e for e in entries if e.split == "train"]
+    alone = len({e.camera for e in trained}) == 1
+    count = Counter(t for _, t in {(e.camera, e.time) for e in (trained if alone else entries)})
     return sorted(t for t, n in count.items() if 2 * n > max(count.values()))
 
 
@@ -227,11 +254,13 @@ def _camera(name: str, e: Entry, width: int, height: int) -> Camera:
     v = e.values
     if (int(v.get("w", width)), int(v.get("h", height))) != (width, height):
         raise CaptureError(f"image {e.image} is {width}x{height}, expected {v.get('w')}x{v.get('h')} (w, h)")
-    distortion = np.array([float(v.get(k, 0)) for k in DISTORTION])
+    fisheye = v.get("camera_model") == FISHEYE or bool(v.get("is_fisheye"))
+    distortion = np.array([float(v.get(k, 0)) for k in (FISHEYE_DISTORTION if fisheye else DISTORTION)])
     near = float(v.get("near", NEAR))
     if not 0 < near < math.inf:
         raise CaptureError(f"near plane at {near:g}, expected a distance above 0")
-    return Camera(name, _intrinsics(v, width, height), _viewmat(v), width, height, distortion, near=near)
+    K = _intrinsics(v, width, height)
+    return Camera(name, K, _viewmat(v), width, height, distortion, near=near, fisheye=fisheye)
 
 
 def _intrinsics(v: dict, width: int, height: int) -> np.ndarray:

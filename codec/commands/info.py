@@ -1,4 +1,4 @@
-"""`gscodec info`: content of a stream as lines or JSON, its attribute maps as images; of splats what they are."""
+"""`gscodec info`: what is in a stream, splats or a capture, as lines or JSON; maps or a contact sheet as images."""
 
 from __future__ import annotations
 
@@ -10,23 +10,51 @@ import typer
 
 from ..errors import UsageError
 from .inputs import open_stream_warning
-from .options import Json, StreamPath, stdout
+from .options import Json, stdout
 
+CALIBRATIONS = (".json", ".qca.txt", ".npy", ".csv")
 SPLATS = (".ply", ".sog", ".drc", ".spz", ".splat", ".splatv", ".zip")
+NOT_STREAMS = CALIBRATIONS + SPLATS
 
 
 def info(
-    stream: StreamPath,
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="A .gsv file, splats or a capture.")],
     as_json: Json = False,
-    maps: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the attribute maps as 16-bit images.")] = None,
+    maps: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Of a stream: write its attribute maps as 16-bit images.")
+    ] = None,
+    sheet: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="Of a capture: draw its cameras and its rig.")
+    ] = None,
+    frame: Annotated[int, typer.Option(min=0, help="Of a capture: whose pictures are looked at.")] = 0,
 ) -> None:
-    """What is in a file: groups, bits by attribute and unit; of splats their format, frames and Gaussians."""
+    """What is in a file: groups, bits by attribute and unit. Of splats the format, of a capture what was recognised."""
+    kind = _kind(path)
+    if maps and kind != "stream":
+        raise UsageError(f"--maps {maps}: {path} is no stream, expected a .gsv file; --sheet draws a capture")
+    if sheet and kind != "capture":
+        raise UsageError(f"--sheet {sheet}: {path} is not a capture, expected its folder or calibration file")
+    if kind == "capture":
+        _of_capture(path, frame, sheet, as_json)
+    elif kind == "splats":
+        _of_splats(path, as_json)
+    else:
+        _of_stream(path, maps, as_json)
+
+
+def _kind(path: Path) -> str:
+    """stream, splats or capture."""
+    from ..splats import detect_input
+
+    if path.is_dir() or path.name.endswith(NOT_STREAMS):
+        return detect_input(path)
+    return "stream"
+
+
+def _of_stream(path: Path, maps: Path | None, as_json: bool) -> None:
     from ..decode.report import describe, write_maps
 
-    if stream.is_dir() or stream.suffix.lower() in SPLATS:
-        _splats(stream, as_json)
-        return
-    s = open_stream_warning(stream)
+    s = open_stream_warning(path)
     facts = describe(s)
     if maps:
         write_maps(s, maps)
@@ -34,7 +62,7 @@ def info(
         print(json.dumps(facts, indent=1))
         return
     stdout.print(
-        f"{stream}: {facts['frames']} frames at {facts['fps']:g} fps in {facts['groups']} groups, "
+        f"{path}: {facts['frames']} frames at {facts['fps']:g} fps in {facts['groups']} groups, "
         f"{facts['gaussians']} Gaussians, SH degree {facts['sh_degree']}, level {facts['level']}"
     )
     per_gaussian = facts["bits_per_gaussian_frame"]  # None where all frames are empty
@@ -51,12 +79,9 @@ def info(
         )
 
 
-def _splats(path: Path, as_json: bool) -> None:
-    from ..splats import detect_input
+def _of_splats(path: Path, as_json: bool) -> None:
     from ..splats.describe import describe_splats
 
-    if detect_input(path) != "splats":
-        raise UsageError(f"{path} is a capture; info tells of streams and of splats, gscodec encode takes captures")
     facts = describe_splats(path)
     if as_json:
         print(json.dumps(facts, indent=1))
@@ -65,3 +90,44 @@ def _splats(path: Path, as_json: bool) -> None:
         f"{path}: {facts['format']}, {facts['frames']} frames at {facts['fps']:g} fps ({facts['mode']}), "
         f"{facts['gaussians']} Gaussians, SH degree {facts['sh_degree']}, {facts['bytes']} bytes"
     )
+
+
+def _of_capture(path: Path, frame: int, sheet: Path | None, as_json: bool) -> None:
+    from ..capture.report import describe_capture
+    from ..capture.sheet import contact_sheet
+    from ..render.png import write_png
+
+    capture, facts = describe_capture(path, frame)
+    if sheet:
+        write_png(sheet, contact_sheet(capture, frame))
+    if as_json:
+        print(json.dumps(facts, indent=1))
+        return
+    split = [len(capture.indices(s)) for s in ("train", "test")]
+    stdout.print(
+        f"{path}: {facts['layout']}, {split[0]} training and {split[1]} test cameras"
+        f"{' that move' if facts['moves'] else ''}, {facts['frames']} frames at {facts['fps']:g} fps"
+    )
+    masks = {None: "no masks", "alpha": "masks from alpha", "files": "masks from files"}[facts["masks"]]
+    points = "no sparse points" if facts["points"] is None else f"{facts['points']} sparse points"
+    error, ratio = facts["epipolar_error"], facts["colour_ratio"]
+    checked = "unknown" if error is None else f"{error:.2f} pixels from epipolar lines ({facts['matches']} matches)"
+    colours = "unknown" if ratio is None else f"{ratio:.2f} from the darkest to the brightest camera"
+    stdout.print(f"{masks}, {points}; calibration: {checked}; colours: {colours}")
+    for c in facts["cameras"]:
+        stdout.print(f"  {_line(c)}")
+    for sentence in (*facts["left_out"], *facts["missing"]):
+        stdout.print(f"! {sentence}")
+
+
+def _line(c: dict) -> str:
+    """Facts of one camera."""
+    words = [f"{c['name']:<12}{c['split']:<6}{c['width']}x{c['height']}", f"{c['angle']:5.1f} degrees wide"]
+    words.append(f"near {c['near']:g}, scene at {c['distance']:g}")
+    if c["subject"] is not None:
+        words.append(f"subject {c['subject']:.1%}")
+    if c["epipolar_error"] is not None:
+        words.append(f"{c['epipolar_error']:.2f} pixels off")
+    if c["gain"]:
+        words.append("gain " + " ".join(f"{g:.2f}" for g in c["gain"]))
+    return ", ".join(words)

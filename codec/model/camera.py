@@ -21,6 +21,8 @@ class Camera:
         width, height: image size in pixels.
         distortion: [k1, k2, p1, p2, k3] as in OpenCV (any length it takes), empty for none; a Capture hands out
             undistorted images with an empty one.
+        fisheye: `distortion` is [k1, k2, k3, k4] of OpenCV's fisheye model (Kannala and Brandt 2006) instead; a Capture
+            hands out pinhole cameras.
         split: "train", "val" or "test".
         near: near plane, world units: Gaussians whose centre is nearer are not drawn. A reader of captures leaves
             `NEAR` where its layout says nothing; `Capture` then puts it at a share of the distance to the scene.
@@ -34,6 +36,7 @@ class Camera:
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
     split: str = "train"
     near: float = NEAR
+    fisheye: bool = False
 
     @property
     def center(self) -> np.ndarray:

@@ -14,8 +14,8 @@ import numpy as np
 
 from ..errors import CaptureError
 from ..model.gaussians import SH_C0, Gaussians
+from ..ply_table import read_table, write_table
 from .ply import join_rest, sh_count, split_rest, stack
-from .ply_table import read_table, write_table
 from .smallest_three import join_smallest_three, split_smallest_three
 
 CHUNK = 256

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..ply_table import read_header
 from .archive import unpacked
 from .files import splat_size
-from .ply_table import read_header
 from .sequence import is_scene, open_sequence, splat_paths
 from .splatv import splatv_header
 from .spz import spz_header

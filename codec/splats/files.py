@@ -8,11 +8,11 @@ import numpy as np
 
 from ..errors import CaptureError, UsageError
 from ..model.gaussians import Gaussians
+from ..ply_table import read_header, read_table
 from .compressed_ply import gaussians_of_compressed, is_compressed, write_compressed_ply
 from .drc import read_drc, write_drc
 from .glb import write_glb
 from .ply import FIELDS, gaussians_of, sh_count, stack, write_ply
-from .ply_table import read_header, read_table
 from .sog import SH_BANDS, read_sog, read_sog_meta, write_sog
 from .splat import read_splat_rows, splat_count
 from .spz import SH_DEGREES, read_spz, spz_header, write_spz

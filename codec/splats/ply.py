@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import CaptureError
 from ..model.gaussians import SH_COUNTS, Gaussians
-from .ply_table import read_table, write_table
+from ..ply_table import read_table, write_table
 
 FIELDS = {
     "means": ("x", "y", "z"),

@@ -11,6 +11,13 @@ from .learning_rates import LearningRates, keyframe_rates
 class InitializationSettings:
     """Initial points of a keyframe, and which source they come from."""
 
+    use_points: bool = True  # the sparse points of the capture, where it has some
+    triangulate: bool = True  # where a capture without masks has none: matched features of its cameras
+    match_neighbours: int = 4  # cameras that each one is matched with
+    match_features: int = 8000  # of one image at most
+    reprojection_max: float = 1.5  # pixels; farther a match is wrong
+    parallax_min: float = 2.0  # degrees between the rays of a point; below it its depth is unknown
+    points_share_max: float = 0.7  # of the points to start from; sparse points leave out what has no texture
     use_plane_sweep: bool = True  # False: a capture without masks starts from random points
     sweep_min_share: float = 0.1  # of initial_points: with fewer, the scene has too little texture for a plane sweep
     surface_opacity: float = 0.5  # of points on a surface that was found

@@ -1,4 +1,4 @@
-"""The PLY container: header and element tables. ply.py and compressed_ply.py know what the properties mean.
+"""The PLY container: header and element tables. splats/ and capture/ know what the properties mean.
 
 Plain numpy, so that the player's side can read and write it. Reading stops at the first element with a list property
 (the faces of a mesh): splats do not need it.
@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..atomic_write import part_file
-from ..errors import CaptureError
+from .atomic_write import part_file
+from .errors import CaptureError
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",

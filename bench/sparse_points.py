@@ -1,0 +1,59 @@
+"""What sparse points are worth at the start of training: those that a capture brings, here triangulated from its own
+training cameras, and none (`python -m bench.sparse_points --help`)."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from gscodec.capture import Capture
+from gscodec.train.settings import InitializationSettings
+from gscodec.train.sparse_points import triangulated
+
+from .train import CASES, every_frame_alone, held_out, part
+
+VALIDATION = {
+    "basketball": ("cam05", "cam13", "cam20", "cam27"),
+    "lumberjack": ("cam03", "cam09", "cam17"),
+    "stage": ("cam03", "cam08"),
+}  # of the training cameras, held out: the test cameras choose nothing
+
+
+def measure(capture: Capture, preset: str, frame: int) -> dict:
+    """PSNR on the held-out cameras, seconds, and seconds of all threads of one keyframe."""
+    from gscodec.metrics.evaluate import evaluate_capture
+    from gscodec.train.settings import train_settings
+
+    settings, start = train_settings(preset), time.process_time()
+    own = replace(settings.initialization, triangulate=False)  # those of `capture`, or none
+    models, seconds = every_frame_alone(capture, range(frame, frame + 1), replace(settings, initialization=own))
+    cpu = round(time.process_time() - start, 1)
+    found = evaluate_capture(lambda _: models[0], part(capture, range(frame, frame + 1)), "test")
+    quality = {k: round(found[k], 3) for k in ("psnr", "psnr_fg", "psnr_corrected", "ssim")}
+    return {**quality, "seconds": round(seconds, 1), "cpu_seconds": cpu, "gaussians": len(models[0])}
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(description="The capture's points against none: one frame, trained alone.")
+    p.add_argument("case", choices=VALIDATION)
+    p.add_argument("--data", type=Path, required=True)
+    p.add_argument("--preset", default="fast")
+    p.add_argument("--frame", type=int, default=0)
+    p.add_argument("--out", type=Path, default=Path("bench/results/points.json"))
+    a = p.parse_args()
+    capture = held_out(CASES[a.case].open(a.data), VALIDATION[a.case])
+    points = triangulated(capture, 0, InitializationSettings())
+    for name, own in (("none", None), ("points", points)):
+        found = measure(replace(capture, points=own), a.preset, a.frame)
+        key = f"{a.case}, frame {a.frame}, {a.preset}, {name}"
+        entries = json.loads(a.out.read_text()) if a.out.is_file() else {}
+        entries[key] = {"points": 0 if own is None else len(own), **found}
+        a.out.write_text(json.dumps(entries, indent=1) + "\n")
+        print(key, entries[key], flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,33 @@
+"""`gscodec masks`: masks of a capture that has none, as files that its reader finds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..progress import Bar
+from .options import stdout
+
+
+def masks(
+    capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture (folder or calibration file).")],
+    plate: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Pictures without the subject, CAMERA.png each.", show_default="plate/"),
+    ] = None,
+    moving: Annotated[bool, typer.Option("--moving", help="What moves is the subject, even with plate/.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace masks that are there.")] = False,
+) -> None:
+    """Masks of a capture that has none: from an empty plate, or from what moves."""
+    from ..capture import open_capture
+    from ..capture.masks import make_masks
+
+    opened = open_capture(capture)
+    root = capture if capture.is_dir() else capture.parent
+    plates = plate or (root / "plate" if (root / "plate").is_dir() and not moving else None)
+    with Bar() as bar:
+        count = make_masks(opened, plates, overwrite=overwrite, on_progress=lambda d, n: bar.update("cameras", d, n))
+    where = opened.footage[0].mask_files[0]
+    stdout.print(f"{count} masks from {'plates' if plates else 'what moves'}, the first one is {where}")
