@@ -66,6 +66,7 @@ VARIANTS = {
     "nothing held still": Variant(stage_with("change_detection", threshold=-1.0)),
     "no noise on canonical values": Variant(stage_with("finetune", canonical_noise=False)),
     "no births": Variant(stage_with("densification", max_share=0.0), (STAGE,)),
+    "no matched features": Variant(stage_with("initialization", triangulate=False), (STAGE,)),
     "no plane sweep": Variant(stage_with("initialization", use_plane_sweep=False), (STAGE,)),
     "no shell of far points": Variant(stage_with("plane_sweep", shell_points=0), (STAGE,)),
     "no node graph": Variant(  # every Gaussian for itself, at the rate of a node

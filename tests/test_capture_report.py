@@ -78,5 +78,5 @@ def test_the_command_line_prints_and_draws(tmp_path):
     assert len(facts["cameras"]) == 4
     fails(run("info", tmp_path, "--maps", tmp_path), "is a capture, expected a .gsv file; --sheet draws a capture")
     fails(run("info", tmp_path / "a.gsv", "--sheet", "x.png"), "is not a capture, expected its folder")
-    fails(run("info", tmp_path / "images"), "not a capture; looked for transforms.json")
+    fails(run("info", tmp_path / "images"), "neither a capture nor splats; looked for transforms.json")
     fails(run("info", tmp_path, "--frame", "7"), "no frame 7, there are 1")

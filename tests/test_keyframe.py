@@ -22,6 +22,7 @@ from gscodec.train.initialization import initial_model
 from gscodec.train.keyframe import Statistics, densify, prune, train_keyframe
 from gscodec.train.model import from_gaussians
 from gscodec.train.plane_sweep import shell, sweep
+from gscodec.train.sparse_points import triangulated
 from gscodec.train.train import train_groups
 from gscodec.train.views import Views
 from gscodec.train.visual_hull import hull_points, project
@@ -65,11 +66,24 @@ def test_initial_points_do_without_shell_or_sweep():
     read = lambda camera, _: View(render_image(wall, cameras[camera], (0, 0, 0)), None)  # noqa: E731
     capture = Capture("wall", 25.0, cameras, 1, False, read)
     no_shell = dataclasses.replace(TINY, plane_sweep=dataclasses.replace(TINY.plane_sweep, shell_points=0))
-    no_sweep = dataclasses.replace(TINY, initialization=dataclasses.replace(TINY.initialization, use_plane_sweep=False))
+    nothing = dataclasses.replace(TINY.initialization, use_plane_sweep=False, triangulate=False)
+    no_sweep = dataclasses.replace(TINY, initialization=nothing)
     with_shell, without, random = (initial_model(capture, 0, 300, s)[0] for s in (TINY, no_shell, no_sweep))
     assert len(with_shell) > len(without) == TINY.initial_points
     opacities = [float(torch.sigmoid(m.params["logit_opacities"][0])) for m in (without, random)]
     assert opacities == pytest.approx([TINY.initialization.surface_opacity, TINY.initialization.random_opacity])
+
+
+def test_matched_features_of_a_wall_lie_on_it():
+    wall, cameras = splat_wall(), [dataclasses.replace(c, split="train") for c in arc()]
+    capture = Capture(
+        "wall", 25.0, cameras, 1, False, lambda i, _: View(render_image(wall, cameras[i], (0, 0, 0)), None)
+    )
+    points = triangulated(capture, 0, TINY.initialization)
+    assert len(points) > 20
+    assert (np.abs(points.means[:, 1]) < 0.22).mean() > 0.9, "as near as those of the plane sweep"
+    narrow = dataclasses.replace(TINY.initialization, parallax_min=90.0)
+    assert not len(triangulated(capture, 0, narrow)), "no two neighbours see it from sides so far apart"
 
 
 @pytest.mark.parametrize("masks", [True, False])

@@ -31,7 +31,8 @@ def info(
     """What is in a file: groups, bits by attribute and unit. Of splats the format, of a capture what was recognised."""
     kind = _kind(path)
     if maps and kind != "stream":
-        raise UsageError(f"--maps {maps}: {path} is no stream, expected a .gsv file; --sheet draws a capture")
+        what = {"capture": "a capture", "splats": "made of splats"}[kind]
+        raise UsageError(f"--maps {maps}: {path} is {what}, expected a .gsv file; --sheet draws a capture")
     if sheet and kind != "capture":
         raise UsageError(f"--sheet {sheet}: {path} is not a capture, expected its folder or calibration file")
     if kind == "capture":
