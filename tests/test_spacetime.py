@@ -207,4 +207,4 @@ def test_info_of_splats(stream, tmp_path):
     fails(run("info", tmp_path / "bad.spz"), "not a .spz")
     fails(run("info", tmp_path / "bad.splatv"), "no such file or folder")
     (tmp_path / "transforms.json").write_text("{}")
-    fails(run("info", tmp_path), "is a capture")
+    fails(run("info", tmp_path), "no 'frames', expected a transforms.json")
