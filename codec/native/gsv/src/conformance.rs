@@ -1,133 +1,137 @@
-//! Conformance of a group to its header (spec 3.1): every announced unit is present, no other unit is, or it is reported as
-//! damaged.
+//! Conformance of a group to its header (spec 3.1): every announced unit is present, and no other unit is; and which units
+//! are lost with a damaged one.
 
 use crate::attributes::Attribute;
 use crate::error::{Error, Result};
 use crate::header::Header;
-use crate::unit::{Unit, UnitType};
+use crate::unit::{Unit, UnitKey, UnitType, unit_name};
+use std::collections::{BTreeMap, BTreeSet};
 
-/// A unit that is damaged or missing, and so is not decoded.
+/// A unit that is damaged, or needs one that is, and so is not decoded.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Damage {
-    /// Index of the unit; None: missing, in a group where other units are damaged.
-    pub unit: Option<usize>,
-    /// Its type, as its bytes claim or as the header announces; None: a type that this version skips.
+    /// Index of the unit in the group.
+    pub unit: usize,
+    /// None: a type that this version skips.
     pub kind: Option<UnitType>,
     pub layer: u8,
-    pub attribute: Option<Attribute>,
+    /// Of a tile in its layer.
+    pub index: u16,
     pub message: String,
 }
 
-/// What identifies a unit in a group: type, layer, attribute.
-pub type UnitKey = (UnitType, u8, Option<Attribute>);
-
-/// Index of the undamaged unit of a type, layer and attribute.
-pub fn find(units: &[Unit], (kind, layer, attribute): UnitKey) -> Option<usize> {
-    let sought = |u: &Unit| (u.kind, u.layer, u.attribute) == (Some(kind), layer, attribute) && u.damage.is_none();
-    units.iter().position(sought)
+/// The undamaged units of a group that may be decoded.
+pub struct Sound<'a> {
+    units: BTreeMap<(u8, u8, u16), &'a Unit<'a>>,
 }
 
-/// Compares the units with the header; returns the units that are damaged or missing. `reference`: the header of the group
-/// that a predicted one refers to; `layers`: number of layers to decode.
+impl<'a> Sound<'a> {
+    pub fn get(&self, (kind, layer, index): UnitKey) -> Option<&'a Unit<'a>> {
+        self.units.get(&(kind as u8, layer, index)).copied()
+    }
+}
+
+/// Compares the units with the header; returns those that can be decoded, and the others. `layers`: number of layers to
+/// decode; `wanted(layer, tile)`: which tiles.
 ///
 /// # Errors
-/// An undamaged unit that the header does not announce, or that lacks a dependency; a missing unit, although nothing is
-/// damaged; no undamaged positions of the first layer of an independent group.
-pub fn check(units: &[Unit], header: &Header, reference: Option<&Header>, layers: usize) -> Result<Vec<Damage>> {
-    let mut damage: Vec<Damage> = units.iter().enumerate().filter_map(claimed).collect();
-    let (mut announced, optional) = announced(header, reference, layers);
-    let end = units.last().map_or(0, |u| u.payload_offset + u.payload.len());
-    let any = !damage.is_empty();
-    for &key in announced.iter().filter(|key| find(units, **key).is_none()) {
-        let (kind, layer, attribute) = key;
-        let vital = layer == 0 && kind == UnitType::Positions && header.reference == 0;
-        if !any || vital {
-            let own = units
-                .iter()
-                .find(|u| u.kind == Some(kind))
-                .and_then(|u| u.damage.clone());
-            return Err(own.unwrap_or_else(|| Error::bitstream(end, "group", missing(key))));
+/// A unit that the header does not announce, or twice; a missing unit; a damaged first tile of an independent group.
+pub fn check<'a>(
+    units: &'a [Unit<'a>],
+    header: &Header,
+    layers: usize,
+    wanted: impl Fn(u8, u16) -> bool,
+) -> Result<(Sound<'a>, Vec<Damage>)> {
+    let announced = announced(header, layers);
+    let mut found = BTreeSet::new();
+    for u in units {
+        let Some((kind, layer, index)) = u.key() else { continue };
+        let key = (kind as u8, layer, index);
+        let fail = |expected: &str| Err(Error::bitstream(u.offset, u.label(), expected));
+        if !announced.contains_key(&key) {
+            return fail("only units that the header announces");
         }
-        if !damage
-            .iter()
-            .any(|d| (d.kind, d.layer, d.attribute) == (Some(kind), layer, attribute))
-        {
-            damage.push(Damage {
-                unit: None,
-                kind: Some(kind),
-                layer,
-                attribute,
-                message: format!("expected {}", missing(key)),
-            });
+        if !found.insert(key) {
+            return fail("one unit of each type, layer and index");
         }
     }
-    announced.extend(optional);
-    for (i, u) in units.iter().enumerate().filter(|(_, u)| u.damage.is_none()) {
-        let Some(kind) = u.kind else { continue };
-        let fail = |expected: String| Err(Error::bitstream(u.offset, u.label(i), expected));
-        if !announced.contains(&(kind, u.layer, u.attribute)) {
-            return fail("only units that the header announces".into());
+    let end = units.last().map_or(0, |u| u.offset + u.payload.len());
+    for (key, (name, required)) in &announced {
+        let skipped = key.0 == UnitType::Tile as u8 && !wanted(key.1, key.2);
+        if *required && !skipped && !found.contains(key) {
+            let expected = format!("a unit {}, found none", unit_name(*name));
+            return Err(Error::bitstream(end, "group", expected));
         }
-        for (need, attribute) in kind.needs(u.attribute) {
-            let key = (*need, u.layer, *attribute);
-            let met = |d: &u8| {
-                units
-                    .get(usize::from(*d))
-                    .is_some_and(|d| (d.kind, d.layer, d.attribute) == (Some(*need), u.layer, *attribute))
-            };
-            if announced.contains(&key) && !u.dependencies.iter().any(met) {
-                let of = attribute.map_or(String::new(), |a| format!(" of {}", a.name()));
-                return fail(format!("a dependency on the {} unit{of}", need.name()));
+    }
+    sort_out(units, header)
+}
+
+/// Separates what can be decoded from what is damaged or needs a damaged unit.
+fn sort_out<'a>(units: &'a [Unit<'a>], header: &Header) -> Result<(Sound<'a>, Vec<Damage>)> {
+    let hurt: BTreeMap<_, _> = units
+        .iter()
+        .filter(|u| u.damage.is_some())
+        .filter_map(|u| Some((u.key().map(|(k, layer, index)| (k as u8, layer, index))?, u.number)))
+        .collect();
+    let (mut sound, mut damage) = (BTreeMap::new(), Vec::new());
+    for u in units {
+        let mut message = u.damage.as_ref().map(Error::to_string);
+        if let Some((kind, layer, index)) = u.key() {
+            let lost = needs(header, (kind, layer, index)).find_map(|key| hurt.get(&key));
+            if let Some(d) = lost.filter(|_| message.is_none()) {
+                let expected = format!("sound units to start from, but unit {d} is damaged");
+                message = Some(Error::bitstream(u.offset, u.label(), expected).to_string());
+            }
+            let vital = header.reference == 0 && header.leading_tiles(0)[0] == Some(usize::from(index));
+            if let (UnitType::Tile, 0, true, Some(e)) = (kind, layer, vital, &u.damage) {
+                return Err(e.clone());
+            }
+            if message.is_none() {
+                sound.insert((kind as u8, layer, index), u);
             }
         }
+        damage.extend(message.map(|message| Damage {
+            unit: u.number,
+            kind: u.kind,
+            layer: u.layer,
+            index: u.index,
+            message,
+        }));
     }
-    Ok(damage)
+    Ok((Sound { units: sound }, damage))
 }
 
-fn missing((kind, layer, attribute): UnitKey) -> String {
-    let attribute = attribute.map_or(String::new(), |a| format!(" {}", a.name()));
-    let of = if layer > 0 {
-        format!(" of layer {layer}")
-    } else {
-        String::new()
-    };
-    format!("a {} unit{attribute}{of}, found none", kind.name())
+/// The units without which a unit cannot be decoded.
+fn needs(header: &Header, (kind, layer, index): UnitKey) -> impl Iterator<Item = (u8, u8, u16)> {
+    let k = usize::from(layer);
+    let [first, born] = header.leading_tiles(k);
+    let born = born.filter(|_| usize::from(index) >= header.survivor_tiles(k));
+    let tiles = [first, born]
+        .into_iter()
+        .flatten()
+        .map(move |t| (UnitType::Tile, layer, t as u16));
+    let nodes = (kind == UnitType::NodeTrajectories).then_some((UnitType::NodePositions, 0, 0));
+    let all = tiles.filter(move |_| kind == UnitType::Tile).chain(nodes);
+    all.filter(move |need| *need != (kind, layer, index))
+        .map(|(kind, layer, index)| (kind as u8, layer, index))
 }
 
-fn claimed((i, u): (usize, &Unit)) -> Option<Damage> {
-    Some(Damage {
-        unit: Some(i),
-        kind: u.kind,
-        layer: u.layer,
-        attribute: u.attribute,
-        message: u.damage.as_ref()?.to_string(),
-    })
-}
-
-/// Units that are required, and units that are optional.
-fn announced(h: &Header, reference: Option<&Header>, layers: usize) -> (Vec<UnitKey>, Vec<UnitKey>) {
-    let mut required = vec![(UnitType::GroupHeader, 0, None)];
-    let mut optional = Vec::new();
+/// The units that a header announces; of each its name, and whether it is required.
+fn announced(h: &Header, layers: usize) -> BTreeMap<(u8, u8, u16), (UnitKey, bool)> {
+    let mut out = BTreeMap::new();
+    let mut add = |key: UnitKey, required| _ = out.insert((key.0 as u8, key.1, key.2), (key, required));
+    add((UnitType::GroupHeader, 0, 0), true);
     if h.nodes.count > 0 {
-        required.extend([
-            (UnitType::NodePositions, 0, None),
-            (UnitType::NodeTrajectories, 0, None),
-        ]);
+        add((UnitType::NodePositions, 0, 0), true);
+        add((UnitType::NodeTrajectories, 0, 0), true);
     }
-    for (k, layer) in h.layers.iter().enumerate().take(layers) {
-        let n = k as u8;
-        if h.candidates(k, reference) > 0 {
-            required.push((UnitType::Deaths, n, None));
+    for (k, tiles) in h.tiles.iter().enumerate().take(layers) {
+        for (t, _) in tiles.iter().enumerate().filter(|(_, tile)| tile.count > 0) {
+            add((UnitType::Tile, k as u8, t as u16), true);
         }
-        if h.reference == 0 || layer.births > 0 {
-            required.push((UnitType::Positions, n, None));
-            required.extend(h.attributes().iter().map(|a| (UnitType::Channels, n, Some(*a))));
+        for a in [Attribute::LogScales, Attribute::LogitOpacities] {
+            add((UnitType::LayerCorrection, k as u8, a as u16), false);
         }
-        let moving = |t: &crate::header::TrajectoryHeader| (UnitType::Trajectories, n, Some(t.attribute));
-        required.extend(h.trajectories.iter().map(moving));
-        optional.push((UnitType::Lifetimes, n, None));
-        optional
-            .extend([Attribute::LogScales, Attribute::LogitOpacities].map(|a| (UnitType::LayerCorrection, n, Some(a))));
     }
-    (required, optional)
+    out
 }

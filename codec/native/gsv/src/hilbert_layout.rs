@@ -1,13 +1,15 @@
 //! Hilbert layout (spec 7.2): index of a Gaussian -> cell of the W x H map in which channels are shown.
 //!
-//! The map is a column of W x W squares, each filled along a Hilbert curve that ends where the next square begins.
+//! The map is a column of W x W squares, each filled along a Hilbert curve that ends where the next square begins. So a tile,
+//! a power of four of cells, is a square of the map.
 //! Consecutive indices are neighbours in space (Morton order), so neighbours in space are near each other on the map.
 
-/// The map of N indices.
-pub struct HilbertLayout {
+/// The map of a layer in tiles.
+pub struct HilbertLayout<'a> {
     pub width: usize,
     pub height: usize,
-    count: usize,
+    tiles: &'a [u32],
+    cells: usize,
     bits: u32,
 }
 
@@ -16,24 +18,36 @@ pub fn width_log2(n: usize) -> u32 {
     n.checked_ilog2().unwrap_or(0) >> 1
 }
 
-impl HilbertLayout {
-    pub fn new(count: usize) -> HilbertLayout {
+impl HilbertLayout<'_> {
+    /// `tiles`: the Gaussians of each; `cells`: most of a tile.
+    pub fn new(tiles: &[u32], cells: usize) -> HilbertLayout<'_> {
+        let last = tiles.last().map_or(0, |n| *n as usize);
+        let count = tiles.len().saturating_sub(1) * cells + last;
         let bits = width_log2(count);
         let width = 1usize << bits;
         HilbertLayout {
             width,
             height: count.div_ceil(width * width) * width,
-            count,
+            tiles,
+            cells,
             bits,
         }
     }
 
-    /// [H, W] in raster order: `value(i)` at the cell of index i, 0 in cells without one.
+    /// Column and row of each Gaussian of the layer.
+    pub fn cells(&self) -> Vec<(usize, usize)> {
+        let tiles = self.tiles.iter().enumerate();
+        let places = tiles.flat_map(|(t, n)| (0..*n as usize).map(move |i| t * self.cells + i));
+        places.map(|i| position(i, self.bits)).collect()
+    }
+
+    /// [H, W] in raster order: `value(i)` at the cell of Gaussian i of the layer, 0 in cells without one.
     pub fn arrange(&self, value: impl Fn(usize) -> i32) -> Vec<i32> {
         let mut cells = vec![0; self.width * self.height];
-        for i in 0..self.count {
-            let (x, y) = position(i, self.bits);
-            cells[y * self.width + x] = value(i);
+        for (i, (x, y)) in self.cells().into_iter().enumerate() {
+            if let Some(cell) = cells.get_mut(y * self.width + x) {
+                *cell = value(i);
+            }
         }
         cells
     }

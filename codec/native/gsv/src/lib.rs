@@ -34,6 +34,8 @@ pub mod range_coder;
 pub mod rigid_blend;
 pub mod rotation_residuals;
 pub mod symbols;
+pub mod tile;
+pub mod tile_bounds;
 pub mod trajectories;
 pub mod unit;
 mod values;

@@ -3,15 +3,16 @@
 use super::group_from::group_from;
 use super::parametric::{canonical, carried, frame};
 use super::quantized_from::{parents_into, quantized};
+use super::report;
 use super::values::{bytes_of, raise};
 use gsv::attributes::sh_coefficients;
 use gsv::conformance::Damage;
-use gsv::decode::{Decoding, decode_damaged, decode_group};
+use gsv::decode::{Decoding, decode_damaged, decode_group, read_header};
 use gsv::evaluate::Evaluator;
 use gsv::group::Group;
 use gsv::hilbert_layout::HilbertLayout;
 use gsv::levels::Level;
-use gsv::unit::{self, ALL_LAYERS};
+use gsv::unit::{ALL_LAYERS, UnitType};
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods};
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
@@ -21,16 +22,16 @@ use pyo3::types::{PyDict, PyList};
 #[pyclass(frozen, module = "gscodec._native")]
 pub struct DecodedGroup {
     evaluator: Evaluator,
-    units: Vec<(String, Option<&'static str>, u8, usize, usize)>,
+    units: Vec<report::UnitReport>,
     damage: Vec<Damage>,
 }
 
 #[pymethods]
 impl DecodedGroup {
     /// `strict`: damage is an error; otherwise `damage` lists what was not decoded. `reference`: the group that a predicted
-    /// one refers to. `layers`: only so many, the payload may end behind them.
+    /// one refers to. `layers`: only so many, the payload may end behind them. `tiles`: of each layer, which tiles; None: all.
     #[new]
-    #[pyo3(signature = (payload, level, strict = true, *, reference = None, layers = ALL_LAYERS))]
+    #[pyo3(signature = (payload, level, strict = true, *, reference = None, layers = ALL_LAYERS, tiles = None))]
     fn new(
         py: Python,
         payload: &Bound<PyAny>,
@@ -38,6 +39,7 @@ impl DecodedGroup {
         strict: bool,
         reference: Option<Py<DecodedGroup>>,
         layers: usize,
+        tiles: Option<Vec<Vec<bool>>>,
     ) -> PyResult<Self> {
         let bytes = bytes_of(payload)?.as_slice()?.to_vec(); // ours while the GIL is released
         let reference = reference.as_ref().map(|r| r.get().group());
@@ -46,19 +48,16 @@ impl DecodedGroup {
                 level: &Level::get(level)?,
                 reference,
                 layers: layers.max(1),
+                tiles: tiles.as_deref(),
             };
             let (group, damage) = if strict {
                 (decode_group(&bytes, &how)?, Vec::new())
             } else {
                 decode_damaged(&bytes, &how)?
             };
-            let units = unit::scan(&bytes, how.layers)?;
-            let label = |u: &unit::Unit| u.kind.map_or("unknown", |k| k.name()).to_string();
-            let units = units
-                .iter()
-                .map(|u| (label(u), u.attribute.map(|a| a.name()), u.layer, u.offset, u.size));
+            let header = read_header(&bytes, &how)?;
             Ok(DecodedGroup {
-                units: units.collect(),
+                units: report::units(&bytes, &header, reference.map(|r| &r.header), how.layers)?,
                 damage,
                 evaluator: Evaluator::new(group),
             })
@@ -151,30 +150,37 @@ impl DecodedGroup {
 
     /// What the payload consists of.
     fn units<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
-        let list = PyList::empty(py);
-        for (kind, attribute, layer, offset, bytes) in &self.units {
-            let d = PyDict::new(py);
-            d.set_item("type", kind)?;
-            d.set_item("attribute", attribute)?;
-            d.set_item("layer", layer)?;
-            d.set_item("offset", offset)?;
-            d.set_item("bytes", bytes)?;
-            list.append(d)?;
-        }
-        Ok(list)
+        report::units_into(py, &self.units)
     }
 
-    /// Units that are damaged, or missing where others are (unit: None): dicts of unit, type, attribute, message.
+    /// The tiles of each layer, as dicts of gaussians (decoded), low, high: the corners of the box where they show, world units.
+    fn tiles<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
+        report::tiles(py, self.group())
+    }
+
+    /// Units that are damaged, or need one that is: dicts of unit, type, layer, tile, message.
     fn damage<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
         let list = PyList::empty(py);
         for damage in &self.damage {
             let d = PyDict::new(py);
             d.set_item("unit", damage.unit)?;
             d.set_item("type", damage.kind.map_or("unknown", |k| k.name()))?;
-            d.set_item("attribute", damage.attribute.map(|a| a.name()))?;
             d.set_item("layer", damage.layer)?;
+            d.set_item("tile", (damage.kind == Some(UnitType::Tile)).then_some(damage.index))?;
             d.set_item("message", &damage.message)?;
             list.append(d)?;
+        }
+        Ok(list)
+    }
+
+    /// Cells (column, row) [N, 2] u32 of the Gaussians of each layer on its maps, and their width and height (spec 7.2).
+    fn cells<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
+        let list = PyList::empty(py);
+        for tiles in &self.group().tiles {
+            let map = HilbertLayout::new(tiles, self.group().header.tile_cells() as usize);
+            let cells: Vec<u32> = map.cells().iter().flat_map(|(x, y)| [*x as u32, *y as u32]).collect();
+            let n = cells.len() / 2;
+            list.append((cells.into_pyarray(py).reshape([n, 2])?, map.width, map.height))?;
         }
         Ok(list)
     }
@@ -186,7 +192,7 @@ impl DecodedGroup {
         let d = PyDict::new(py);
         for k in 0..group.layers.len() {
             let range = group.range(k..k + 1);
-            let map = HilbertLayout::new(range.len());
+            let map = HilbertLayout::new(&group.tiles[k], group.header.tile_cells() as usize);
             let layer = if group.layers.len() > 1 {
                 format!("layer{k}_")
             } else {
