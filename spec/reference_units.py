@@ -90,7 +90,10 @@ def check_units(units, header, layers, wanted=lambda k, t: True):
         if unit.unit_type not in UNIT_NAMES:
             continue  # unknown: skipped
         name = unit_name(unit.key())
-        require(unit.key() in required | optional, f"a unit {name}, which the header announces not: only units that it announces")
+        require(
+            unit.key() in required | optional,
+            f"a unit {name}, which the header announces not: only units that it announces",
+        )
         require(unit.key() not in found, f"a second {name}, expected one unit of each type, layer and index")
         found[unit.key()] = unit.payload
     missing = sorted(required - found.keys())
@@ -279,7 +282,8 @@ def read_tiles(r, layers, side_log2, reference):
         for t, before in enumerate(reference.layers[k].tiles if reference else []):
             count = r.u32()
             require(
-                count <= min(before.count, left), f"group_header: {count} survivors in tile {t}, expected at most {left}"
+                count <= min(before.count, left),
+                f"group_header: {count} survivors in tile {t}, expected at most {left}",
             )
             left -= count
             candidates = before.count if 0 < count < before.count else 0
@@ -290,7 +294,7 @@ def read_tiles(r, layers, side_log2, reference):
 
 
 def read_bounds(r):
-    bounds = tuple(r.take(6))
+    bounds = tuple(r.u16() for _ in range(6))
     valid = all(low <= high for low, high in zip(bounds[:3], bounds[3:], strict=True))
     require(valid, f"group_header: bounds are {bounds}, expected bounds whose lower corner is below")
     return bounds
@@ -368,6 +372,8 @@ def check_limits(header, level):
     budget = Budget(level)
     channels = sum(len(steps) for steps, _ in header.channels.values())
     budget.spend((3 + channels) * sum(layer.births for layer in header.layers))
-    budget.spend(len(header.trajectories) * count + sum(tile.candidates for layer in header.layers for tile in layer.tiles))
+    budget.spend(
+        len(header.trajectories) * count + sum(tile.candidates for layer in header.layers for tile in layer.tiles)
+    )
     budget.spend((3 + 6 * header.node_coefficients) * header.node_count)
     return budget

@@ -15,6 +15,7 @@ from gscodec import _native
 from gscodec.bitstream.levels import LEVELS, smallest_level
 from gscodec.bitstream.quantized_group import QuantizedNodes, QuantizedTrajectories
 from gscodec.decode import Stream, open_stream
+from gscodec.decode.maps import layouts, planes
 from gscodec.errors import BitstreamError, LimitError
 
 CAMERA = {"name": "cam00", "K": [[500, 0, 320], [0, 510, 240], [0, 0, 1]], "viewmat": np.eye(4)}
@@ -327,12 +328,18 @@ def test_levels_are_caps():
 
 
 def test_maps_hold_every_value():
-    group = surface_group(700)
-    maps = _native.DecodedGroup(_native.encode_group(group)[0], 1).maps()
-    assert len(maps) == 13
-    assert maps["sh0_1"].shape == (48, 16)
-    x = np.sort(maps["means_0"].ravel())
-    np.testing.assert_array_equal(x[-700:], np.sort(group.positions[:, 0]))
+    group = replace(surface_group(700), tile_side_log2=4)
+    decoded = _native.DecodedGroup(_native.encode_group(group)[0], 1)
+    [layout] = layouts(decoded)
+    assert (layout.width, layout.height, layout.side) == (16, 48, 16)
+    for name, values in planes(decoded.quantized()):
+        np.testing.assert_array_equal(layout.collect(layout.arrange(values)), values, err_msg=name)
+    for t in range(3):  # a tile is a square
+        own = slice(256 * t, 256 * (t + 1))
+        assert (layout.x[own] // 16 == 0).all()
+        assert (layout.y[own] // 16 == t).all()
+    steps = np.abs(np.diff(layout.x)) + np.abs(np.diff(layout.y))
+    assert (steps == 1).all()
 
 
 def make_file(frames=(20, 1, 7)):

@@ -1,4 +1,4 @@
-"""`gscodec info`: content of a file as lines or JSON, and its attribute maps as images."""
+"""`gscodec info`: content of a file as lines or JSON, and a picture of its attribute maps."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from ..errors import UsageError
 from .inputs import open_stream_warning
 from .options import Json, StreamPath, stdout
 
@@ -15,15 +16,24 @@ from .options import Json, StreamPath, stdout
 def info(
     stream: StreamPath,
     as_json: Json = False,
-    maps: Annotated[Path | None, typer.Option(metavar="DIR", help="Write the attribute maps as 16-bit images.")] = None,
+    maps: Annotated[
+        Path | None,
+        typer.Option(metavar="OUT.png", help="Draw the attribute maps of the first group with their tiles."),
+    ] = None,
 ) -> None:
     """What is in a file: groups, bits by attribute and unit."""
-    from ..decode.report import describe, write_maps
+    from ..decode.maps import draw_maps
+    from ..decode.report import describe
 
+    if maps and maps.suffix != ".png":
+        raise UsageError(
+            f"--maps {maps}: the picture must be named *.png; `gscodec decode --maps DIR` writes the planes"
+        )
     s = open_stream_warning(stream)
     facts = describe(s)
-    if maps:
-        write_maps(s, maps)
+    if maps and not s.groups:
+        raise UsageError(f"{stream}: no groups, so there are no maps to draw")
+    rows = draw_maps(s, maps) if maps else []
     if as_json:
         print(json.dumps(facts, indent=1))
         return
@@ -37,6 +47,8 @@ def info(
             f"{facts['bytes']} bytes, {facts['kb_per_frame']:.2f} kB/frame, {facts['mbit_per_s']:.2f} Mbit/s"
             + ("" if per_gaussian is None else f", {per_gaussian:.3f} bits per Gaussian and frame")
         )
+    if rows:
+        stdout.print(f"{maps}: from the top " + ", ".join(rows))
     if len(facts["layers"]) > 1:
         stdout.print("bytes of the layers: " + ", ".join(str(layer["bytes"]) for layer in facts["layers"]))
     for name, u in facts["units"].items():

@@ -1,20 +1,20 @@
 """Stream -> attribute maps: a picture of the planes with their tiles, or a folder of 16-bit images and maps.json, from
 which encode/from_maps.py makes the same bytes again.
 
-A plane has one integer a Gaussian (spec 7.2). Of a plane `low` is the least value; the image holds what is above it, and a
-second one the bits from 16 on where they are needed. Planes of zeros are left out.
+A plane has one integer a Gaussian (spec 7.2). The image holds how much each is above the least one, which maps.json
+tells, and a second image the bits from 16 on where they are needed. Planes of zeros are left out.
 """
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 
-from ..atomic_write import part_file
 from ..bitstream.hilbert_layout import HilbertLayout
 from ..bitstream.quantized_group import QuantizedGroup
 from ..render.png import write_png
@@ -68,8 +68,9 @@ def write_maps(stream: Stream, folder: Path) -> int:
         tiles = [[t["gaussians"] for t in tiles] for tiles in decoded.tiles()]
         groups.append({"sync": g["sync"], "tiles": tiles, "planes": own} | _facts(q))
     facts = {"format": FORMAT, "config": _plain(stream.config), "groups": groups}
-    with part_file(folder / "maps.json") as part:
-        part.write_text(json.dumps(facts, indent=1))
+    part = folder / "maps.json.part"
+    part.write_text(json.dumps(facts, indent=1))
+    os.replace(part, folder / "maps.json")
     return count
 
 
@@ -108,8 +109,8 @@ def _plain(value):
 
 
 def draw_maps(stream: Stream, path: Path) -> list[str]:
-    """Draws the planes of positions and channels of the first group: a row of them for each attribute, layer below layer,
-    with the borders of their tiles. Returns what the rows show, from the top."""
+    """Draws the planes of positions and channels of the first group with the borders of their tiles: a row for each
+    attribute, layer below layer. Returns what the rows show, from the top."""
     decoded = stream.group(0)
     q = decoded.quantized()
     ends, rows, names = [0, *accumulate(q.layers)], [], []

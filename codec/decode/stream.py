@@ -62,9 +62,10 @@ class Stream:
         """What was damaged in the groups decoded so far: dicts of group, unit, type, layer, tile, message.
 
         The Gaussians of a damaged tile are missing; so are those of all tiles of its layer if it is the first one, from
-        whose models they start. Without nodes, or their motion, Gaussians stay where they are. Groups that refer to a damaged one show its damage, which is
-        listed once, for that one. A group without sound header and first tile stays an error, and so does one whose
-        boxes are damaged (type: fragment), which does not cost the groups behind it if the file has an index.
+        whose models they start. Without nodes, or their motion, Gaussians stay where they are. Groups that refer to a
+        damaged one show its damage, which is listed once, for that one. A group without sound header and first tile
+        stays an error, and so does one whose boxes are damaged (type: fragment), which does not cost the groups behind
+        it if the file has an index.
         """
         return [{"group": i, **d} for i, found in sorted(self._damage.items()) for d in found]
 

@@ -79,7 +79,9 @@ def _group(folder: Path, i: int, g: dict) -> QuantizedGroup:
         channels=channels,
         trajectories=trajectories,
         nodes=_nodes(g["nodes"]) if g["nodes"] else None,
-        lifetimes=np.stack([plane(f"lifetimes_{e}") for e in range(2)], 1).astype(np.uint16) if g["lifetimes"] else None,
+        lifetimes=np.stack([plane(f"lifetimes_{e}") for e in range(2)], 1).astype(np.uint16)
+        if g["lifetimes"]
+        else None,
         layers=tuple(g["layers"]),
         shifts=array(g["shifts"], np.uint8),
         corrections=array(g["corrections"], np.float32),

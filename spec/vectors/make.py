@@ -47,7 +47,6 @@ from groups import (  # noqa: E402
 )
 from units import (  # noqa: E402
     HEADER,
-    STREAMS,
     TILE,
     add_unknown_units,
     change_predicted,
@@ -58,7 +57,6 @@ from units import (  # noqa: E402
     find_unit,
     header,
     insert,
-    join_streams,
     layers_file,
     other_deaths,
     other_top,
@@ -69,7 +67,6 @@ from units import (  # noqa: E402
     poke_time,
     predicted_file,
     remove_unit,
-    split_streams,
     traj,
     unit_dict,
     units_file,
@@ -113,7 +110,12 @@ VALID = {  # name: (what it is about, bytes)
     "tiles_layers": ("layers in tiles", lambda: groups_file(TILED_LAYERS)),
     "tiles_same": (
         "predicted groups in tiles without motion: tiles without streams",
-        lambda: predicted_file(TILED, replace(predicted(TILED, MANY, deaths=lambda i: False, births=0), trajectories={}, lifetimes=None, nodes=None)),
+        lambda: predicted_file(
+            TILED,
+            replace(
+                predicted(TILED, MANY, deaths=lambda i: False, births=0), trajectories={}, lifetimes=None, nodes=None
+            ),
+        ),
     ),
     "duplicates": ("many Gaussians on one grid point", lambda: groups_file(duplicates())),
     "tied_nodes": ("nodes at equal distance and on one point", lambda: groups_file(tied_nodes())),
@@ -307,8 +309,12 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "predicted_layer_count": (B, "layers", change_predicted(lambda h: h[:5] + b"\2" + h[6:])),
     "predicted_many_births": (B, "births", change_predicted(lambda h: h[:10] + u32(10**6) + h[14:])),
     "predicted_many_survivors": (B, "survivors", change_predicted(lambda h: h[:6] + u32(250) + u32(0) + h[14:])),
-    "predicted_few_survivors": (B, "more survivors", change_predicted(lambda h: h[:-13] + bytes([h[-13] - 1]) + h[-12:])),
-    "predicted_tile_survivors": (B, "at most", change_predicted(lambda h: h[:-13] + bytes([h[-13] + 1]) + h[-12:])),
+    "predicted_few_survivors": (
+        B,
+        "more survivors",
+        change_predicted(lambda h: h[:-25] + bytes([h[-25] - 1]) + h[-24:]),
+    ),
+    "predicted_tile_survivors": (B, "at most", change_predicted(lambda h: h[:-25] + bytes([h[-25] + 1]) + h[-24:])),
     "predicted_deaths_count": (B, "survivors", change_unit_of_predicted(TILE, 0, other_deaths)),
     "predicted_no_births": (B, "tile 1", change_unit_of_predicted(TILE, 1, lambda units, u: units.remove(u))),
     "layer_no_tile": (B, "tile 0 of layer 1", lambda: layers_file(lambda u: u.remove(find_unit(u, TILE, 0, 1)))),
@@ -319,7 +325,7 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
         header(flags=2, companding=[(0.0, 0.1), (0.0, 0.0), (0.0, 0.1), (0.0, 0.1)]),
     ),
     "header_companding_low": (B, "low", header(flags=2, companding=[(0.0, 0.1), (0.0, 0.1), (0.0, 0.1), (INF, 0.1)])),
-    "header_companding_cut": (B, "4 more", header(flags=2)),
+    "header_companding_cut": (B, "8 more", header(flags=2, bounds=())),
     "predicted_companding": (B, "flags", change_predicted(lambda h: h[:2] + bytes([h[2] | 2]) + h[3:])),
     "header_flags": (B, "flags", header(flags=32)),
     "header_flag_of_draft_7": (B, "flags", header(flags=4)),
@@ -339,8 +345,8 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "header_sh_degree": (B, "sh_degree", header(sh_degree=4)),
     "header_tile_side_small": (B, "tile_side_log2", header(tile_side_log2=3)),
     "header_tile_side_large": (B, "tile_side_log2", header(tile_side_log2=8)),
-    "header_bounds": (B, "bounds", header(bounds=(0, 9, 0, 255, 8, 255))),
-    "header_bounds_cut": (B, "6 more", header(layer_counts=[40], bounds=(0,) * 5)),
+    "header_bounds": (B, "bounds", header(bounds=(0, 9, 0, 255, 8, 256))),
+    "header_bounds_cut": (B, "2 more", header(layer_counts=[40], bounds=(0,) * 5)),
     "header_attribute_count": (B, "attributes", header(channels=HEADER["channels"][:3])),
     "header_attribute_order": (B, "attribute", header(channels=[HEADER["channels"][i] for i in (1, 0, 2, 3)])),
     "header_step_nan": (B, "step", header(channels=[(2, [(NAN, 0.0)] * 3), *HEADER["channels"][1:]])),
@@ -359,7 +365,7 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "header_node_coefficients": (B, "coefficients", header(coefficients=5)),
     "header_rotation_step": (B, "rotation_step", header(rotation_step=0.0)),
     "header_translation_step": (B, "translation_step", header(translation_step=NAN)),
-    "header_truncated": (B, "6 more", change_unit(0, payload=pack_header()[:-1])),
+    "header_truncated": (B, "2 more", change_unit(0, payload=pack_header()[:-1])),
     "header_left_over": (B, "group_header", change_unit(0, payload=pack_header() + b"\0")),
     # Limits
     "limit_gaussians": (L, "Gaussians", header(layer_counts=[65537])),

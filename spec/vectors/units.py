@@ -34,7 +34,7 @@ def base_group():
 
 
 def split_units(payload):
-    """Dicts of unit_type, layer, index, payload. That of the header has no directory, which `join_units` puts in again."""
+    """Dicts of unit_type, layer, index, payload; that of the header has no directory, `join_units` makes it."""
     header, _ = reference.read_header_bytes(payload)
     at = directory_at(header)
     count = struct.unpack_from(">H", header, at)[0]
@@ -103,7 +103,16 @@ def payload_file(edit):
 
 
 TILE = 1
-STREAMS = ("positions", "log_scales", "quats", "logit_opacities", "sh0", "means trajectories", "sh0 trajectories", "lifetimes")
+STREAMS = (
+    "positions",
+    "log_scales",
+    "quats",
+    "logit_opacities",
+    "sh0",
+    "means trajectories",
+    "sh0 trajectories",
+    "lifetimes",
+)
 
 
 def unit_dict(unit_type, layer=0, index=0, payload=b""):
@@ -182,7 +191,7 @@ HEADER = {
     "layer_count": 1,
     "layer_counts": [40],
     "tile_side_log2": 6,
-    "bounds": (0, 0, 0, 255, 255, 255),
+    "bounds": (0, 0, 0, 65535, 65535, 65535),
     "channels": [(a, [(0.1, 0.0)] * c) for a, c in ((2, 3), (3, 3), (4, 1), (5, 3))],
     "trajectories": [(1, 2, 0.1), (5, 2, 0.1)],
     "node_count": 3,
@@ -211,7 +220,8 @@ def pack_header(**changes):
             ">BHff", *(h[k] for k in ("neighbors", "coefficients", "rotation_step", "translation_step"))
         )
     cells = 4 ** max(h["tile_side_log2"], 4)
-    return data + bytes(h["bounds"]) * sum(-(-count // cells) for count in h["layer_counts"] if count < 2**24)
+    bounds = b"".join(struct.pack(">H", v) for v in h["bounds"])
+    return data + bounds * sum(-(-count // cells) for count in h["layer_counts"] if count < 2**24)
 
 
 def header(duration=4, **changes):

@@ -18,13 +18,13 @@ use crate::levels::Level;
 use crate::lifetimes;
 use crate::morton;
 use crate::neighbors::{self, Near};
+use crate::parallel;
 use crate::positions;
 use crate::range_coder::Decoder;
 use crate::tile::{self, Models, Stream, StreamModel};
 use crate::trajectories::{self, Kind, Stop, Trajectories, TrajectoryModel};
 use crate::unit::{self, ALL_LAYERS, Unit, UnitType};
 use crate::values::MAX_VALUE;
-use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Options of decoding.
@@ -131,9 +131,13 @@ fn decode(header: Header, units: &[Unit], how: &Decoding) -> Result<(Group, Vec<
     };
     let known_layers = decoder.reference.map_or(header.layers.len(), |r| r.layers.len()); // a prefix refers to a prefix
     let count = known_layers.min(how.layers);
-    let layer = |k: usize| decoder.layer(k);
-    let (layers, nodes) = rayon::join(
-        || (0..count).into_par_iter().map(layer).collect::<Result<Vec<_>>>(),
+    let order: Vec<usize> = (0..count).collect();
+    let (layers, nodes) = parallel::join(
+        || {
+            parallel::map(&order, |k| decoder.layer(*k))
+                .into_iter()
+                .collect::<Result<Vec<_>>>()
+        },
         || decoder.nodes(),
     );
     let corrections = (0..count)
@@ -215,14 +219,11 @@ impl GroupDecoder<'_> {
                 .for_each(|(stream, model)| models.learn(stream, model));
             tiles[t] = tile;
         }
-        let others = tiles
-            .par_iter_mut()
-            .enumerate()
-            .filter(|(t, _)| !leading.contains(&Some(*t)));
-        others.try_for_each(|(t, tile)| {
-            *tile = self.tile(k, t, &models)?.0;
-            Ok(())
-        })?;
+        let others: Vec<usize> = (0..count).filter(|t| !leading.contains(&Some(*t))).collect();
+        let decoded = parallel::map(&others, |t| self.tile(k, *t, &models));
+        for (t, learned) in others.into_iter().zip(decoded) {
+            tiles[t] = learned?.0;
+        }
         Ok(tiles)
     }
 
@@ -280,12 +281,12 @@ impl GroupDecoder<'_> {
         let near = neighbors::nearest(&tile.positions);
         tile.channels.resize(h.scales.len(), Vec::new());
         let others: Vec<(Stream, Source)> = sources.collect();
-        let decoded = others.par_iter().map(|(stream, source)| {
+        let decoded = parallel::map(&others, |(stream, source)| {
             let mut model = models.of(*stream, h);
             let part = self.part(k, *stream, source, &near, &mut model)?;
             Ok((*stream, model, part))
         });
-        for (stream, model, part) in decoded.collect::<Result<Vec<_>>>()? {
+        for (stream, model, part) in decoded.into_iter().collect::<Result<Vec<_>>>()? {
             learned.push((stream, model));
             match part {
                 Some(Part::Channels(i, v)) => tile.channels[i] = v,

@@ -51,8 +51,8 @@ pub struct NodeHeader {
 pub struct TileHeader {
     /// Gaussians: survivors of the tile of the same index of the reference, or births.
     pub count: u32,
-    /// Lower corner and upper corner in 1/256 of the grid, both included; 0 and 255 at a side: unbounded there.
-    pub bounds: [u8; 6],
+    /// Lower corner and upper corner, both included, in parts of the grid (tile_bounds.rs).
+    pub bounds: [u16; 6],
 }
 
 /// Gaussians of one layer.

@@ -79,8 +79,11 @@ pub fn join(streams: &[Vec<u8>]) -> Vec<u8> {
     out
 }
 
-/// Splits the payload of a tile into `count` streams, with their offsets in it; or where what was expected.
-pub fn split(payload: &[u8], count: usize) -> Result<Vec<(usize, &[u8])>, (usize, String)> {
+/// The streams of a tile with their offsets in its payload.
+pub type Parts<'a> = Vec<(usize, &'a [u8])>;
+
+/// Splits the payload of a tile into `count` streams; an error tells where what was expected.
+pub fn split(payload: &[u8], count: usize) -> Result<Parts<'_>, (usize, String)> {
     let mut r = Reader::new(payload);
     let mut sizes = Vec::with_capacity(count);
     for _ in 1..count {

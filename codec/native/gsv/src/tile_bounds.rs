@@ -1,5 +1,4 @@
-//! Bounds of tiles (spec 4): where the Gaussians of a tile show in any frame of the group, in 1/256 of the grid; and which
-//! tiles a view needs.
+//! Bounds of tiles (spec 4): where the Gaussians of a tile show in any frame of the group, in parts of the grid.
 
 use crate::evaluate::Evaluator;
 use crate::header::Header;
@@ -7,13 +6,13 @@ use crate::parametric::Frame;
 
 /// Corners of a box, world units.
 pub type Bounds = [[f32; 3]; 2];
-/// a x + b y + c z + d >= 0 inside.
-pub type Plane = [f32; 4];
 
-/// Parts of the grid along an axis.
-const PARTS: f32 = 256.0;
-/// A Gaussian of opacity 1 ends at this many standard deviations: sqrt(2 ln 255).
-const REACH: f32 = 3.33;
+/// Parts of the grid along an axis; as many halves lie on both sides of it.
+const PARTS: f32 = 32768.0;
+const FIRST: f32 = 16384.0; // the first part of the grid
+const MOST: f32 = 65535.0;
+/// The box holds what a Gaussian shows with this alpha or more.
+const ALPHA: f32 = 16.0 / 255.0;
 
 /// Side of a part, world units.
 fn part(h: &Header) -> f32 {
@@ -39,8 +38,8 @@ pub fn set(e: &mut Evaluator) {
     let (origin, part) = (h.origin, part(h));
     for (tiles, found) in h.tiles.iter_mut().zip(found) {
         for (tile, [low, high]) in tiles.iter_mut().zip(found) {
-            let lower = |a: usize| ((low[a] - origin[a]) / part).floor().clamp(0.0, 255.0) as u8;
-            let upper = |a: usize| ((high[a] - origin[a]) / part).floor().clamp(0.0, 255.0) as u8;
+            let place = |v: f32, a: usize| ((v - origin[a]) / part + FIRST).floor().clamp(0.0, MOST) as u16;
+            let (lower, upper) = (|a: usize| place(low[a], a), |a: usize| place(high[a], a));
             tile.bounds = [lower(0), lower(1), lower(2), upper(0), upper(1), upper(2)];
             if low[0] > high[0] {
                 tile.bounds = [0; 6]; // no Gaussians
@@ -72,7 +71,7 @@ fn extend([low, high]: &mut Bounds, f: &Frame, i: usize) {
         ],
     ];
     let opacity = 1.0 / (1.0 + (-f.logit_opacities[i]).exp());
-    let reach = (2.0 * (255.0 * opacity).ln()).max(0.0).sqrt().min(REACH);
+    let reach = (2.0 * (opacity / ALPHA).ln()).max(0.0).sqrt();
     for (a, row) in rows.iter().enumerate() {
         let axis = |c: usize| row[c] * f.log_scales[3 * i + c].exp();
         let deviation = (axis(0).powi(2) + axis(1).powi(2) + axis(2).powi(2)).sqrt();
@@ -85,16 +84,16 @@ fn extend([low, high]: &mut Bounds, f: &Frame, i: usize) {
 pub fn of(h: &Header, k: usize, t: usize) -> Option<Bounds> {
     let tile = h.tiles.get(k)?.get(t)?;
     let [a, b, c, d, e, f] = tile.bounds;
-    let place = |axis: usize, v: f32| h.origin[axis] + part(h) * v;
-    let lower = |axis, v: u8| {
+    let place = |axis: usize, v: f32| h.origin[axis] + part(h) * (v - FIRST);
+    let lower = |axis, v: u16| {
         if v == 0 {
             f32::NEG_INFINITY
         } else {
             place(axis, f32::from(v))
         }
     };
-    let upper = |axis, v: u8| {
-        if v == 255 {
+    let upper = |axis, v: u16| {
+        if v == u16::MAX {
             f32::INFINITY
         } else {
             place(axis, f32::from(v) + 1.0)
@@ -104,21 +103,4 @@ pub fn of(h: &Header, k: usize, t: usize) -> Option<Bounds> {
         [lower(0, a), lower(1, b), lower(2, c)],
         [upper(0, d), upper(1, e), upper(2, f)],
     ])
-}
-
-/// Of each layer, which tiles have a box that is not wholly outside one of the planes.
-pub fn inside(h: &Header, planes: &[Plane]) -> Vec<Vec<bool>> {
-    let seen = |k: usize, t: usize| of(h, k, t).is_some_and(|b| planes.iter().all(|p| reaches(b, p)));
-    let layer = |(k, tiles): (usize, &Vec<_>)| (0..tiles.len()).map(|t| seen(k, t)).collect();
-    h.tiles.iter().enumerate().map(layer).collect()
-}
-
-/// True if the corner of a box that is farthest along a plane's normal is inside.
-fn reaches([low, high]: Bounds, plane: &Plane) -> bool {
-    let term = |a: usize| match plane[a] {
-        0.0 => 0.0,
-        n if n > 0.0 => n * high[a],
-        n => n * low[a],
-    };
-    term(0) + term(1) + term(2) + plane[3] >= 0.0
 }

@@ -7,7 +7,7 @@ use crate::crc::crc32;
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader, Writer};
 use crate::header::Header;
-use rayon::prelude::*;
+use crate::parallel;
 
 /// The unit types of this version (spec 3.1).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -198,13 +198,13 @@ pub fn scan(payload: &[u8], layers: usize, wanted: impl Fn(u8, u16) -> bool) -> 
 
 /// Compares the checksums of units, which were cut off or are as the directory says.
 fn checked(mut units: Vec<Unit>) -> Vec<Unit> {
-    units.par_iter_mut().skip(1).for_each(|u| {
-        let computed = crc32(&[u.payload]);
+    let computed = parallel::map(&units, |u| crc32(&[u.payload]));
+    for (u, computed) in units.iter_mut().zip(computed).skip(1) {
         if u.damage.is_none() && u.crc != computed {
             let expected = format!("CRC-32 {:08x}, found {computed:08x}: the unit is damaged", u.crc);
             u.damage = Some(Error::bitstream(u.offset, u.label(), expected));
         }
-    });
+    }
     units
 }
 

@@ -146,19 +146,19 @@ fn tiles_come_alone() {
         }
         let part = decode_group(&holes, &how).unwrap();
         part.validate(None).unwrap();
-        for k in 0..g.tiles.len() {
-            for t in 0..g.tiles[k].len() {
-                let (own, all) = (part.tile_range(k, t), whole.tile_range(k, t));
-                assert_eq!(own.len(), if t == 0 || wanted[k][t] { all.len() } else { 0 });
-                if !own.is_empty() {
-                    assert_eq!(part.positions[own.clone()], whole.positions[all.clone()]);
-                    assert_eq!(part.rotations[own.clone()], whole.rotations[all.clone()]);
+        for (k, own) in wanted.iter().enumerate() {
+            for (t, asked) in own.iter().enumerate() {
+                let (mine, all) = (part.tile_range(k, t), whole.tile_range(k, t));
+                assert_eq!(mine.len(), if t == 0 || *asked { all.len() } else { 0 });
+                if !mine.is_empty() {
+                    assert_eq!(part.positions[mine.clone()], whole.positions[all.clone()]);
+                    assert_eq!(part.rotations[mine.clone()], whole.rotations[all.clone()]);
                     assert_eq!(
-                        part.channels[1][3 * own.start..3 * own.end],
+                        part.channels[1][3 * mine.start..3 * mine.end],
                         whole.channels[1][3 * all.start..3 * all.end]
                     );
                     assert!(
-                        own.clone()
+                        mine.clone()
                             .zip(all)
                             .all(|(i, j)| part.trajectories[0].get(i) == whole.trajectories[0].get(j))
                     );
@@ -243,7 +243,7 @@ fn impossible_groups_are_refused() {
     refused(|g| g.positions.truncate(11), "positions");
     refused(|g| g.header.layers[0].count += 1, "layers and tiles that the header");
     refused(|g| g.header.tile_side_log2 = 3, "tile_side_log2");
-    refused(|g| g.header.tiles[0][0].bounds[0] = 255, "bounds");
+    refused(|g| g.header.tiles[0][0].bounds[0] = u16::MAX, "bounds");
     refused(|g| g.tiles[0][0] -= 1, "make up the layers");
     refused(|g| g.header.layers.clear(), "1 to 16 layers");
     refused(|g| g.channels[1][0] = (1 << 24) + 1, "quats");

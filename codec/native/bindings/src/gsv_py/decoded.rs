@@ -10,7 +10,6 @@ use gsv::conformance::Damage;
 use gsv::decode::{Decoding, decode_damaged, decode_group, read_header};
 use gsv::evaluate::Evaluator;
 use gsv::group::Group;
-use gsv::hilbert_layout::HilbertLayout;
 use gsv::levels::Level;
 use gsv::unit::{ALL_LAYERS, UnitType};
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods};
@@ -171,48 +170,6 @@ impl DecodedGroup {
             list.append(d)?;
         }
         Ok(list)
-    }
-
-    /// Cells (column, row) [N, 2] u32 of the Gaussians of each layer on its maps, and their width and height (spec 7.2).
-    fn cells<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
-        let list = PyList::empty(py);
-        for tiles in &self.group().tiles {
-            let map = HilbertLayout::new(tiles, self.group().header.tile_cells() as usize);
-            let cells: Vec<u32> = map.cells().iter().flat_map(|(x, y)| [*x as u32, *y as u32]).collect();
-            let n = cells.len() / 2;
-            list.append((cells.into_pyarray(py).reshape([n, 2])?, map.width, map.height))?;
-        }
-        Ok(list)
-    }
-
-    /// Attribute maps (spec 7.2): name of the channel, behind that of the layer if there are several -> [H, W] i32; cells
-    /// without a Gaussian are 0.
-    fn maps<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let group = self.group();
-        let d = PyDict::new(py);
-        for k in 0..group.layers.len() {
-            let range = group.range(k..k + 1);
-            let map = HilbertLayout::new(&group.tiles[k], group.header.tile_cells() as usize);
-            let layer = if group.layers.len() > 1 {
-                format!("layer{k}_")
-            } else {
-                String::new()
-            };
-            let set = |name: String, value: &dyn Fn(usize) -> i32| {
-                let cells = map.arrange(|i| value(range.start + i)).into_pyarray(py);
-                d.set_item(layer.clone() + &name, cells.reshape([map.height, map.width])?)
-            };
-            for a in 0..3 {
-                set(format!("means_{a}"), &|i| group.positions[i][a] as i32)?;
-            }
-            for (a, values) in group.header.attributes().iter().zip(&group.channels) {
-                let channels = a.channels(group.header.sh_degree);
-                for c in 0..channels {
-                    set(format!("{}_{c}", a.name()), &|i| values[i * channels + c])?;
-                }
-            }
-        }
-        Ok(d)
     }
 }
 

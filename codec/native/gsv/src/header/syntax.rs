@@ -291,7 +291,7 @@ fn slot(tiles: &mut Vec<TileHeader>, t: usize) -> &mut TileHeader {
 
 impl TileHeader {
     fn bounds<F: Fields>(&mut self, f: &mut F) -> Result<()> {
-        f.bytes(&mut self.bounds)?;
+        self.bounds.iter_mut().try_for_each(|v| f.u16(v))?;
         let [a, b, c, d, e, g] = self.bounds;
         f.must(a <= d && b <= e && c <= g, || {
             format!("bounds whose lower corner is below, found {:?}", [a, b, c, d, e, g])

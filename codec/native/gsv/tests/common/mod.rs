@@ -153,8 +153,8 @@ pub fn group(s: &Shape) -> Group {
 fn divide(g: &mut Group, reference: Option<&Group>, r: &mut Random) {
     g.divide(reference);
     for tile in g.header.tiles.iter_mut().flatten() {
-        let (a, b) = (r.below(256) as u8, r.below(256) as u8);
-        tile.bounds = [a.min(b), 0, 255, a.max(b), 0, 255];
+        let (a, b) = (r.next() as u16, r.next() as u16);
+        tile.bounds = [a.min(b), 0, 9, a.max(b), 0, u16::MAX];
     }
 }
 
