@@ -15,7 +15,6 @@ import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from statistics import median
 from time import perf_counter
 
 import numpy as np
@@ -30,7 +29,7 @@ from gscodec.splats import read_splat
 from .data import data_folder
 from .machine import RESULTS, ROOT, write_result
 
-LEVEL, QUALITY, COPIES, RUNS = 4, 50, 13, 9
+LEVEL, QUALITY, COPIES, RUNS = 4, 50, 13, 15
 SIDES = (4, 5, 6, 7)  # log2
 
 
@@ -50,13 +49,13 @@ def sizes(q: QuantizedGroup) -> list[dict]:
 
 
 def seconds(payload: bytes, tiles: list[list[bool]] | None = None) -> float:
-    """Median time of decoding."""
+    """Time of decoding: the fastest of several runs, which other work on the machine disturbs least."""
     times = []
     for _ in range(RUNS):
         start = perf_counter()
         _native.DecodedGroup(payload, LEVEL, tiles=tiles)
         times.append(perf_counter() - start)
-    return median(times)
+    return min(times)
 
 
 def by_threads(payload: bytes) -> list[dict]:
@@ -101,10 +100,10 @@ def planes_of_view(group, share: float) -> np.ndarray:
     low, high = means.min(0), means.max(0)
     eye = (low + high) / 2 + np.array([0.11, 0, 0.07]) * (high - low)
     eye[1] = high[1] + (high - low).max()
-    for slope in np.geomspace(2, 0.01, 400):
+    for slope in np.geomspace(2, 0.01, 200):
         normals = np.array([[1, -slope, 0], [-1, -slope, 0], [0, -slope, 1], [0, -slope, -1], [0, -1, 0]])
         planes = np.column_stack([normals, -normals @ eye])
-        if _inside(means, planes).mean() <= share:
+        if _inside(means[::50], planes).mean() <= share:
             break
     return planes
 
