@@ -1,4 +1,4 @@
-"""What tiles cost and buy: bytes by their side, decoding on one core and on all, a view of a tenth of a million, damage.
+"""What tiles cost and buy: bytes by their side, decoding on one core and on all, views of a tenth of a million, damage.
 
 usage: GSCODEC_DATA=... python -m bench.tiles [PAYLOAD]        writes bench/results/tiles.json
 
