@@ -236,7 +236,7 @@ def read_sample_entry(data, trak):
 def read_gsvc(r):
     """Clause 2.3."""
     version = r.u8()
-    require(version == 3, f"gsvC: configuration_version is {version}, expected 3")
+    require(version == 4, f"gsvC: configuration_version is {version}, expected 4")
     level, frame_duration = r.u8(), r.u32()
     if level not in LEVELS:
         raise LimitError(f"gsvC: level is {level}, expected 1 to {max(LEVELS)}")

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from reference_container import LEVELS, BitstreamError, LimitError, read_container, require
-from reference_entropy import MAX_VALUE
+from reference_entropy import MAX_VALUE, Model, SymbolModel, ValueModel
 from reference_integers import (
     class_nodes,
     class_trajectories,
@@ -47,6 +47,7 @@ from reference_units import (
     QUATS,
     SH0,
     SHN,
+    TILE,
     TRAJECTORIES,
     Header,
     channel_count,
@@ -54,8 +55,10 @@ from reference_units import (
     check_units,
     limit,
     read_group_header,
+    read_header_bytes,
     read_reference,
     read_units,
+    split_tile,
 )
 
 # ---- 3 to 12. Group -------------------------------------------------------------------------------------------------
@@ -67,6 +70,7 @@ class Group:
 
     header: Header
     counts: list  # Gaussians of each decoded layer
+    tiles: list  # (first, count) of each tile of each decoded layer; None: not decoded
     positions: np.ndarray  # [N, 3]
     channels: dict  # attribute -> [C, N]
     quats0: np.ndarray  # [N, 4] wxyz, from the channels of quats and log_scales (clause 13.1)
@@ -77,75 +81,128 @@ class Group:
     correction: dict  # attribute -> value, of the last decoded layer
 
 
-def decode_layer(found, k, header, reference, spend):
-    """Clauses 8 to 10 and 12: one layer -> positions [N, 3], channels, quats0, lifetimes or None, trajectories."""
-    layer, shifts = header.layers[k], header.shifts[k]
-    points, near_births = [], []
-    if layer.births or not header.reference:
-        points = decode_positions(found[POSITIONS, k, 0], layer.births, header.grid_bits - shifts[MEANS], "positions")
-        near_births = find_neighbors(points)
-    positions = np.array(points, np.int32).reshape(layer.births, 3) << shifts[MEANS]
-    channels = {}
-    for a, (steps, _) in header.channels.items():
-        if (CHANNELS, k, a) in found:
-            q = decode_channels(found[CHANNELS, k, a], a, len(steps), near_births, f"channels of {ATTRIBUTES[a]}")
-            q = np.array(q, np.int64).reshape(len(steps), layer.births) << shifts[a]
-            require((abs(q) <= MAX_VALUE).all(), f"channels of {ATTRIBUTES[a]}: a value beyond {MAX_VALUE}")
+def make_model(kind):
+    if kind == CHANNELS:
+        return SymbolModel()
+    return (Model(), ValueModel()) if kind == TRAJECTORIES else Model()
+
+
+def settled(model):
+    return tuple(m.settled() for m in model) if isinstance(model, tuple) else model.settled()
+
+
+def decode_tile(payload, tile, k, header, reference, models, spend):
+    """Clauses 3.3, 8 to 10 and 12: one tile -> positions [n, 3], channels, quats0, lifetimes or None, trajectories.
+
+    `reference`: its Group and the (first, count) of the tile there, of a tile of survivors. `models`: (kind, attribute)
+    -> model, those that are missing are made and left as they are at the end of the stream.
+    """
+    shifts, streams = header.shifts[k], split_tile(payload, tile, header)
+
+    def model(kind, a=0):
+        return models.setdefault((kind, a), make_model(kind))
+
+    if tile.born:
+        bits = header.grid_bits - shifts[MEANS]
+        points = decode_positions(streams[POSITIONS, 0], tile.count, bits, "positions", model(POSITIONS))
+        near = find_neighbors(points)
+        positions = np.array(points, np.int32).reshape(tile.count, 3) << shifts[MEANS]
+        channels = {}
+        for a, (steps, _) in header.channels.items():
+            what = f"channels of {ATTRIBUTES[a]}"
+            q = decode_channels(streams[CHANNELS, a], a, len(steps), near, what, model(CHANNELS, a))
+            q = np.array(q, np.int64).reshape(len(steps), tile.count) << shifts[a]
+            require((abs(q) <= MAX_VALUE).all(), f"{what}: a value beyond {MAX_VALUE}")
             channels[a] = q.astype(np.int32)
-        else:
-            channels[a] = np.zeros((len(steps), 0), np.int32)
-    quats0 = rotations(header, channels, near_births)
-    if reference:
-        first = sum(reference.counts[:k])
-        alive = list(range(reference.counts[k]))
-        if layer.candidates:
-            theirs = reference.positions[first : first + layer.candidates].tolist()
-            unit, survivors = found[DEATHS, k, 0], layer.count - layer.births
-            alive = decode_deaths(unit, find_neighbors(theirs), survivors, "deaths")
+        quats0 = rotations(header, channels, near)
+    else:
+        group, (first, count) = reference
+        alive = list(range(count))
+        if tile.candidates:
+            theirs = group.positions[first : first + count].tolist()
+            alive = decode_deaths(streams[DEATHS, 0], find_neighbors(theirs), tile.count, "deaths")
         alive = np.array(alive, int) + first
-        positions = np.concatenate([reference.positions[alive], positions])
-        channels = {a: np.concatenate([reference.channels[a][:, alive], q], 1) for a, q in channels.items()}
-        quats0 = np.concatenate([reference.quats0[alive], quats0])
+        positions, quats0 = group.positions[alive], group.quats0[alive]
+        channels = {a: q[:, alive] for a, q in group.channels.items()}
     near = find_neighbors(positions.tolist())
-    lifetimes, trajectories = None, {}
-    if (LIFETIMES, k, 0) in found:
-        q = decode_lifetimes(found[LIFETIMES, k, 0], header.frames, near, "lifetimes")
-        lifetimes = np.array(q, np.int32).reshape(layer.count, 2)
+    trajectories, lifetimes = {}, None
     for a, (K, _) in header.trajectories.items():
         C, what = channel_count(a, header.sh_degree), f"trajectories of {ATTRIBUTES[a]}"
-        q = decode_trajectories(found[TRAJECTORIES, k, a], K, C, near, class_trajectories, spend, what)
+        own = model(TRAJECTORIES, a)
+        q = decode_trajectories(streams[TRAJECTORIES, a], K, C, near, class_trajectories, spend, what, own)
         trajectories[a] = dense(q, K, C)
+    if header.lifetimes:
+        q = decode_lifetimes(streams[LIFETIMES, 0], header.frames, near, "lifetimes", model(LIFETIMES))
+        lifetimes = np.array(q, np.int32).reshape(tile.count, 2)
     return positions, channels, quats0, lifetimes, trajectories
 
 
-def decode_group(payload, level, frames=None, reference=None, layers=256):
+def decode_layer(found, k, header, reference, spend):
+    """Clause 7.4: the tiles of a layer, those that start others first -> {index: what decode_tile gives}."""
+    layer, seeds, decoded = header.layers[k], {}, {}
+    leading = layer.leading()
+    for t in sorted(range(len(layer.tiles)), key=lambda t: (t not in leading, t)):
+        tile, theirs = layer.tiles[t], None
+        if not tile.born:
+            theirs = reference.tiles[k][t]
+        if (TILE, k, t) not in found or (not tile.born and theirs is None):
+            continue
+        models = {key: settled(seed) for key, seed in seeds.items()}
+        decoded[t] = decode_tile(found[TILE, k, t], tile, k, header, (reference, theirs), models, spend)
+        if t in leading:
+            seeds = models | seeds
+    return decoded
+
+
+def empty_tile(header):
+    """What decode_tile gives for no Gaussians."""
+    channels = {a: np.zeros((len(steps), 0), np.int32) for a, (steps, _) in header.channels.items()}
+    trajectories = {
+        a: np.zeros((K, channel_count(a, header.sh_degree), 0), np.int32) for a, (K, _) in header.trajectories.items()
+    }
+    lifetimes = np.zeros((0, 2), np.int32) if header.lifetimes else None
+    return np.zeros((0, 3), np.int32), channels, np.zeros((0, 4)), lifetimes, trajectories
+
+
+def decode_group(payload, level, frames=None, reference=None, layers=256, tiles=None):
     """Clauses 3 to 12: a sample -> Group.
 
     `frames`: its duration in the container, if it comes out of one. `reference`: the Group to which a predicted one
-    refers. `layers`: how many are decoded.
+    refers. `layers`: how many are decoded. `tiles`: (layer, index) -> whether the tile is; leading ones always are.
     """
     limit(len(payload), LEVELS[level][4], "bytes", level)
-    units = read_units(payload, layers)
-    header = read_group_header(units[0].payload, reference and reference.header)
+    header = read_group_header(read_header_bytes(payload)[0], reference and reference.header)
     reference = reference if header.reference else None
+
+    def wanted(k, t):
+        return tiles is None or tiles(k, t) or t in header.layers[k].leading()
+
     budget = check_limits(header, level)
+    units = read_units(payload, layers, wanted)
     wrong = f"group_header: frames is {header.frames}, but the sample lasts {frames}"
     require(frames is None or frames == header.frames, wrong)
-    found = check_units(units, header, layers)
-    counts = [layer.count for layer in header.layers[:layers]]
-    parts = [decode_layer(found, k, header, reference, budget.spend) for k in range(len(counts))]
+    found = check_units(units, header, layers, wanted)
+    parts, places, total = [empty_tile(header)], [], 0
+    for k, layer in enumerate(header.layers[:layers]):
+        decoded = decode_layer(found, k, header, reference, budget.spend)
+        places.append([])
+        for t, tile in enumerate(layer.tiles):
+            lacking = t not in decoded and tile.count > 0
+            count = len(decoded[t][0]) if t in decoded else 0
+            places[-1].append(None if lacking else (total, count))
+            total += count
+            parts += [decoded[t]] if t in decoded else []
+    counts = [sum(place[1] for place in own if place) for own in places]
     node_positions, node_trajectories = None, None
     if header.node_count:
-        nodes = decode_positions(found[NODE_POSITIONS, 0, 0], header.node_count, header.grid_bits, "node_positions")
+        nodes = decode_positions(
+            found[NODE_POSITIONS, 0, 0], header.node_count, header.grid_bits, "node_positions", Model()
+        )
         node_positions = np.array(nodes, np.int32)
         K, node_near = header.node_coefficients, find_neighbors(nodes)
         unit = found[NODE_TRAJECTORIES, 0, 0]
         q = decode_trajectories(unit, K, 6, node_near, class_nodes, lambda _: None, "node_trajectories")
         node_trajectories = dense(q, K, 6)
-    lifetimes = None
-    if any(part[3] is not None for part in parts):
-        whole = [np.tile(np.array([0, header.frames], np.int32), (n, 1)) for n in counts]
-        lifetimes = np.concatenate([w if part[3] is None else part[3] for w, part in zip(whole, parts, strict=True)])
     correction = {}
     for k in range(len(counts)):
         for a in (LOG_SCALES, LOGIT_OPACITIES):
@@ -155,10 +212,11 @@ def decode_group(payload, level, frames=None, reference=None, layers=256):
     return Group(
         header,
         counts,
+        places,
         np.concatenate([part[0] for part in parts]),
         {a: np.concatenate([part[1][a] for part in parts], 1) for a in header.channels},
         np.concatenate([part[2] for part in parts]),
-        lifetimes,
+        np.concatenate([part[3] for part in parts]) if header.lifetimes else None,
         node_positions,
         node_trajectories,
         {a: np.concatenate([part[4][a] for part in parts], 2) for a in header.trajectories},
@@ -349,7 +407,7 @@ def decode(data):
     config, samples = read_container(data)
     groups = []
     for i, sample in enumerate(samples):
-        back = read_reference(read_units(sample.payload, layers=1)[0].payload)
+        back = read_reference(sample.payload)
         require(back <= i, f"group {i}: it refers to the group {back} before it, which is before the first")
         require(not back or not sample.sync, f"group {i}: it is predicted, but its sample is a sync sample")
         reference = groups[i - back] if back else None

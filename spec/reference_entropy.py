@@ -89,11 +89,19 @@ AGE = [0 if n < 4 else 1 if n < 16 else 2 if n < 64 else 3 for n in range(256)]
 class Model:
     """Clauses 6.2 and 6.4: tables A and B of counters [p, n] and pairs of weights, made when first used."""
 
-    def __init__(self, decoder):
+    def __init__(self, decoder=None):
         self.decoder = decoder
         self.A = defaultdict(lambda: [1 << 21, 0])
         self.B = defaultdict(lambda: [1 << 21, 0])
         self.weights = defaultdict(lambda: [26214, 26214])
+
+    def settled(self):
+        """Clause 7.4: a copy for another tile, which takes a decoder of its own."""
+        other = type(self)()
+        for mine, theirs in ((self.A, other.A), (self.B, other.B)):
+            theirs.update({i: [p, min(n, 20)] for i, (p, n) in mine.items()})
+        other.weights.update({i: list(pair) for i, pair in self.weights.items()})
+        return other
 
     def mixed(self, a, b, w):
         ca, cb = self.A[a], self.B[b]
@@ -175,10 +183,19 @@ class Distribution:
 class SymbolModel:
     """Clause 6.6: tables of distributions and pairs of weights, made when first used."""
 
-    def __init__(self, decoder):
+    def __init__(self, decoder=None):
         self.decoder = decoder
         self.tables = [defaultdict(Distribution) for _ in range(3)]
         self.weights = defaultdict(lambda: [21845 * 128] * 2)
+
+    def settled(self):
+        """Clause 7.4: a copy for another tile, which takes a decoder of its own."""
+        other = SymbolModel()
+        for mine, theirs in zip(self.tables, other.tables, strict=True):
+            for i, d in mine.items():
+                theirs[i].E, theirs[i].n = list(d.E), min(d.n, 30)
+        other.weights.update({i: list(pair) for i, pair in self.weights.items()})
+        return other
 
     def mixed_symbol(self, class_, *contexts):
         e = [table[d] for table, d in zip(self.tables, contexts, strict=True)]

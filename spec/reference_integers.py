@@ -2,7 +2,7 @@
 
 import numpy as np
 from reference_container import Reader, require
-from reference_entropy import Model, RangeDecoder, SymbolModel, ValueModel, checked, expected
+from reference_entropy import Model, RangeDecoder, ValueModel, checked, expected
 from reference_units import SHN
 
 # ---- 7. Order and maps ----------------------------------------------------------------------------------------------
@@ -28,27 +28,10 @@ def find_neighbors(positions):
 # ---- 8. Positions ---------------------------------------------------------------------------------------------------
 
 
-def decode_positions(payload, count, grid_bits, what):
+def decode_positions(payload, count, grid_bits, what, model=None):
     """Clause 8: -> list of (x, y, z) in Morton order."""
-    if count < 1 << 14:
-        codes = decode_tree(payload, count, grid_bits, what)
-    else:
-        reader = Reader(payload, 0, len(payload), what)
-        size = reader.u32()
-        require(
-            size <= reader.end - reader.position, f"{reader.what}: the first tree has {size} bytes, more than are left"
-        )
-        first = reader.take(size)
-        second = reader.take(reader.end - reader.position)
-        codes = decode_tree(first, count // 2, grid_bits, what) + decode_tree(
-            second, count - count // 2, grid_bits, what
-        )
-    return [morton_inverse(code) for code in sorted(codes)]
-
-
-def decode_tree(payload, count, grid_bits, what):
-    """Clause 8: -> Morton codes."""
-    model = Model(RangeDecoder(payload, what))
+    model = model or Model()
+    model.decoder = RangeDecoder(payload, what)
     output, level = [], [(0, count)] if count else []
     for rest in range(grid_bits, 0, -1):
         cubes = [morton_inverse(code) for code, _ in level]
@@ -69,7 +52,7 @@ def decode_tree(payload, count, grid_bits, what):
     for code, n in level:
         output += [code] * n
     model.decoder.finish()
-    return output
+    return [morton_inverse(code) for code in sorted(output)]
 
 
 class Splitter:
@@ -134,10 +117,9 @@ LEAST = [1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 13, 17, 25, 41, 73]
 EXTRA = [0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 2, 3, 4, 5]
 
 
-def decode_channels(payload, attribute, channels, near, what):
+def decode_channels(payload, attribute, channels, near, what, model):
     """Clause 9: -> q[c][i]."""
-    decoder = RangeDecoder(payload, what)
-    model = SymbolModel(decoder)
+    decoder = model.decoder = RangeDecoder(payload, what)
     q = [[] for _ in range(channels)]
     s = 3 if attribute == SHN else 2
     for j in near:
@@ -181,9 +163,9 @@ def residual(decoder, symbol):
 # ---- 10. Lifetimes --------------------------------------------------------------------------------------------------
 
 
-def decode_lifetimes(payload, frames, near, what):
+def decode_lifetimes(payload, frames, near, what, model):
     """Clause 10: -> list of (t0, t1)."""
-    model = Model(RangeDecoder(payload, what))
+    model.decoder = RangeDecoder(payload, what)
     w = (frames - 1).bit_length()
 
     def point(e, ref):
@@ -249,10 +231,12 @@ def class_trajectories(k, c):
     return 3 * min(k, 3) + c % 3
 
 
-def decode_trajectories(payload, coefficients, channels, near, class_of, spend, what):
-    """Clauses 11 and 12: -> for each i the list of its coefficients, [C] values each; calls spend(C) before each."""
+def decode_trajectories(payload, coefficients, channels, near, class_of, spend, what, models=None):
+    """Clauses 11 and 12: -> for each i the list of its coefficients, [C] values each; calls spend(C) before each.
+    `models`: of the lengths, of the values."""
     decoder = RangeDecoder(payload, what)
-    lengths, values = Model(decoder), ValueModel(decoder)
+    lengths, values = models or (Model(), ValueModel())
+    lengths.decoder = values.decoder = decoder
     q, zeros, any_of = [], [0] * channels, [0, 0]  # any(g) of clause 12 for all blocks, after two zeros
     for i, j in enumerate(near):
         if i % 16 == 0:

@@ -1,30 +1,19 @@
 """Clauses 3 to 5 of gsv.md for the reference decoder: units, group header, levels."""
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from reference_container import LEVELS, PAIRS, LimitError, Reader, require
 
 # ---- 3. Group payload -----------------------------------------------------------------------------------------------
 
-GROUP_HEADER, POSITIONS, CHANNELS, LIFETIMES, NODE_POSITIONS, NODE_TRAJECTORIES, TRAJECTORIES = range(7)
-DEATHS, LAYER_CORRECTION = 8, 9
+GROUP_HEADER, TILE, NODE_POSITIONS, NODE_TRAJECTORIES, LAYER_CORRECTION = range(5)
 UNIT_NAMES = {
     GROUP_HEADER: "group_header",
-    POSITIONS: "positions",
-    CHANNELS: "channels",
-    LIFETIMES: "lifetimes",
+    TILE: "tile",
     NODE_POSITIONS: "node_positions",
     NODE_TRAJECTORIES: "node_trajectories",
-    TRAJECTORIES: "trajectories",
-    DEATHS: "deaths",
     LAYER_CORRECTION: "layer_correction",
-}
-MUST_DEPEND_ON = {
-    CHANNELS: (POSITIONS,),
-    LIFETIMES: (POSITIONS, DEATHS),
-    NODE_TRAJECTORIES: (NODE_POSITIONS,),
-    TRAJECTORIES: (POSITIONS, DEATHS),
 }
 MEANS, LOG_SCALES, QUATS, LOGIT_OPACITIES, SH0, SHN = range(1, 7)
 ATTRIBUTES = {1: "means", 2: "log_scales", 3: "quats", 4: "logit_opacities", 5: "sh0", 6: "shN"}
@@ -36,93 +25,138 @@ def channel_count(attribute, sh_degree):
 
 
 def unit_name(key):
-    """(type, layer, attribute) in words."""
-    unit_type, layer, attribute = key
-    of = f" of {ATTRIBUTES.get(attribute, attribute)}" if attribute else ""
-    return f"{UNIT_NAMES.get(unit_type, unit_type)} unit{of} in layer {layer}"
+    """(type, layer, index) in words."""
+    unit_type, layer, index = key
+    which = f" {index}" if unit_type == TILE else ""
+    return f"{UNIT_NAMES.get(unit_type, unit_type)}{which} of layer {layer}"
 
 
 @dataclass
 class Unit:
     unit_type: int
     layer: int
-    attribute: int
-    dependencies: list
+    index: int
     payload: bytes
 
     def key(self):
-        return self.unit_type, self.layer, self.attribute
+        return self.unit_type, self.layer, self.index
 
 
-def read_units(payload, layers=256):
-    """Clause 3: the units of the first layers of a group, with all rules that do not need the group header."""
-    units, sizes = [], []
-    reader = Reader(payload, 0, len(payload), "unit 0")
-    while reader.position < reader.end:
-        index, start = len(units), reader.position
-        reader.what = f"unit {index}"
-        require(index < 255, f"more than 255 units in the group, byte {start}")
-        unit_type, layer, attribute = reader.u8(), reader.u8(), reader.u8()
+def read_header_bytes(payload):
+    """Clause 3: the header of a group, and where the payloads of the units begin."""
+    r = Reader(payload, 0, len(payload), "unit 0 (group_header)")
+    length, crc = r.u32(), r.u32()
+    header = r.take(length)
+    require(zlib.crc32(header) == crc, "unit 0: wrong CRC, the group_header is damaged")
+    return bytes(header), r.position
+
+
+def read_units(payload, layers=256, tiles=None):
+    """Clause 3: the units of the first layers of a group behind the header, with all rules that do not need its other
+    fields. `tiles`: (layer, index) -> whether a tile is wanted; the bytes of others are not looked at."""
+    header, start = read_header_bytes(payload)
+    units, directory = [], read_opening(Reader(header, 0, len(header), "group_header"))[3]
+    reader = Reader(payload, start, len(payload), "unit 1")
+    for number, (unit_type, layer, index, size, crc) in enumerate(directory, 1):
+        reader.what, where = f"unit {number}", f"unit {number} of the directory"
+        before = directory[number - 2][1] if number > 1 else 0
+        require(before <= layer, f"{where}: layer {layer}, expected layers in increasing order")
+        require(unit_type != GROUP_HEADER, f"{where}: expected no second group_header")
+        single = unit_type not in (NODE_POSITIONS, NODE_TRAJECTORIES) or index == 0
+        require(single, f"{where}: expected an index of 0, not {index}")
+        known = unit_type != LAYER_CORRECTION or index in (LOG_SCALES, LOGIT_OPACITIES)
+        require(known, f"{where}: a layer_correction of attribute {index}, expected one of attribute 2 or 4")
         if layer >= layers:
-            break
-        dependencies = list(reader.take(reader.u8()))
-        length = reader.u32()
-        covered = bytes(payload[start : reader.position])
-        crc = reader.u32()
-        body = reader.take(length)
-        require(zlib.crc32(covered + body) == crc, f"unit {index} at byte {start}: wrong CRC, the unit is damaged")
-        size = reader.position - start
-        wrong = f"unit {index}: {size} bytes, but the header says {sizes[index] if index < len(sizes) else 0}"
-        require(index >= len(sizes) or sizes[index] == size, wrong)
-        increasing = dependencies == sorted({d for d in dependencies if d < index})
-        require(increasing, f"unit {index}: dependencies {dependencies} are not increasing indices below {index}")
-        require(not units or units[-1].layer <= layer, f"unit {index}: layer {layer} after a higher one")
-        unit = Unit(unit_type, layer, attribute, dependencies, body)
-        second = unit_type in UNIT_NAMES and any(unit.key() == u.key() for u in units)
-        require(not second, f"unit {index}: a second {unit_name(unit.key())}, expected one")
-        if index == 0 and unit_type == GROUP_HEADER:
-            sizes = [size, *read_opening(Reader(body, 0, len(body), "group_header"))[3]]
-        units.append(unit)
-    require(units and units[0].key() == (GROUP_HEADER, 0, 0), "unit 0 is not the group header, of layer 0")
+            return units
+        wanted = unit_type != TILE or tiles is None or tiles(layer, index)
+        body = bytes(reader.take(size))
+        if wanted:
+            require(zlib.crc32(body) == crc, f"unit {number}: wrong CRC, the unit is damaged")
+            units.append(Unit(unit_type, layer, index, body))
+    left = reader.end - reader.position
+    require(not left, f"{left} bytes behind the last unit, expected the end of the group")
     return units
 
 
-def check_units(units, header, layers):
-    """Clause 3.1: the units are those that the header announces -> {(type, layer, attribute): payload}."""
-    required, optional = {(GROUP_HEADER, 0, 0)}, set()
+def check_units(units, header, layers, wanted=lambda k, t: True):
+    """Clause 3.1: the units are those that the header announces -> {(type, layer, index): payload}."""
+    required, optional = set(), set()
     required |= {(NODE_POSITIONS, 0, 0), (NODE_TRAJECTORIES, 0, 0)} if header.node_count else set()
     for k, layer in enumerate(header.layers[:layers]):
-        if not header.reference or layer.births:
-            required |= {(POSITIONS, k, 0)} | {(CHANNELS, k, a) for a in header.channels}
-        required |= {(DEATHS, k, 0)} if layer.candidates else set()
-        required |= {(TRAJECTORIES, k, a) for a in header.trajectories}
-        optional |= {(LIFETIMES, k, 0), (LAYER_CORRECTION, k, LOG_SCALES), (LAYER_CORRECTION, k, LOGIT_OPACITIES)}
+        required |= {(TILE, k, t) for t, tile in enumerate(layer.tiles) if tile.count and wanted(k, t)}
+        optional |= {(LAYER_CORRECTION, k, LOG_SCALES), (LAYER_CORRECTION, k, LOGIT_OPACITIES)}
     found = {}
-    for index, unit in enumerate(units):
+    for unit in units:
         if unit.unit_type not in UNIT_NAMES:
             continue  # unknown: skipped
-        announced = unit.key() in required | optional
-        require(announced, f"unit {index}: the header announces no {unit_name(unit.key())}")
-        on = [units[d].key() for d in unit.dependencies]
-        needs = [(needed, unit.layer, 0) for needed in MUST_DEPEND_ON.get(unit.unit_type, ())]
-        if unit.unit_type == CHANNELS and unit.attribute == QUATS:
-            needs.append((CHANNELS, unit.layer, LOG_SCALES))
-        for key in needs:
-            require(key not in required or key in on, f"unit {index}: must depend on a {unit_name(key)}")
+        name = unit_name(unit.key())
+        require(
+            unit.key() in required | optional,
+            f"a unit {name}, which the header announces not: only units that it announces",
+        )
+        require(unit.key() not in found, f"a second {name}, expected one unit of each type, layer and index")
         found[unit.key()] = unit.payload
     missing = sorted(required - found.keys())
-    require(not missing, f"expected units that are missing: {', '.join(map(unit_name, missing))}")
+    require(not missing, f"expected a unit {', '.join(map(unit_name, missing))}, found none")
     return found
+
+
+# ---- 3.3 Tile -------------------------------------------------------------------------------------------------------
+
+DEATHS, POSITIONS, CHANNELS, TRAJECTORIES, LIFETIMES = "deaths", "positions", "channels", "trajectories", "lifetimes"
+
+
+def split_tile(payload, tile, header):
+    """Clause 3.3: {(kind, attribute or 0): bytes}."""
+    kinds = [(DEATHS, 0)] if tile.candidates else []
+    if tile.born:
+        kinds = [(POSITIONS, 0)] + [(CHANNELS, a) for a in header.channels]
+    kinds += [(TRAJECTORIES, a) for a in header.trajectories] + [(LIFETIMES, 0)] * header.lifetimes
+    r = Reader(payload, 0, len(payload), "tile")
+    sizes = [read_varint(r) for _ in kinds[1:]]
+    streams = {}
+    for n, kind in enumerate(kinds):
+        left = r.end - r.position
+        size = sizes[n] if n < len(sizes) else left
+        require(size <= left, f"tile: {size} more bytes of a stream, found {left}")
+        streams[kind] = bytes(r.take(size))
+    require(r.position == r.end, f"tile: expected the end of the tile, found {r.end - r.position} more bytes")
+    return streams
+
+
+def read_varint(r):
+    value = 0
+    for _ in range(5):
+        require(r.position < r.end, "tile: the size of a stream is cut off")
+        byte = r.u8()
+        value = value << 7 | byte & 127
+        if byte < 128:
+            require(value < 1 << 32, "tile: the size of a stream is too large")
+            return value
+    require(False, "tile: expected the size of a stream, of at most 5 bytes")
 
 
 # ---- 4. Group header ------------------------------------------------------------------------------------------------
 
 
 @dataclass
+class Tile:
+    count: int
+    born: bool  # of births, not of survivors
+    candidates: int = 0  # Gaussians of the reference that its deaths code
+    bounds: tuple = ()
+
+
+@dataclass
 class Layer:
     count: int
     births: int  # Gaussians that are not in the reference
-    candidates: int = 0  # Gaussians of the reference that a deaths unit codes
+    tiles: list = field(default_factory=list)
+
+    def leading(self):
+        """Clause 7.4: indices of the leading tiles."""
+        first = {0} if self.tiles and self.tiles[0].count else set()
+        return first | set([t for t, tile in enumerate(self.tiles) if tile.born][:1])
 
 
 @dataclass
@@ -134,6 +168,8 @@ class Header:
     grid_bits: int
     sh_degree: int
     layers: list
+    tile_side_log2: int
+    lifetimes: bool
     channels: dict  # attribute -> (steps, offsets)
     trajectories: dict  # attribute -> (K_a, step)
     scale_exponents: list  # [3][3]: channel of quats, channel of log_scales
@@ -147,19 +183,21 @@ class Header:
 
 
 def read_opening(r):
-    """Clause 4: frames, flags, reference (0: independent) and the unit_sizes, if present."""
+    """Clause 4: frames, flags, reference (0: independent) and the directory."""
     frames, flags = r.u16(), r.u8()
-    require(frames >= 1, "group_header: frames is 0")
-    wanted = "bits 4 to 7 must be 0, and bits 1 and 3 in a predicted group"
-    require(not flags & (0xFA if flags & 1 else 0xF0), f"group_header: flags are {flags:#x}, {wanted}")
+    require(frames >= 1, "group_header: frames is 0, expected frames >= 1")
+    allowed = 0x11 if flags & 1 else 0x1A
+    require(not flags & ~allowed, f"group_header: flags are {flags:#x}, expected reserved flags to be 0")
     reference = r.u16() if flags & 1 else 0
-    require(reference or not flags & 1, "group_header: reference is 0, expected >= 1")
-    return frames, flags, reference, [r.u32() for _ in range(r.u8() if flags & 4 else 0)]
+    require(reference or not flags & 1, "group_header: reference is 0, expected a reference >= 1")
+    directory = [(r.u8(), r.u8(), r.u16(), r.u32(), r.u32()) for _ in range(r.u16())]
+    return frames, flags, reference, directory
 
 
 def read_reference(payload):
     """Clause 4: how many groups back a group refers, 0: it is independent."""
-    return read_opening(Reader(payload, 0, len(payload), "group_header"))[2]
+    header, _ = read_header_bytes(payload)
+    return read_opening(Reader(header, 0, len(header), "group_header"))[2]
 
 
 def read_grid(r):
@@ -181,9 +219,7 @@ def read_layers(r, reference):
         require(layer_count == wanted, f"group_header: {layer_count} layers, the reference has {wanted}")
     layers = []
     for k in range(layer_count):
-        count, map_width_log2 = r.u32(), r.u8()
-        width = expected_map_width_log2(count)
-        require(map_width_log2 == width, f"group_header: map_width_log2 is {map_width_log2}, expected {width}")
+        count = r.u32()
         layer = Layer(count, count)
         if reference:
             layer.births, before = r.u32(), reference.layers[k].count
@@ -192,7 +228,6 @@ def read_layers(r, reference):
                 0 <= survivors <= before,
                 f"group_header: {survivors} survivors of {before} Gaussians besides {layer.births} births",
             )
-            layer.candidates = before if survivors < before else 0
         layers.append(layer)
     return layers
 
@@ -237,9 +272,32 @@ def read_companding(r):
     return {LOG_SCALES: [channel() for _ in range(3)], LOGIT_OPACITIES: [channel()]}
 
 
-def expected_map_width_log2(count):
-    """Clause 7.2."""
-    return (count.bit_length() - 1) >> 1 if count else 0
+def read_tiles(r, layers, side_log2, reference):
+    """Clause 4: the index of tiles."""
+    total, most = sum(layer.count for layer in layers), LEVELS[4][0]
+    if total > most:
+        raise LimitError(f"{total} Gaussians in the group, no level allows more than {most}")
+    for k, layer in enumerate(layers):
+        left = layer.count - layer.births
+        for t, before in enumerate(reference.layers[k].tiles if reference else []):
+            count = r.u32()
+            require(
+                count <= min(before.count, left),
+                f"group_header: {count} survivors in tile {t}, expected at most {left}",
+            )
+            left -= count
+            candidates = before.count if 0 < count < before.count else 0
+            layer.tiles.append(Tile(count, False, candidates, read_bounds(r)))
+        require(left == 0, f"group_header: expected {left} more survivors in the tiles of layer {k}")
+        for first in range(0, layer.births, 4**side_log2):
+            layer.tiles.append(Tile(min(4**side_log2, layer.births - first), True, 0, read_bounds(r)))
+
+
+def read_bounds(r):
+    bounds = tuple(r.u16() for _ in range(6))
+    valid = all(low <= high for low, high in zip(bounds[:3], bounds[3:], strict=True))
+    require(valid, f"group_header: bounds are {bounds}, expected bounds whose lower corner is below")
+    return bounds
 
 
 def read_group_header(payload, reference=None):
@@ -249,11 +307,14 @@ def read_group_header(payload, reference=None):
     if back:
         require(reference is not None and not reference.reference, "group_header: no independent group to refer to")
         layers, channels = read_layers(r, reference), reference.channels
+        side_log2 = reference.tile_side_log2
         grid = reference.origin, reference.grid_step, reference.grid_bits, reference.sh_degree
         scale_exponents, shifts, companding = reference.scale_exponents, reference.shifts, reference.companding
     else:
         grid = read_grid(r)
         layers = read_layers(r, None)
+        side_log2 = r.u8()
+        require(4 <= side_log2 <= 7, f"group_header: tile_side_log2 is {side_log2}, expected 4 to 7")
         channels = read_channels(r, grid[3])
         scale_exponents = read_scale_exponents(r)
         unshifted = [dict.fromkeys((MEANS, *channels), 0)] * len(layers)
@@ -268,7 +329,8 @@ def read_group_header(payload, reference=None):
         require(1 <= coefficients <= frames, f"group_header: {coefficients} coefficients, expected 1 to {frames}")
         trajectories[attribute] = coefficients, r.f32("trajectory step", positive=True)
         last = attribute
-    header = Header(frames, back, *grid, layers, channels, trajectories, scale_exponents, shifts, companding, r.u32())
+    head = frames, back, *grid, layers, side_log2, bool(flags & 16)
+    header = Header(*head, channels, trajectories, scale_exponents, shifts, companding, r.u32())
     if header.node_count:
         header.neighbors, header.node_coefficients = r.u8(), r.u16()
         require(1 <= header.neighbors <= 8, f"group_header: neighbors is {header.neighbors}, expected 1 to 8")
@@ -276,6 +338,7 @@ def read_group_header(payload, reference=None):
         require(valid, f"group_header: {header.node_coefficients} node coefficients, expected 1 to {frames}")
         header.rotation_step = r.f32("rotation_step", positive=True)
         header.translation_step = r.f32("translation_step", positive=True)
+    read_tiles(r, layers, side_log2, reference if back else None)
     require(r.position == r.end, f"group_header: {r.end - r.position} bytes left over")
     return header
 
@@ -309,6 +372,8 @@ def check_limits(header, level):
     budget = Budget(level)
     channels = sum(len(steps) for steps, _ in header.channels.values())
     budget.spend((3 + channels) * sum(layer.births for layer in header.layers))
-    budget.spend(len(header.trajectories) * count + sum(layer.candidates for layer in header.layers))
+    budget.spend(
+        len(header.trajectories) * count + sum(tile.candidates for layer in header.layers for tile in layer.tiles)
+    )
     budget.spend((3 + 6 * header.node_coefficients) * header.node_count)
     return budget

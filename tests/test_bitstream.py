@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap
 import threading
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from gscodec import _native
 from gscodec.bitstream.levels import LEVELS, smallest_level
 from gscodec.bitstream.quantized_group import QuantizedNodes, QuantizedTrajectories
 from gscodec.decode import Stream, open_stream
+from gscodec.decode.maps import layouts, planes
 from gscodec.errors import BitstreamError, LimitError
 
 CAMERA = {"name": "cam00", "K": [[500, 0, 320], [0, 510, 240], [0, 0, 1]], "viewmat": np.eye(4)}
@@ -64,7 +66,9 @@ def test_contexts_beat_a_memoryless_code():
     n = 20000
     group = surface_group(n)
     _, report = _native.encode_group(group)
-    bits = {u["attribute"] or u["type"]: 8 * u["bytes"] / n for u in report}
+    bits = Counter()
+    for u in report:
+        bits[u["attribute"] or u["type"]] += 8 * u["bytes"] / n
     for name, c in group.channels.items():
         memoryless = 0.0
         for channel in c.values:
@@ -205,42 +209,59 @@ def test_damage_is_an_error():
             _native.DecodedGroup(payload[:size], 1)
 
 
-def flipped(payload, unit_type, attribute=None):
-    """The payload with a bit in the middle of one unit changed."""
-    u = next(u for u in _native.units(payload) if (u["type"], u["attribute"]) == (unit_type, attribute))
+def flipped(payload, unit_type, index=0):
+    """The payload with a bit near the end of one unit changed."""
+    u = next(u for u in _native.units(payload) if (u["type"], u["index"]) == (unit_type, index))
     bad = bytearray(payload)
     bad[u["offset"] + u["bytes"] - 2] ^= 4
     return bytes(bad), u["unit"]
 
 
+def tiled_group(count=600):
+    """Tiles of 256 Gaussians."""
+    return replace(moving_group(count), tile_side_log2=4)
+
+
 def test_what_is_not_damaged_decodes():
-    payload, _ = _native.encode_group(moving_group(40))
+    payload, _ = _native.encode_group(tiled_group())
     sound = _native.DecodedGroup(payload, 1, strict=False)
     assert sound.damage() == []
-    bad, unit = flipped(payload, "trajectories", "sh0")
+    bad, unit = flipped(payload, "tile", 1)
     decoded = _native.DecodedGroup(bad, 1, strict=False)
     [damage] = decoded.damage()
     assert damage.pop("message").endswith("the unit is damaged")
-    assert damage == {"unit": unit, "type": "trajectories", "layer": 0, "attribute": "sh0"}
+    assert damage == {"unit": unit, "type": "tile", "layer": 0, "tile": 1}
+    assert [t["gaussians"] for t in decoded.tiles()[0]] == [256, 0, 88]
+    kept = np.r_[:256, 512:600]
     for t in (0, 5):
-        frame, want = decoded.frame(t), sound.frame(t)
-        np.testing.assert_array_equal(frame["means"], want["means"])
-        np.testing.assert_array_equal(frame["sh0"], decoded.frame(1)["sh0"])  # held
+        for name, values in decoded.frame(t).items():
+            np.testing.assert_array_equal(values, sound.frame(t)[name][kept], err_msg=name)
     assert not np.array_equal(sound.frame(0)["sh0"], sound.frame(5)["sh0"])
-
-    decoded = _native.DecodedGroup(flipped(payload, "channels", "log_scales")[0], 1, strict=False)
-    channels = decoded.quantized().channels["log_scales"]
-    assert not channels.values.any()
-    assert channels.offsets.tolist() == [0.5] * 3
-    np.testing.assert_array_equal(decoded.frame(3)["sh0"], sound.frame(3)["sh0"])
-    for name in ("positions", "group_header"):
+    for name in ("tile", "group_header"):  # the first tile starts the others
         with pytest.raises(BitstreamError, match="CRC"):
             _native.DecodedGroup(flipped(payload, name)[0], 1, strict=False)
 
 
+def test_bounds_hold_what_a_tile_shows():
+    group = tiled_group()
+    decoded = _native.DecodedGroup(_native.encode_group(group)[0], 1)
+    [tiles] = decoded.tiles()
+    first = 0
+    for tile in tiles:
+        own = slice(first, first + tile["gaussians"])
+        first = own.stop
+        for t in range(decoded.frames):
+            frame = decoded.frame(t)
+            opaque = frame["logit_opacities"][own] > -5
+            means, sizes = frame["means"][own][opaque], np.exp(frame["log_scales"][own][opaque]).min(1, keepdims=True)
+            assert (means - sizes >= tile["low"]).all()
+            assert (means + sizes <= tile["high"]).all()
+    assert first == 600
+
+
 def test_streams_tell_of_damage(tmp_path):
-    payload, _ = _native.encode_group(moving_group(40))
-    bad, unit = flipped(payload, "trajectories", "means")
+    payload, _ = _native.encode_group(tiled_group())
+    bad, unit = flipped(payload, "tile", 2)
     frames = _native.DecodedGroup(payload, 1).frames
     path = tmp_path / "damaged.gsv"
     config = {**CONFIG, "sh_degree": 3}
@@ -252,12 +273,12 @@ def test_streams_tell_of_damage(tmp_path):
     with pytest.raises(BitstreamError, match=r"group 1 .*CRC"):
         open_stream(path).frame(frames)
     stream = open_stream(path, strict=False)
-    assert stream.frame(0).means.shape == (len(stream.frame(frames)), 3)
+    assert len(stream.frame(0)) > len(stream.frame(frames)) > 0
     assert stream.frame_count == 4 * frames
     for i in (0, 2, 3, 1):  # decoded again, told once
         stream.group(i)
     [damage] = stream.damage
-    assert (damage["group"], damage["unit"], damage["type"], damage["attribute"]) == (1, unit, "trajectories", "means")
+    assert (damage["group"], damage["unit"], damage["type"], damage["tile"]) == (1, unit, "tile", 2)
     with pytest.raises(IndexError):
         stream.frame(4 * frames)
 
@@ -307,12 +328,18 @@ def test_levels_are_caps():
 
 
 def test_maps_hold_every_value():
-    group = surface_group(700)
-    maps = _native.DecodedGroup(_native.encode_group(group)[0], 1).maps()
-    assert len(maps) == 13
-    assert maps["sh0_1"].shape == (48, 16)
-    x = np.sort(maps["means_0"].ravel())
-    np.testing.assert_array_equal(x[-700:], np.sort(group.positions[:, 0]))
+    group = replace(surface_group(700), tile_side_log2=4)
+    decoded = _native.DecodedGroup(_native.encode_group(group)[0], 1)
+    [layout] = layouts(decoded)
+    assert (layout.width, layout.height, layout.side) == (16, 48, 16)
+    for name, values in planes(decoded.quantized()):
+        np.testing.assert_array_equal(layout.collect(layout.arrange(values)), values, err_msg=name)
+    for t in range(3):  # a tile is a square
+        own = slice(256 * t, 256 * (t + 1))
+        assert (layout.x[own] // 16 == 0).all()
+        assert (layout.y[own] // 16 == t).all()
+    steps = np.abs(np.diff(layout.x)) + np.abs(np.diff(layout.y))
+    assert (steps == 1).all()
 
 
 def make_file(frames=(20, 1, 7)):

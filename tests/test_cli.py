@@ -64,15 +64,34 @@ def test_info_accounts_for_every_byte(folder):
     assert "kB/frame" in run("info", folder / "a.gsv").stdout
 
 
-def test_info_writes_two_dimensional_maps(folder, tmp_path):
-    assert run("info", folder / "a.gsv", "--maps", tmp_path / "maps").returncode == 0
-    maps = list((tmp_path / "maps").glob("*.png"))
-    assert len(maps) >= 13
-    header = maps[0].read_bytes()[16:26]
-    width, height, depth = int.from_bytes(header[:4], "big"), int.from_bytes(header[4:8], "big"), header[8]
-    assert depth == 16
-    assert width > 8
-    assert height > 8
+def png_header(path):
+    """Width, height and bit depth."""
+    header = path.read_bytes()[16:26]
+    return int.from_bytes(header[:4], "big"), int.from_bytes(header[4:8], "big"), header[8]
+
+
+def test_maps_come_back_to_the_same_bytes(folder, tmp_path):
+    stream, maps = folder / "a.gsv", tmp_path / "maps"
+    assert run("decode", "--maps", stream, maps).returncode == 0
+    images = list(maps.glob("*.png"))
+    assert len(images) >= 13
+    width, height, depth = png_header(images[0])
+    assert (width > 8, height > 8, depth) == (True, True, 16)
+    done = run("encode", "--from-maps", maps, tmp_path / "b.gsv")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "b.gsv").read_bytes() == stream.read_bytes()
+    images[0].unlink()
+    bad = run("encode", "--from-maps", maps, tmp_path / "c.gsv")
+    assert bad.returncode != 0
+    assert "no attribute maps" in bad.stderr
+    assert not (tmp_path / "c.gsv").exists()
+
+
+def test_info_draws_the_maps(folder, tmp_path):
+    assert run("info", folder / "a.gsv", "--maps", tmp_path / "maps.png").returncode == 0
+    width, height, depth = png_header(tmp_path / "maps.png")
+    assert (width > 100, height > 100, depth) == (True, True, 8)
+    assert "--maps" in run("info", folder / "a.gsv", "--maps", tmp_path / "maps").stderr
 
 
 def test_eval_gives_the_quality_of_every_prefix(tmp_path):

@@ -112,7 +112,7 @@ def test_reference_stops_at_the_cap_of_symbols(monkeypatch):
         reference.decode_group(payload, 1)
 
 
-@pytest.mark.parametrize("name", ["layers", "layers_most", "layers_predicted", "layer_corrections"])
+@pytest.mark.parametrize("name", ["layers", "layers_most", "layers_predicted", "layer_corrections", "tiles_layers"])
 def test_prefix(name):
     """Both decoders decode the first layers alone, also where the sample ends behind them."""
     data = (VECTORS / VALID[name]["file"]).read_bytes()
@@ -131,6 +131,29 @@ def test_prefix(name):
             expected.pop("shown")
             for key, values in expected.items():
                 assert_close(ours.frame(0)[key], values, f"{name}, {layers} layers, {key}")
+
+
+@pytest.mark.parametrize("name", ["tiles", "tiles_predicted", "tiles_layers"])
+def test_some_tiles(name):
+    """Both decoders decode the same tiles alone, also where the bytes of others are not there."""
+    data = (VECTORS / VALID[name]["file"]).read_bytes()
+    _, samples = reference.read_container(data)
+    for wanted in ({(0, 2)}, {(0, 1), (0, 4), (1, 1)}, set()):
+        theirs, ours = [], []
+        for i, sample in enumerate(samples):
+            payload = bytearray(sample.payload)
+            for u in _native.units(sample.payload):
+                if u["type"] == "tile" and (u["layer"], u["index"]) not in wanted and u["index"] not in (0, 5):
+                    payload[u["offset"] : u["offset"] + u["bytes"]] = bytes(u["bytes"])
+            payload = bytes(payload)
+            before, known = (theirs[0], ours[0]) if i else (None, None)
+            tiles = [[(k, t) in wanted for t in range(9)] for k in range(2)]
+            theirs.append(reference.decode_group(payload, 1, reference=before, tiles=lambda k, t, all=tiles: all[k][t]))
+            ours.append(_native.DecodedGroup(payload, 1, reference=known, tiles=tiles))
+            assert native_hash(ours[i].quantized()) == reference.group_hash(theirs[i])
+            told = [sum(place[1] for place in own if place) for own in theirs[i].tiles]
+            assert ours[i].layers == told == [sum(t["gaussians"] for t in own) for own in ours[i].tiles()]
+            assert len(theirs[i].positions) < VALID[name]["groups"][i]["gaussians"]
 
 
 def test_reference_command(tmp_path):

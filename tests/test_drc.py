@@ -24,7 +24,7 @@ def test_points_survive_as_a_set(tmp_path):
 def test_stream_to_drc_and_back(tmp_path):
     write_splat(tmp_path / "a.drc", blob(50))
     assert run("encode", tmp_path / "a.drc", tmp_path / "a.gsv", "--keep-all", "--quality", 100).returncode == 0
-    assert run("decode", tmp_path / "a.gsv", tmp_path / "points", "--drc").returncode == 0
+    assert run("decode", tmp_path / "a.gsv", tmp_path / "points", "--format", "drc").returncode == 0
     assert len(read_splat(tmp_path / "points" / "000000.drc")) == 50
 
 

@@ -79,6 +79,7 @@ class QuantizedGroup:
             `channels` in the table; None: none.
         corrections: [L, 2] f32, added to log_scales and logit_opacities while the layers behind are missing; None: 0.
         scale_exponents: [3, 3] i32, how the steps of quats fall with the decoded sizes (clause 13.1), in 1/32.
+        tile_side_log2: a tile has up to 4^tile_side_log2 Gaussians (clause 7.2); predicted: as in the reference.
         reference: how many groups back the group is that this one is predicted from; 0: independent.
         parents: [N] i32, index of each Gaussian in that group, -1 for a birth; None where `reference` is 0.
     """
@@ -96,6 +97,7 @@ class QuantizedGroup:
     shifts: np.ndarray | None = None
     corrections: np.ndarray | None = None
     scale_exponents: np.ndarray = field(default_factory=lambda: np.zeros((3, 3), np.int32))
+    tile_side_log2: int = 6
     reference: int = 0
     parents: np.ndarray | None = None
 

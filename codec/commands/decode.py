@@ -1,4 +1,4 @@
-"""`gscodec decode`: stream -> one splat per frame (standard 3DGS .ply, .spz, .glb, Draco points), or one .splatv."""
+"""`gscodec decode`: stream -> one splat per frame (.ply, .spz, .glb, Draco points), one .splatv, or attribute maps."""
 
 from __future__ import annotations
 
@@ -25,15 +25,22 @@ def decode(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the frames, or one NAME.splatv for all.")],
     form: Annotated[str, typer.Option("--format", help="Of each frame: ply, spz, glb or drc (points alone).")] = "ply",
     frames: Frames = None,
-    drc: Annotated[bool, typer.Option("--drc", hidden=True, help="The same as --format drc.")] = False,
+    maps: Annotated[bool, typer.Option("--maps", help="The attribute maps as 16-bit images, and maps.json.")] = False,
 ) -> None:
-    """Stream to one standard 3DGS .ply (.spz, .glb) per frame, or to one .splatv."""
+    """Stream to one standard 3DGS .ply (.spz, .glb) per frame, to one .splatv, or to attribute maps."""
     from ..splats import write_sequence, write_splat
 
-    form = "drc" if drc else form.lower().lstrip(".")
+    form = form.lower().lstrip(".")
     if form not in FORMATS:
         raise UsageError(f"--format {form}: expected {', '.join(FORMATS)}; a .splatv is named as the output instead")
+    if maps and (frames or form != "ply" or folder.suffix.lower() == ".splatv"):
+        raise UsageError("--maps writes the whole stream as images into a folder; leave --format and --frames away")
     s = open_stream_of_frames(stream)
+    if maps:
+        from ..decode.maps import write_maps
+
+        stdout.print(f"{folder}: {write_maps(s, folder)} images of {len(s.groups)} groups, maps.json")
+        return
     chosen = frame_range(frames, s.frame_count)
     if folder.suffix.lower() == ".splatv":
         stdout.print(_to_splatv(s, folder, chosen))

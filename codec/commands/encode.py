@@ -48,9 +48,15 @@ def encode(
     ray: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Train on this Ray cluster; its machines see SEQ too.")
     ] = None,
+    from_maps: Annotated[
+        bool, typer.Option("--from-maps", help="SEQ is a folder of attribute maps, of decode --maps.")
+    ] = False,
     report: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the report there.")] = None,
 ) -> None:
     """Capture or Gaussian sequence to a stream. A second run resumes; Ctrl-C leaves a playable file."""
+    if from_maps:
+        _from_maps(seq, out)
+        return
     from ..encode.settings import EncodeSettings
     from .sources import TrainOptions
 
@@ -73,6 +79,16 @@ def encode(
     if result.interrupted:
         print("stopped early: the file holds the groups done, the same command goes on", file=sys.stderr)
         raise typer.Exit(130)
+
+
+def _from_maps(folder: Path, out: Path) -> None:
+    from ..encode.from_maps import encode_maps
+
+    if out.suffix != ".gsv":
+        raise UsageError(f"{out}: the output must be named *.gsv")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    frames, size = encode_maps(folder, out)
+    stdout.print(f"{out}: {frames} frames, {size} bytes")
 
 
 def _bits(rate: str | None) -> float | None:

@@ -1,4 +1,4 @@
-"""`gscodec info`: what is in a stream, splats or a capture, as lines or JSON; maps or a contact sheet as images."""
+"""`gscodec info`: what is in a stream, splats or a capture, as lines or JSON; a picture of its maps or its rig."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ def info(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="A .gsv file, splats or a capture.")],
     as_json: Json = False,
     maps: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Of a stream: write its attribute maps as 16-bit images.")
+        Path | None,
+        typer.Option(
+            metavar="OUT.png", help="Of a stream: draw the attribute maps of its first group with their tiles."
+        ),
     ] = None,
     sheet: Annotated[
         Path | None, typer.Option(metavar="PNG", help="Of a capture: draw its cameras and its rig.")
@@ -53,12 +56,18 @@ def _kind(path: Path) -> str:
 
 
 def _of_stream(path: Path, maps: Path | None, as_json: bool) -> None:
-    from ..decode.report import describe, write_maps
+    from ..decode.maps import draw_maps
+    from ..decode.report import describe
 
+    if maps and maps.suffix != ".png":
+        raise UsageError(
+            f"--maps {maps}: the picture must be named *.png; `gscodec decode --maps DIR` writes the planes"
+        )
     s = open_stream_warning(path)
     facts = describe(s)
-    if maps:
-        write_maps(s, maps)
+    if maps and not s.groups:
+        raise UsageError(f"{path}: no groups, so there are no maps to draw")
+    rows = draw_maps(s, maps) if maps else []
     if as_json:
         print(json.dumps(facts, indent=1))
         return
@@ -72,6 +81,8 @@ def _of_stream(path: Path, maps: Path | None, as_json: bool) -> None:
             f"{facts['bytes']} bytes, {facts['kb_per_frame']:.2f} kB/frame, {facts['mbit_per_s']:.2f} Mbit/s"
             + ("" if per_gaussian is None else f", {per_gaussian:.3f} bits per Gaussian and frame")
         )
+    if rows:
+        stdout.print(f"{maps}: from the top " + ", ".join(rows))
     if len(facts["layers"]) > 1:
         stdout.print("bytes of the layers: " + ", ".join(str(layer["bytes"]) for layer in facts["layers"]))
     for name, u in facts["units"].items():

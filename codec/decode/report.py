@@ -1,20 +1,15 @@
-"""What is in a stream, for people and scripts: bytes by unit and attribute, and the attribute maps as images."""
+"""What is in a stream, for people and scripts: bytes by unit and attribute."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import numpy as np
-
-from ..render.png import write_png
 from .stream import Stream
 
 
 def describe(stream: Stream) -> dict:
     """Facts of a whole file.
 
-    `units` maps a unit's name to bytes, share of the file and bits per Gaussian and group; `layers` the bytes of
-    each layer. A file without frames has no rates (None).
+    `units` maps the name of a unit, or of a stream of the tiles, to bytes, share of the file and bits per Gaussian and
+    group; `layers` the bytes of each layer. A file without frames has no rates (None).
     """
     units: dict[str, int] = {}
     layers: dict[int, int] = {}
@@ -23,12 +18,14 @@ def describe(stream: Stream) -> dict:
         decoded = stream.group(i)
         most = max(most, decoded.count)
         gaussian_frames += decoded.count * g["frames"]
+        tiles = decoded.tiles()
         groups.append(
             {
                 "start_frame": g["start_frame"],
                 "frames": g["frames"],
                 "bytes": g["size"],
                 "gaussians": decoded.count,
+                "tiles": [len(own) for own in tiles],
                 "reference": i - decoded.reference if decoded.reference else None,
             }
         )
@@ -57,13 +54,3 @@ def describe(stream: Stream) -> dict:
         "layers": [{"bytes": layers[k]} for k in sorted(layers)],
         "per_group": groups,
     }
-
-
-def write_maps(stream: Stream, folder: Path) -> None:
-    """Every channel of every group as a 16-bit grey PNG, its integers shifted so that the smallest is 0."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    for i in range(len(stream.groups)):
-        for name, values in stream.group(i).maps().items():
-            shifted = np.clip(values.astype(np.int64) - values.min(initial=0), 0, 65535).astype(np.uint16)
-            write_png(folder / f"group{i:04d}_{name}.png", shifted)

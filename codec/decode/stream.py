@@ -42,7 +42,7 @@ class Stream:
         index = _native.demux(data, strict)
         self.config, self.groups, self.complete = index["config"], index["groups"], index["complete"]
         self._held: OrderedDict[int, object] = OrderedDict()
-        blank = {"unit": None, "type": "fragment", "layer": 0, "attribute": None}
+        blank = {"unit": None, "type": "fragment", "layer": 0, "tile": None}
         self._damage: dict[int, list[dict]] = {i: [blank | {"message": m}] for i, m in index["damage"]}
         self._ends: list[int] = list(accumulate(g["frames"] for g in self.groups))  # frames up to and with each group
 
@@ -59,12 +59,13 @@ class Stream:
 
     @property
     def damage(self) -> list[dict]:
-        """What was damaged in the groups decoded so far: dicts of group, unit, type, layer, attribute, message.
+        """What was damaged in the groups decoded so far: dicts of group, unit, type, layer, tile, message.
 
-        Damaged trajectories stand still, and a damaged attribute has its offsets everywhere. `unit` is None where a
-        unit is missing because one before it is damaged. Groups that refer to a damaged one show its damage, which is
-        listed once, for that one. A group without sound header and positions stays an error, and so does one whose
-        boxes are damaged (type: fragment), which does not cost the groups behind it if the file has an index.
+        The Gaussians of a damaged tile are missing; so are those of all tiles of its layer if it is the first one, from
+        whose models they start. Without nodes, or their motion, Gaussians stay where they are. Groups that refer to a
+        damaged one show its damage, which is listed once, for that one. A group without sound header and first tile
+        stays an error, and so does one whose boxes are damaged (type: fragment), which does not cost the groups behind
+        it if the file has an index.
         """
         return [{"group": i, **d} for i, found in sorted(self._damage.items()) for d in found]
 
@@ -90,7 +91,7 @@ class Stream:
         """Group `i`, decoded (`_native.DecodedGroup`).
 
         Raises:
-            BitstreamError: a unit of it is damaged (not strict: header or positions), or it contradicts the file.
+            BitstreamError: a unit of it is damaged (not strict: header or first tile), or it contradicts the file.
             LimitError: it exceeds the level of the file.
         """
         if i not in self._held:

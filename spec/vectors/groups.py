@@ -105,12 +105,9 @@ def duplicates():
     return group
 
 
-def two_trees():
-    """The least number of Gaussians whose positions are two trees; all else is 0."""
-    group = make_group(2**14, 1, bits=4)
-    for channel in group.channels.values():
-        channel.values[:] = 0
-    return group
+def tiled(group, side_log2=4):
+    """A group in tiles of another size."""
+    return replace(group, tile_side_log2=side_log2)
 
 
 def tied_nodes():

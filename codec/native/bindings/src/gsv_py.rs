@@ -6,16 +6,21 @@ mod decoded;
 mod group_from;
 mod parametric;
 mod quantized_from;
+mod report;
 mod rigid_blend;
 mod values;
 
 use gsv::attributes::Attribute;
+use gsv::evaluate::Evaluator;
 use gsv::levels::LEVELS;
-use gsv::unit;
+use gsv::unit::{self, ALL_LAYERS};
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyList};
 use values::{bytes_of, invalid, raise, rows};
+
+/// Gaussians of a tile, unless the group says otherwise.
+const TILE_CELLS: usize = 1 << 12;
 
 pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(morton_order, m)?)?;
@@ -25,7 +30,6 @@ pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(encode_group, m)?)?;
     m.add_function(wrap_pyfunction!(units, m)?)?;
     m.add_function(wrap_pyfunction!(reference_of, m)?)?;
-    m.add_function(wrap_pyfunction!(unit_bytes, m)?)?;
     m.add_function(wrap_pyfunction!(levels, m)?)?;
     m.add_function(wrap_pyfunction!(container::init_segment, m)?)?;
     m.add_function(wrap_pyfunction!(container::fragment, m)?)?;
@@ -76,11 +80,16 @@ fn node_weights<'py>(
 }
 
 /// [N, 4] i64, for each of the positions [N, 3] u32 (in Morton order) the nearest of those just before it, nearest first (spec
-/// 7.3): the contexts of the entropy coder. Its own index where there is none.
+/// 7.3): the contexts of the entropy coder. Its own index where there is none. `cells`: most Gaussians of a tile.
 #[pyfunction]
-fn context_neighbors<'py>(py: Python<'py>, positions: PyReadonlyArray2<'py, u32>) -> PyResult<Bound<'py, PyAny>> {
+#[pyo3(signature = (positions, cells = TILE_CELLS))]
+fn context_neighbors<'py>(
+    py: Python<'py>,
+    positions: PyReadonlyArray2<'py, u32>,
+    cells: usize,
+) -> PyResult<Bound<'py, PyAny>> {
     let p = grid(&positions, "positions")?;
-    let near = py.detach(|| gsv::neighbors::nearest(&p));
+    let near = py.detach(|| gsv::neighbors::nearest_in_tiles(&p, cells));
     let own = near.iter().enumerate().flat_map(|(i, near)| {
         let known = move |j: &u32| if *j == u32::MAX { i as i64 } else { i64::from(*j) };
         near.iter().map(known).collect::<Vec<_>>()
@@ -96,8 +105,9 @@ fn context_neighbors<'py>(py: Python<'py>, positions: PyReadonlyArray2<'py, u32>
 /// k, by whose inverse it was multiplied from the right.
 ///
 /// `steps` [N, 3] f32 of each; `positions` [N, 3] u32 in Morton order; `worth` [N, 3] f32, bits that an error of one step costs,
-/// squared; `lengths` [3, 31, 31] f32, bits of an integer (last) in a context, from -15 to 15 each, or nothing: all cost the same.
+/// squared; `lengths` [3, 31, 31] f32, bits of an integer (last) in a context, from -15 to 15 each, or nothing: all cost the same. `cells`: most Gaussians of a tile.
 #[pyfunction]
+#[pyo3(signature = (quats, steps, positions, worth, lengths, cells = TILE_CELLS))]
 fn quantize_rotations<'py>(
     py: Python<'py>,
     quats: PyReadonlyArray2<'py, f32>,
@@ -105,6 +115,7 @@ fn quantize_rotations<'py>(
     positions: PyReadonlyArray2<'py, u32>,
     worth: PyReadonlyArray2<'py, f32>,
     lengths: PyReadonlyArray1<'py, f32>,
+    cells: usize,
 ) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
     let p = grid(&positions, "positions")?;
     let (quats, steps, worth) = (quats.as_slice()?, steps.as_slice()?, worth.as_slice()?);
@@ -121,7 +132,7 @@ fn quantize_rotations<'py>(
         error_bits: worth.as_chunks().0,
         lengths,
     };
-    let coded = py.detach(|| residuals.quantize(&gsv::neighbors::nearest(&p)));
+    let coded = py.detach(|| residuals.quantize(&gsv::neighbors::nearest_in_tiles(&p, cells)));
     let integers: Vec<i32> = coded.iter().flat_map(|c| c.integers).collect();
     let forms: Vec<u8> = coded.iter().map(|c| c.form).collect();
     Ok((
@@ -140,14 +151,20 @@ fn encode_group<'py>(
 ) -> PyResult<(Bound<'py, PyBytes>, Bound<'py, PyList>)> {
     let reference = reference.as_ref().map(|r| r.get().group());
     let group = group_from::group_from(group, reference)?;
-    let payload = py
-        .detach(|| gsv::encode::encode_group(&group, reference))
+    let (payload, units) = py
+        .detach(|| {
+            let mut evaluator = Evaluator::reconstruct(group, reference)?;
+            gsv::tile_bounds::set(&mut evaluator);
+            let group = evaluator.into_group();
+            let payload = gsv::encode::encode_group(&group, reference)?;
+            let units = report::units(&payload, &group.header, reference.map(|r| &r.header), ALL_LAYERS)?;
+            Ok((payload, units))
+        })
         .map_err(|e| raise(py, e))?;
-    let report = units_of(py, &payload)?;
-    Ok((PyBytes::new(py, &payload), report))
+    Ok((PyBytes::new(py, &payload), report::units_into(py, &units)?))
 }
 
-/// The units of a payload: dicts of unit, type, attribute, layer, offset, bytes.
+/// The units of a payload: dicts of unit, type, layer, index, offset, bytes. Unit 0 is the header.
 #[pyfunction]
 fn units<'py>(py: Python<'py>, payload: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyList>> {
     units_of(py, bytes_of(payload)?.as_slice()?)
@@ -169,31 +186,13 @@ fn units_of<'py>(py: Python<'py>, payload: &[u8]) -> PyResult<Bound<'py, PyList>
         let d = PyDict::new(py);
         d.set_item("unit", i)?;
         d.set_item("type", u.kind.map_or("unknown", |k| k.name()))?;
-        d.set_item("attribute", u.attribute.map(|a| a.name()))?;
         d.set_item("layer", u.layer)?;
+        d.set_item("index", u.index)?;
         d.set_item("offset", u.offset)?;
         d.set_item("bytes", u.size)?;
         list.append(d)?;
     }
     Ok(list)
-}
-
-/// One unit with its checksum, unchecked otherwise: for making test vectors, invalid ones too.
-#[pyfunction]
-#[pyo3(signature = (unit_type, payload, *, layer = 0, attribute = 0, dependencies = Vec::new()))]
-fn unit_bytes<'py>(
-    py: Python<'py>,
-    unit_type: u8,
-    payload: &Bound<'py, PyAny>,
-    layer: u8,
-    attribute: u8,
-    dependencies: Vec<u8>,
-) -> PyResult<Bound<'py, PyBytes>> {
-    let mut out = Vec::new();
-    let payload = bytes_of(payload)?;
-    let id = [unit_type, layer, attribute];
-    unit::write(&mut out, id, &dependencies, payload.as_slice()?).map_err(|e| raise(py, e))?;
-    Ok(PyBytes::new(py, &out))
 }
 
 /// The attribute table (spec 3.2): dicts of name, number, channels (of shN for one coefficient), companded.

@@ -1,4 +1,4 @@
-//! The unit parser: any bytes as a group payload, alone or with a group to refer to. Damaged or not, what is decoded is a group.
+//! The unit parser: any bytes as a group payload, alone or with a group to refer to, all of its tiles or some. Damaged or not, what is decoded is a group.
 #![no_main]
 
 use gsv::decode::{Decoding, decode_damaged, decode_group, reference_of};
@@ -13,9 +13,11 @@ static REFERENCE: LazyLock<Group> = LazyLock::new(|| {
 
 fuzz_target!(|input: (u8, &[u8])| {
     let (how, data) = (input.0, input.1);
+    let wanted: Vec<Vec<bool>> = (0..3).map(|k| (0..8).map(|t| how >> 5 & 1 << (t + k) % 3 != 0).collect()).collect();
     let how = Decoding {
         reference: (how & 1 != 0).then(|| &*REFERENCE),
-        layers: 1 + usize::from(how >> 1),
+        layers: 1 + usize::from(how >> 1 & 7),
+        tiles: (how & 16 != 0).then_some(&wanted[..]),
         ..Decoding::at(&LEVELS[0])
     };
     let _ = reference_of(data);

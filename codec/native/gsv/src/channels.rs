@@ -9,17 +9,35 @@ use crate::range_coder::{Bins, SYMBOLS};
 use crate::symbols::SymbolModel;
 use crate::values::{Expected, MAX_VALUE};
 
+/// Adaptive model of the channels of one attribute.
+#[derive(Clone)]
+pub struct ChannelModel {
+    symbols: SymbolModel,
+    class: Vec<usize>, // of each channel
+    second: usize,     // how many channels back the second value of the same Gaussian is
+}
+
+impl ChannelModel {
+    pub fn new(attribute: Attribute, channels: usize) -> Self {
+        let bands = attribute == Attribute::ShN;
+        let classes = if bands { 9 } else { channels };
+        ChannelModel {
+            symbols: SymbolModel::new([230, 675, 675].map(|n| n * classes), classes),
+            class: (0..channels).map(|ch| if bands { sh_class(ch) } else { ch }).collect(),
+            second: if bands { 3 } else { 2 },
+        }
+    }
+
+    /// As of `SymbolModel`.
+    pub fn settle(&mut self) {
+        self.symbols.settle();
+    }
+}
+
 /// Codes `values`, which holds the C channels of Gaussian i at `C * i..`. False if a forbidden value was read.
-pub fn code<C: Bins>(c: &mut C, attribute: Attribute, channels: usize, near: &[Near], values: &mut [i32]) -> bool {
-    let (classes, second) = if attribute == Attribute::ShN {
-        (9, 3)
-    } else {
-        (channels, 2)
-    };
-    let class: Vec<usize> = (0..channels)
-        .map(|ch| if classes == 9 { sh_class(ch) } else { ch })
-        .collect();
-    let mut model = SymbolModel::new([230, 675, 675].map(|n| n * classes), classes);
+pub fn code<C: Bins>(c: &mut C, model: &mut ChannelModel, near: &[Near], values: &mut [i32]) -> bool {
+    let ChannelModel { symbols, class, second } = model;
+    let (channels, second) = (class.len(), *second);
     for (i, near) in near.iter().enumerate() {
         let (done, rest) = values.split_at_mut(i * channels);
         let Some(own) = rest.get_mut(..channels) else {
@@ -34,7 +52,7 @@ pub fn code<C: Bins>(c: &mut C, attribute: Attribute, channels: usize, near: &[N
             }
             let back = |n: usize| ch.checked_sub(n).map_or(0, |k| own[k]);
             let prev = [back(1), back(second)];
-            match value(c, &mut model, class, own[ch], &around[..present], prev) {
+            match value(c, symbols, class, own[ch], &around[..present], prev) {
                 Some(v) => own[ch] = v,
                 None => return false,
             }

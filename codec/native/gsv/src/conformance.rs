@@ -1,133 +1,146 @@
-//! Conformance of a group to its header (spec 3.1): every announced unit is present, no other unit is, or it is reported as
-//! damaged.
+//! Conformance of a group to its header (spec 3.1): every announced unit is present, and no other unit is; and which units
+//! are lost with a damaged one.
 
 use crate::attributes::Attribute;
 use crate::error::{Error, Result};
 use crate::header::Header;
-use crate::unit::{Unit, UnitType};
+use crate::unit::{Unit, UnitKey, UnitType, unit_name};
 
-/// A unit that is damaged or missing, and so is not decoded.
+/// A unit that is damaged, or needs one that is, and so is not decoded.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Damage {
-    /// Index of the unit; None: missing, in a group where other units are damaged.
-    pub unit: Option<usize>,
-    /// Its type, as its bytes claim or as the header announces; None: a type that this version skips.
+    /// Index of the unit in the group.
+    pub unit: usize,
+    /// None: a type that this version skips.
     pub kind: Option<UnitType>,
     pub layer: u8,
-    pub attribute: Option<Attribute>,
+    /// Of a tile in its layer.
+    pub index: u16,
     pub message: String,
 }
 
-/// What identifies a unit in a group: type, layer, attribute.
-pub type UnitKey = (UnitType, u8, Option<Attribute>);
-
-/// Index of the undamaged unit of a type, layer and attribute.
-pub fn find(units: &[Unit], (kind, layer, attribute): UnitKey) -> Option<usize> {
-    let sought = |u: &Unit| (u.kind, u.layer, u.attribute) == (Some(kind), layer, attribute) && u.damage.is_none();
-    units.iter().position(sought)
+/// A unit as a number: type, layer, index.
+fn number((kind, layer, index): UnitKey) -> u32 {
+    u32::from(kind as u8) << 24 | u32::from(layer) << 16 | u32::from(index)
 }
 
-/// Compares the units with the header; returns the units that are damaged or missing. `reference`: the header of the group
-/// that a predicted one refers to; `layers`: number of layers to decode.
+/// The undamaged units of a group that may be decoded.
+pub struct Sound<'a> {
+    announced: Vec<(UnitKey, bool)>,
+    units: Vec<Option<&'a Unit<'a>>>, // of each that is announced
+}
+
+impl<'a> Sound<'a> {
+    pub fn get(&self, key: UnitKey) -> Option<&'a Unit<'a>> {
+        self.units.get(find(&self.announced, key)?).copied().flatten()
+    }
+}
+
+/// Place of a unit among those that the header announces.
+fn find(announced: &[(UnitKey, bool)], key: UnitKey) -> Option<usize> {
+    announced
+        .binary_search_by_key(&number(key), |(key, _)| number(*key))
+        .ok()
+}
+
+/// Compares the units with the header; returns those that can be decoded, and the others. `layers`: number of layers to
+/// decode; `wanted(layer, tile)`: which tiles.
 ///
 /// # Errors
-/// An undamaged unit that the header does not announce, or that lacks a dependency; a missing unit, although nothing is
-/// damaged; no undamaged positions of the first layer of an independent group.
-pub fn check(units: &[Unit], header: &Header, reference: Option<&Header>, layers: usize) -> Result<Vec<Damage>> {
-    let mut damage: Vec<Damage> = units.iter().enumerate().filter_map(claimed).collect();
-    let (mut announced, optional) = announced(header, reference, layers);
-    let end = units.last().map_or(0, |u| u.payload_offset + u.payload.len());
-    let any = !damage.is_empty();
-    for &key in announced.iter().filter(|key| find(units, **key).is_none()) {
-        let (kind, layer, attribute) = key;
-        let vital = layer == 0 && kind == UnitType::Positions && header.reference == 0;
-        if !any || vital {
-            let own = units
-                .iter()
-                .find(|u| u.kind == Some(kind))
-                .and_then(|u| u.damage.clone());
-            return Err(own.unwrap_or_else(|| Error::bitstream(end, "group", missing(key))));
-        }
-        if !damage
-            .iter()
-            .any(|d| (d.kind, d.layer, d.attribute) == (Some(kind), layer, attribute))
-        {
-            damage.push(Damage {
-                unit: None,
-                kind: Some(kind),
-                layer,
-                attribute,
-                message: format!("expected {}", missing(key)),
-            });
+/// A unit that the header does not announce, or twice; a missing unit; a damaged first tile of an independent group.
+pub fn check<'a>(
+    units: &'a [Unit<'a>],
+    header: &Header,
+    layers: usize,
+    wanted: impl Fn(u8, u16) -> bool,
+) -> Result<(Sound<'a>, Vec<Damage>)> {
+    let announced = announced(header, layers);
+    let mut found: Vec<Option<&Unit>> = vec![None; announced.len()];
+    for u in units {
+        let Some(key) = u.key() else { continue };
+        let fail = |expected: &str| Err(Error::bitstream(u.offset, u.label(), expected));
+        match find(&announced, key).and_then(|at| found.get_mut(at)) {
+            None => return fail("only units that the header announces"),
+            Some(Some(_)) => return fail("one unit of each type, layer and index"),
+            Some(slot) => *slot = Some(u),
         }
     }
-    announced.extend(optional);
-    for (i, u) in units.iter().enumerate().filter(|(_, u)| u.damage.is_none()) {
-        let Some(kind) = u.kind else { continue };
-        let fail = |expected: String| Err(Error::bitstream(u.offset, u.label(i), expected));
-        if !announced.contains(&(kind, u.layer, u.attribute)) {
-            return fail("only units that the header announces".into());
-        }
-        for (need, attribute) in kind.needs(u.attribute) {
-            let key = (*need, u.layer, *attribute);
-            let met = |d: &u8| {
-                units
-                    .get(usize::from(*d))
-                    .is_some_and(|d| (d.kind, d.layer, d.attribute) == (Some(*need), u.layer, *attribute))
-            };
-            if announced.contains(&key) && !u.dependencies.iter().any(met) {
-                let of = attribute.map_or(String::new(), |a| format!(" of {}", a.name()));
-                return fail(format!("a dependency on the {} unit{of}", need.name()));
-            }
+    let end = units.last().map_or(0, |u| u.offset + u.payload.len());
+    for ((key, required), found) in announced.iter().zip(&found) {
+        let skipped = key.0 == UnitType::Tile && !wanted(key.1, key.2);
+        if *required && !skipped && found.is_none() {
+            let expected = format!("a unit {}, found none", unit_name(*key));
+            return Err(Error::bitstream(end, "group", expected));
         }
     }
-    Ok(damage)
-}
-
-fn missing((kind, layer, attribute): UnitKey) -> String {
-    let attribute = attribute.map_or(String::new(), |a| format!(" {}", a.name()));
-    let of = if layer > 0 {
-        format!(" of layer {layer}")
-    } else {
-        String::new()
+    let hurt = |key| {
+        find(&announced, key)
+            .and_then(|at| found[at])
+            .filter(|u| u.damage.is_some())
     };
-    format!("a {} unit{attribute}{of}, found none", kind.name())
+    let first = (UnitType::Tile, 0, 0);
+    if let (0, Some(e)) = (header.reference, hurt(first).and_then(|u| u.damage.as_ref())) {
+        return Err(e.clone());
+    }
+    let mut damage = Vec::new();
+    for u in units {
+        let message = match (&u.damage, u.key()) {
+            (Some(e), _) => e.to_string(),
+            (None, None) => continue,
+            (None, Some(key)) => match needs(header, key).into_iter().flatten().find_map(hurt) {
+                None => continue,
+                Some(d) => {
+                    let expected = format!("sound units to start from, but unit {} is damaged", d.number);
+                    Error::bitstream(u.offset, u.label(), expected).to_string()
+                }
+            },
+        };
+        damage.push(Damage {
+            unit: u.number,
+            kind: u.kind,
+            layer: u.layer,
+            index: u.index,
+            message,
+        });
+    }
+    for u in found.iter_mut() {
+        let lost = |u: &Unit| damage.iter().any(|d| d.unit == u.number);
+        *u = u.filter(|u| damage.is_empty() || !lost(u));
+    }
+    let units = found;
+    Ok((Sound { announced, units }, damage))
 }
 
-fn claimed((i, u): (usize, &Unit)) -> Option<Damage> {
-    Some(Damage {
-        unit: Some(i),
-        kind: u.kind,
-        layer: u.layer,
-        attribute: u.attribute,
-        message: u.damage.as_ref()?.to_string(),
-    })
+/// The other units without which a unit cannot be decoded.
+fn needs(header: &Header, key: UnitKey) -> [Option<UnitKey>; 2] {
+    let (kind, layer, index) = key;
+    let k = usize::from(layer);
+    let needed = match kind {
+        UnitType::Tile => {
+            let [first, born] = header.leading_tiles(k);
+            let born = born.filter(|_| usize::from(index) >= header.survivor_tiles(k));
+            [first, born].map(|t| t.map(|t| (UnitType::Tile, layer, t as u16)))
+        }
+        UnitType::NodeTrajectories => [Some((UnitType::NodePositions, 0, 0)), None],
+        _ => [None; 2],
+    };
+    needed.map(|need| need.filter(|need| *need != key))
 }
 
-/// Units that are required, and units that are optional.
-fn announced(h: &Header, reference: Option<&Header>, layers: usize) -> (Vec<UnitKey>, Vec<UnitKey>) {
-    let mut required = vec![(UnitType::GroupHeader, 0, None)];
-    let mut optional = Vec::new();
+/// The units that a header announces, in the order of `number`; of each whether it is required.
+fn announced(h: &Header, layers: usize) -> Vec<(UnitKey, bool)> {
+    let mut out = vec![((UnitType::GroupHeader, 0, 0), true)];
+    for (k, tiles) in h.tiles.iter().enumerate().take(layers) {
+        let present = tiles.iter().enumerate().filter(|(_, tile)| tile.count > 0);
+        out.extend(present.map(|(t, _)| ((UnitType::Tile, k as u8, t as u16), true)));
+    }
     if h.nodes.count > 0 {
-        required.extend([
-            (UnitType::NodePositions, 0, None),
-            (UnitType::NodeTrajectories, 0, None),
-        ]);
+        out.push(((UnitType::NodePositions, 0, 0), true));
+        out.push(((UnitType::NodeTrajectories, 0, 0), true));
     }
-    for (k, layer) in h.layers.iter().enumerate().take(layers) {
-        let n = k as u8;
-        if h.candidates(k, reference) > 0 {
-            required.push((UnitType::Deaths, n, None));
-        }
-        if h.reference == 0 || layer.births > 0 {
-            required.push((UnitType::Positions, n, None));
-            required.extend(h.attributes().iter().map(|a| (UnitType::Channels, n, Some(*a))));
-        }
-        let moving = |t: &crate::header::TrajectoryHeader| (UnitType::Trajectories, n, Some(t.attribute));
-        required.extend(h.trajectories.iter().map(moving));
-        optional.push((UnitType::Lifetimes, n, None));
-        optional
-            .extend([Attribute::LogScales, Attribute::LogitOpacities].map(|a| (UnitType::LayerCorrection, n, Some(a))));
+    for k in 0..h.tiles.len().min(layers) {
+        let corrected = [Attribute::LogScales, Attribute::LogitOpacities];
+        out.extend(corrected.map(|a| ((UnitType::LayerCorrection, k as u8, a as u16), false)));
     }
-    (required, optional)
+    out
 }

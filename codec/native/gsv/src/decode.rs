@@ -1,29 +1,30 @@
 //! Payload -> group of integers (spec 3 to 12). The mirror of encode.rs.
 //!
-//! Positions first, since all contexts come from them; then every other unit in parallel, and the nodes beside them. Memory
-//! is taken only for what the header announces and the level allows; trajectories grow against the symbols that the level
-//! has left. Damage (spec 3) is an error (strict), or the undamaged units are decoded and the damaged ones get the defaults
-//! of spec 3.
+//! Of each layer the tiles from whose models the others start, then all others in parallel; the nodes beside them. Memory is
+//! taken only for what the header announces and the level allows; trajectories grow against the symbols that the level has
+//! left. Damage (spec 3) is an error (strict), or the undamaged units are decoded.
 
-use crate::assemble::{LayerPoints, Part, Slot, append, assemble};
+use crate::assemble::{Tile, assemble};
 use crate::attributes::Attribute;
 use crate::channels;
-use crate::conformance::{self, Damage};
+use crate::conformance::{self, Damage, Sound};
 use crate::deaths;
+use crate::dequantize;
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader};
 use crate::group::Group;
-use crate::header::{Header, LayerHeader, NodeHeader};
+use crate::header::{Header, NodeHeader};
 use crate::levels::Level;
 use crate::lifetimes;
 use crate::morton;
-use crate::neighbors::{self, Contexts};
+use crate::neighbors::{self, Near};
+use crate::parallel;
 use crate::positions;
 use crate::range_coder::Decoder;
-use crate::trajectories::{self, Kind, Stop, Trajectories};
+use crate::tile::{self, Models, Stream, StreamModel};
+use crate::trajectories::{self, Kind, Stop, Trajectories, TrajectoryModel};
 use crate::unit::{self, ALL_LAYERS, Unit, UnitType};
 use crate::values::MAX_VALUE;
-use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Options of decoding.
@@ -34,16 +35,26 @@ pub struct Decoding<'a> {
     pub reference: Option<&'a Group>,
     /// Number of layers to decode; the payload may end behind them.
     pub layers: usize,
+    /// Of each layer, which tiles are wanted; the bytes of others may be anything, but those from which others start are
+    /// decoded anyway. None: all.
+    pub tiles: Option<&'a [Vec<bool>]>,
 }
 
 impl<'a> Decoding<'a> {
-    /// All layers of an independent group.
+    /// All of an independent group.
     pub fn at(level: &'a Level) -> Self {
         Decoding {
             level,
             reference: None,
             layers: ALL_LAYERS,
+            tiles: None,
         }
+    }
+
+    fn wants(&self, header: &Header, layer: u8, tile: u16) -> bool {
+        let (k, t) = (usize::from(layer), usize::from(tile));
+        let asked = |all: &[Vec<bool>]| all.get(k).and_then(|own| own.get(t)).copied().unwrap_or(false);
+        self.tiles.is_none_or(asked) || header.leading_tiles(k).contains(&Some(t))
     }
 }
 
@@ -52,23 +63,29 @@ impl<'a> Decoding<'a> {
 /// # Errors
 /// `Error::Bitstream` with offsets from the start of the payload; `Error::Limit`.
 pub fn decode_group(payload: &[u8], how: &Decoding) -> Result<Group> {
-    how.level.cap("group", "bytes", payload.len() as u64, how.level.bytes)?;
-    decode_units(&unit::split(payload, how.layers)?, how)
+    let (header, mut units) = open(payload, how)?;
+    match units.iter_mut().find_map(|u| u.damage.take()) {
+        Some(damage) => Err(damage),
+        None => Ok(decode(header, &units, how)?.0),
+    }
 }
 
-/// Decodes the undamaged units. Defaults for damaged ones: no trajectories; channels 0; no nodes, or nodes without motion;
-/// all Gaussians shown in all frames; no deaths; no births in a layer with damaged positions.
+/// Decodes the undamaged units. Damaged tiles are missing, and those that start from their models; without nodes, or without
+/// their motion, Gaussians stay where they are.
 ///
 /// # Errors
-/// As `decode_group`; damage only of the header, or of the positions of the first layer of an independent group.
+/// As `decode_group`; damage only of the header, or of the first tile of an independent group.
 pub fn decode_damaged(payload: &[u8], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
-    how.level.cap("group", "bytes", payload.len() as u64, how.level.bytes)?;
-    decode(&unit::scan(payload, how.layers)?, how)
+    let (header, units) = open(payload, how)?;
+    decode(header, &units, how)
 }
 
 /// Decodes units whose checksums were verified, or do not matter (fuzzing).
 pub fn decode_units(units: &[Unit], how: &Decoding) -> Result<Group> {
-    Ok(decode(units, how)?.0)
+    let Some(first) = units.first() else {
+        return Err(Error::bitstream(0, "unit 0", "a group header"));
+    };
+    Ok(decode(header_of(first, how)?, units, how)?.0)
 }
 
 /// How many groups back a payload refers; 0: it is independent.
@@ -77,44 +94,57 @@ pub fn decode_units(units: &[Unit], how: &Decoding) -> Result<Group> {
 /// `Error::Bitstream`: the header is damaged.
 pub fn reference_of(payload: &[u8]) -> Result<u16> {
     let first = unit::first(payload)?;
-    let opened = Header::open(first.payload).map_err(|e| e.at(first.payload_offset, &first.label(0)));
+    let opened = Header::open(first.payload).map_err(|e| e.at(first.offset, &first.label()));
     opened.map(|(reference, _)| reference)
 }
 
-fn decode(units: &[Unit], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
-    let Some(first) = units.first() else {
-        return Err(Error::bitstream(0, "unit 0", "a group header"));
-    };
+/// The header of a group, from a payload that may end behind it.
+///
+/// # Errors
+/// The header is damaged or breaks a rule.
+pub fn read_header(payload: &[u8], how: &Decoding) -> Result<Header> {
+    header_of(&unit::first(payload)?, how)
+}
+
+fn header_of(first: &Unit, how: &Decoding) -> Result<Header> {
     let before = how.reference.map(|g| &g.header);
-    let header = Header::read(first.payload, before).map_err(|e| e.at(first.payload_offset, &first.label(0)))?;
-    let known = header.check(how.level, before)?;
-    let damage = conformance::check(units, &header, before, how.layers)?;
+    Header::read(first.payload, before).map_err(|e| e.at(first.offset, &first.label()))
+}
+
+fn open<'a>(payload: &'a [u8], how: &Decoding) -> Result<(Header, Vec<Unit<'a>>)> {
+    how.level.cap("group", "bytes", payload.len() as u64, how.level.bytes)?;
+    let header = read_header(payload, how)?;
+    let units = unit::scan(payload, how.layers, |layer, tile| how.wants(&header, layer, tile))?;
+    Ok((header, units))
+}
+
+fn decode(header: Header, units: &[Unit], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
+    let known = header.check(how.level, how.reference.map(|g| &g.header))?;
+    let wanted = |layer, tile| how.wants(&header, layer, tile);
+    let (sound, damage) = conformance::check(units, &header, how.layers, wanted)?;
     let decoder = GroupDecoder {
         reference: how.reference.filter(|_| header.reference > 0),
         header: &header,
-        units,
+        sound,
         level: how.level,
         symbols: AtomicU64::new(known),
     };
     let known_layers = decoder.reference.map_or(header.layers.len(), |r| r.layers.len()); // a prefix refers to a prefix
     let count = known_layers.min(how.layers);
-    let points = |k: usize| decoder.points_of_layer(k);
-    let layers = (0..count).into_par_iter().map(points).collect::<Result<Vec<_>>>()?;
-    let mut sound: Vec<(usize, &Unit)> = units.iter().enumerate().filter(|(_, u)| u.damage.is_none()).collect();
-    sound.sort_by_key(|(_, u)| std::cmp::Reverse(u.payload.len())); // long ones first, so that threads end together
-    let part = |(i, u): (usize, &Unit)| decoder.part(i, u, &layers).map(|p| p.map(|p| (i, p)));
-    let (parts, nodes) = rayon::join(
-        || sound.into_iter().par_bridge().map(part).collect::<Result<Vec<_>>>(),
+    let order: Vec<usize> = (0..count).collect();
+    let (layers, nodes) = parallel::join(
+        || {
+            parallel::map(&order, |k| decoder.layer(*k))
+                .into_iter()
+                .collect::<Result<Vec<_>>>()
+        },
         || decoder.nodes(),
     );
-    let ((node_positions, node_trajectories), parts) = (nodes?, parts?);
-    let mut slots: Vec<Slot> = (0..count).map(|_| Slot::new(&header)).collect();
-    for (i, part) in parts.into_iter().flatten() {
-        if let Some(slot) = slots.get_mut(usize::from(units[i].layer)) {
-            slot.place(&header, units[i].attribute, part);
-        }
-    }
-    let mut group = assemble(layers, slots, decoder.reference, &header);
+    let corrections = (0..count)
+        .map(|k| decoder.correction(k as u8))
+        .collect::<Result<Vec<_>>>()?;
+    let ((node_positions, node_trajectories), layers) = (nodes?, layers?);
+    let mut group = assemble(layers, corrections, decoder.reference, &header);
     (group.node_positions, group.node_trajectories) = (node_positions, node_trajectories);
     group.header = header;
     if group.node_positions.is_empty() {
@@ -129,72 +159,210 @@ fn decode(units: &[Unit], how: &Decoding) -> Result<(Group, Vec<Damage>)> {
 struct GroupDecoder<'a> {
     header: &'a Header,
     reference: Option<&'a Group>,
-    units: &'a [Unit<'a>],
+    sound: Sound<'a>,
     level: &'a Level,
     symbols: AtomicU64, // taken so far
 }
 
+/// The bytes of a stream, and where they are, for messages.
+struct Source<'a> {
+    bytes: &'a [u8],
+    offset: usize,
+    label: String,
+}
+
+impl Source<'_> {
+    fn fail<T>(&self, expected: impl Into<String>) -> Result<T> {
+        Err(Error::bitstream(self.offset, &*self.label, expected))
+    }
+
+    /// Checks that the bytes are used up and that no forbidden value was read (`sound`).
+    fn finish(&self, c: Decoder, sound: bool) -> Result<()> {
+        let end = self.offset + self.bytes.len();
+        match c.finish() {
+            Err(expected) if sound || expected.starts_with("more") => {
+                Err(Error::bitstream(end, &*self.label, expected))
+            }
+            _ if !sound => self.fail("values within the range of spec 6.5 and 10"),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// What a stream other than positions and deaths holds.
+enum Part {
+    Channels(usize, Vec<i32>),
+    Trajectories(usize, Trajectories),
+    Lifetimes(Vec<[u16; 2]>),
+}
+
+/// A tile, and what its models have learned.
+type Learned = (Tile, Vec<(Stream, StreamModel)>);
+
 impl GroupDecoder<'_> {
-    /// Decodes a unit of points; empty if it is damaged or missing.
-    fn points(&self, kind: UnitType, layer: u8, count: u32) -> Result<Vec<[u32; 3]>> {
-        let Some(i) = conformance::find(self.units, (kind, layer, None)) else {
+    /// The tiles of layer `k`.
+    fn layer(&self, k: usize) -> Result<Vec<Tile>> {
+        let count = self.header.tiles.get(k).map_or(0, Vec::len);
+        let mut tiles: Vec<Tile> = Vec::new();
+        tiles.resize_with(count, Tile::default);
+        let (mut models, leading) = (Models::default(), self.header.leading_tiles(k));
+        for (i, t) in leading.into_iter().enumerate() {
+            let Some(t) = t.filter(|_| !leading[..i].contains(&t)) else {
+                continue;
+            };
+            if !self.reference_has(k, t) {
+                return Ok(tiles); // lost with the reference, and so are those that start from it
+            }
+            let (tile, learned) = self.tile(k, t, &models)?;
+            learned
+                .into_iter()
+                .for_each(|(stream, model)| models.learn(stream, model));
+            tiles[t] = tile;
+        }
+        let others: Vec<usize> = (0..count).filter(|t| !leading.contains(&Some(*t))).collect();
+        let decoded = parallel::map(&others, |t| self.tile(k, *t, &models));
+        for (t, learned) in others.into_iter().zip(decoded) {
+            tiles[t] = learned?.0;
+        }
+        Ok(tiles)
+    }
+
+    /// Tile `t` of layer `k`; `models`: what its streams start from.
+    fn tile(&self, k: usize, t: usize, models: &Models) -> Result<Learned> {
+        let h = self.header;
+        let mut tile = Tile {
+            survivors: (t < h.survivor_tiles(k)).then(Vec::new),
+            trajectories: h
+                .trajectories
+                .iter()
+                .map(|t| Trajectories::new(t.attribute.channels(h.sh_degree)))
+                .collect(),
+            ..Tile::default()
+        };
+        let candidates = tile.survivors.as_ref().and(self.reference).map(|r| r.tile_range(k, t));
+        let Some(unit) = self
+            .sound
+            .get((UnitType::Tile, k as u8, t as u16))
+            .filter(|_| self.reference_has(k, t))
+        else {
+            return Ok((tile, Vec::new()));
+        };
+        let streams = Stream::of(h, k, t, self.reference.map(|r| &r.header));
+        let parts = tile::split(unit.payload, streams.len());
+        let parts = parts.map_err(|(at, expected)| Error::bitstream(unit.offset + at, unit.label(), expected))?;
+        let mut sources = streams.iter().zip(parts).map(|(stream, (at, bytes))| {
+            let label = format!("{}, {}", unit.label(), stream.name(h));
+            let offset = unit.offset + at;
+            (*stream, Source { bytes, offset, label })
+        });
+        let mut learned = Vec::new();
+        match candidates {
+            None => {
+                if let Some((stream, source)) = sources.next() {
+                    let mut model = models.of(stream, h);
+                    let count = h.tiles[k][t].count;
+                    tile.positions = self.points(&source, &mut model, count, h.shift(k, Attribute::Means))?;
+                    learned.push((stream, model));
+                }
+            }
+            Some(range) => {
+                let first = (h.candidates(k, t, self.reference.map(|r| &r.header)) > 0).then(|| sources.next());
+                let survivors =
+                    self.survivors(range, first.flatten().map(|(_, source)| source), h.tiles[k][t].count)?;
+                let known = self.reference.map_or(&[][..], |r| &r.positions);
+                tile.positions = survivors
+                    .iter()
+                    .filter_map(|i| known.get(*i as usize))
+                    .copied()
+                    .collect();
+                tile.survivors = Some(survivors);
+            }
+        }
+        let near = neighbors::nearest(&tile.positions);
+        tile.channels.resize(h.scales.len(), Vec::new());
+        let others: Vec<(Stream, Source)> = sources.collect();
+        let decoded = parallel::map(&others, |(stream, source)| {
+            let mut model = models.of(*stream, h);
+            let part = self.part(k, *stream, source, &near, &mut model)?;
+            Ok((*stream, model, part))
+        });
+        for (stream, model, part) in decoded.into_iter().collect::<Result<Vec<_>>>()? {
+            learned.push((stream, model));
+            match part {
+                Some(Part::Channels(i, v)) => tile.channels[i] = v,
+                Some(Part::Trajectories(i, v)) => tile.trajectories[i] = v,
+                Some(Part::Lifetimes(v)) => tile.lifetimes = v,
+                None => {}
+            }
+        }
+        if tile.survivors.is_none() {
+            tile.rotations = self.rotations(&tile.channels, &near);
+        }
+        Ok((tile, learned))
+    }
+
+    /// False if tile `t` of layer `k` holds survivors of a tile that the reference lacks.
+    fn reference_has(&self, k: usize, t: usize) -> bool {
+        let Some(r) = self.reference.filter(|_| t < self.header.survivor_tiles(k)) else {
+            return true;
+        };
+        let told = r
+            .header
+            .tiles
+            .get(k)
+            .and_then(|tiles| tiles.get(t))
+            .map(|tile| tile.count as usize);
+        told == Some(r.tile_range(k, t).len())
+    }
+
+    /// Quaternions of births.
+    fn rotations(&self, channels: &[Vec<i32>], near: &[Near]) -> Vec<[f32; 4]> {
+        let integers = |a| {
+            let at = self.header.attributes().iter().position(|b| *b == a);
+            at.and_then(|k| channels.get(k)).map_or(&[][..], Vec::as_slice)
+        };
+        dequantize::rotations(
+            self.header,
+            integers(Attribute::Quats),
+            integers(Attribute::LogScales),
+            near,
+        )
+    }
+
+    /// Decodes points without their lowest `shift` bits.
+    fn points(&self, source: &Source, model: &mut StreamModel, count: u32, shift: u32) -> Result<Vec<[u32; 3]>> {
+        let StreamModel::Counters(model) = model else {
             return Ok(Vec::new());
         };
-        let unit = &self.units[i];
-        let shift = match kind {
-            UnitType::Positions => self.header.shift(usize::from(layer), Attribute::Means),
-            _ => 0,
-        };
         let bits = u32::from(self.header.grid_bits) - shift;
-        let end = unit.payload_offset + unit.payload.len();
-        let codes = positions::decode(unit.payload, count, bits);
-        let codes = codes.map_err(|expected| Error::bitstream(end, unit.label(i), expected))?;
+        let codes = match positions::decode(model, source.bytes, count, bits) {
+            Ok(codes) => codes,
+            Err(expected) => {
+                let end = source.offset + source.bytes.len();
+                return Err(Error::bitstream(end, &*source.label, expected));
+            }
+        };
         let points = codes.into_iter().map(morton::decode);
         Ok(points.map(|p| p.map(|v| v << shift)).collect())
     }
 
-    /// Positions of layer `k`: survivors, then births. Damaged positions: no births; damaged deaths: all survive.
-    fn points_of_layer(&self, k: usize) -> Result<LayerPoints> {
-        let told = self.header.layers.get(k).copied().unwrap_or_default();
-        let births = self.points(UnitType::Positions, k as u8, told.births)?;
-        let survivors = self.survivors(k)?;
-        let known = |i: &u32| self.reference.and_then(|r| r.positions.get(*i as usize)).copied();
-        let mut positions: Vec<_> = survivors.iter().filter_map(known).collect();
-        let births_count = births.len() as u32;
-        append(&mut positions, births);
-        let header = LayerHeader {
-            count: positions.len() as u32,
-            births: births_count,
+    /// Indices of the survivors among those of the reference at `range`; `source`: which have died, None: none has.
+    fn survivors(&self, range: std::ops::Range<usize>, source: Option<Source>, told: u32) -> Result<Vec<u32>> {
+        let (Some(r), Some(source)) = (self.reference, source) else {
+            return Ok((range.start as u32..range.end as u32).collect());
         };
-        Ok(LayerPoints {
-            whole: header == told,
-            header,
-            contexts: Contexts::new(&positions, survivors.len()),
-            survivors,
-            positions,
-        })
-    }
-
-    /// Indices of the survivors of layer `k` in the reference.
-    fn survivors(&self, k: usize) -> Result<Vec<u32>> {
-        let Some(r) = self.reference else {
-            return Ok(Vec::new());
-        };
-        let range = r.range(k..k + 1);
-        let all = range.start as u32..range.end as u32;
-        let unit = conformance::find(self.units, (UnitType::Deaths, k as u8, None)).filter(|_| !range.is_empty());
-        let Some((i, unit)) = unit.and_then(|i| Some((i, self.units.get(i)?))) else {
-            return Ok(all.collect());
-        };
-        let mut c = Decoder::new(unit.payload);
-        let mut dead = vec![false; range.len()];
-        let sound = deaths::code(&mut c, &neighbors::nearest(&r.positions[range]), &mut dead);
-        finish(c, sound, i, unit)?;
-        let survivors: Vec<u32> = all.zip(&dead).filter(|(_, dead)| !**dead).map(|(i, _)| i).collect();
-        let told = self.header.layers.get(k).map_or(0, LayerHeader::survivors);
+        let positions = r.positions.get(range.clone()).unwrap_or(&[]);
+        let mut c = Decoder::new(source.bytes);
+        let mut dead = vec![false; positions.len()];
+        let sound = deaths::code(&mut c, &neighbors::nearest(positions), &mut dead);
+        source.finish(c, sound)?;
+        let alive = (range.start as u32..).zip(&dead).filter(|(_, dead)| !**dead);
+        let survivors: Vec<u32> = alive.map(|(i, _)| i).collect();
         if survivors.len() != told as usize {
-            let expected = format!("{told} survivors as the header says, found {}", survivors.len());
-            return Err(Error::bitstream(unit.payload_offset, unit.label(i), expected));
+            return source.fail(format!(
+                "{told} survivors as the header says, found {}",
+                survivors.len()
+            ));
         }
         Ok(survivors)
     }
@@ -202,101 +370,96 @@ impl GroupDecoder<'_> {
     /// Nodes and their trajectories, which do not depend on the Gaussians.
     fn nodes(&self) -> Result<(Vec<[u32; 3]>, Trajectories)> {
         let h = &self.header.nodes;
-        let positions = self.points(UnitType::NodePositions, 0, h.count)?;
-        let Some(i) = conformance::find(self.units, (UnitType::NodeTrajectories, 0, None)) else {
+        let source = |kind| {
+            let unit = self.sound.get((kind, 0, 0))?;
+            let (bytes, offset, label) = (unit.payload, unit.offset, unit.label());
+            Some(Source { bytes, offset, label })
+        };
+        let Some(own) = source(UnitType::NodePositions) else {
+            return Ok(Default::default());
+        };
+        let positions = self.points(&own, &mut StreamModel::Counters(positions::model()), h.count, 0)?;
+        let Some(motion) = source(UnitType::NodeTrajectories) else {
             return Ok((positions, Trajectories::default()));
         };
-        let (unit, near, k) = (
-            &self.units[i],
-            neighbors::nearest(&positions),
-            usize::from(h.coefficients),
-        );
-        let mut c = Decoder::new(unit.payload);
-        let t = trajectories::code(&mut c, Kind::Node, k, &near, &Trajectories::new(6), u64::MAX); // counted from the header
-        finish(c, t.is_ok(), i, unit)?;
+        let (near, k) = (neighbors::nearest(&positions), usize::from(h.coefficients));
+        let mut c = Decoder::new(motion.bytes);
+        let mut model = TrajectoryModel::new(Kind::Node);
+        let t = trajectories::code(&mut c, &mut model, k, &near, &Trajectories::new(6), u64::MAX); // counted from the header
+        motion.finish(c, t.is_ok())?;
         Ok((positions, t.unwrap_or_default()))
     }
 
-    /// Decodes a unit other than points; None: nothing to decode, or its layer is damaged.
-    fn part(&self, i: usize, unit: &Unit, layers: &[LayerPoints]) -> Result<Option<Part>> {
+    /// Decodes a stream other than positions and deaths.
+    fn part(
+        &self,
+        k: usize,
+        stream: Stream,
+        source: &Source,
+        near: &[Near],
+        model: &mut StreamModel,
+    ) -> Result<Option<Part>> {
         let h = self.header;
-        let Some(layer) = layers.get(usize::from(unit.layer)) else {
-            return Ok(None);
-        };
-        let mut c = Decoder::new(unit.payload);
-        let (part, sound) = match (unit.kind, unit.attribute) {
-            (Some(UnitType::Channels), Some(a)) => {
-                let (channels, near) = (a.channels(h.sh_degree), layer.contexts.births());
-                let mut values = vec![0; near.len() * channels];
-                let read = channels::code(&mut c, a, channels, near, &mut values);
-                let shift = h.shift(usize::from(unit.layer), a);
+        let mut c = Decoder::new(source.bytes);
+        let (part, sound) = match (stream, model) {
+            (Stream::Channels(i, a), StreamModel::Channels(model)) => {
+                let mut values = vec![0; near.len() * a.channels(h.sh_degree)];
+                let read = channels::code(&mut c, model, near, &mut values);
+                let shift = h.shift(k, a);
                 let fit = values.iter().all(|v| v.abs() <= MAX_VALUE >> shift);
                 values.iter_mut().for_each(|v| *v <<= shift);
-                (Part::Channels(values), read && fit)
+                (Part::Channels(i, values), read && fit)
             }
-            (Some(UnitType::Lifetimes | UnitType::Trajectories), _) if !layer.whole => return Ok(None),
-            (Some(UnitType::Lifetimes), _) => {
-                let mut l = vec![[0; 2]; layer.positions.len()];
-                let sound = lifetimes::code(&mut c, h.frames, &layer.contexts.all, &mut l);
+            (Stream::Lifetimes, StreamModel::Counters(model)) => {
+                let mut l = vec![[0; 2]; near.len()];
+                let sound = lifetimes::code(&mut c, model, h.frames, near, &mut l);
                 (Part::Lifetimes(l), sound)
             }
-            (Some(UnitType::Trajectories), Some(a)) => {
-                let head = h.trajectories.iter().find(|t| t.attribute == a);
-                let k = usize::from(head.map_or(0, |t| t.coefficients));
-                let source = Trajectories::new(a.channels(h.sh_degree));
-                let near = &layer.contexts.all;
-                let t = trajectories::code(&mut c, Kind::Gaussians, k, near, &source, self.budget());
-                self.count(t, i, unit)?
+            (Stream::Trajectories(i), StreamModel::Trajectories(model)) => {
+                let Some(head) = h.trajectories.get(i) else {
+                    return Ok(None);
+                };
+                let blank = Trajectories::new(head.attribute.channels(h.sh_degree));
+                let most = usize::from(head.coefficients);
+                let t = trajectories::code(&mut c, model, most, near, &blank, self.budget());
+                let (t, sound) = self.count(t, &source.label)?;
+                (Part::Trajectories(i, t), sound)
             }
-            (Some(UnitType::LayerCorrection), _) => return correction(i, unit).map(Some),
             _ => return Ok(None),
         };
-        finish(c, sound, i, unit)?;
+        source.finish(c, sound)?;
         Ok(Some(part))
     }
 
-    /// Symbols left for a unit. Several units may see the same number; `count` is what enforces the cap.
+    /// Symbols left for a stream. Several streams may see the same number; `count` is what enforces the cap.
     fn budget(&self) -> u64 {
         self.level.symbols.saturating_sub(self.symbols.load(Ordering::Relaxed))
     }
 
-    /// Adds the symbols of decoded trajectories to the total and checks the cap.
-    fn count(&self, t: std::result::Result<Trajectories, Stop>, i: usize, unit: &Unit) -> Result<(Part, bool)> {
+    /// Adds the symbols of decoded trajectories to the total and checks the cap. False: broken.
+    fn count(&self, t: std::result::Result<Trajectories, Stop>, label: &str) -> Result<(Trajectories, bool)> {
         let symbols = match &t {
             Ok(t) => t.symbols() as u64,
             Err(Stop::Symbols) => self.level.symbols + 1,
-            Err(Stop::Broken) => return Ok((Part::Trajectories(Trajectories::default()), false)),
+            Err(Stop::Broken) => return Ok((Trajectories::default(), false)),
         };
-        let sum = self
-            .symbols
-            .fetch_add(symbols, Ordering::Relaxed)
-            .saturating_add(symbols);
-        self.level.cap(&unit.label(i), "symbols", sum, self.level.symbols)?;
-        Ok((Part::Trajectories(t.unwrap_or_default()), true))
+        let before = self.symbols.fetch_add(symbols, Ordering::Relaxed);
+        let sum = before.saturating_add(symbols);
+        self.level.cap(label, "symbols", sum, self.level.symbols)?;
+        Ok((t.unwrap_or_default(), true))
     }
-}
 
-/// Layer correction (spec 10.2).
-fn correction(i: usize, unit: &Unit) -> Result<Part> {
-    let mut r = Reader::new(unit.payload);
-    let mut value = 0.0;
-    let read = r
-        .f32(&mut value, "a correction")
-        .and_then(|()| r.must(r.rest() == 0, || "one number".into()));
-    read.map_err(|e| e.at(unit.payload_offset, &unit.label(i)))?;
-    Ok(Part::Correction(value))
-}
-
-/// Checks that the payload is used up and that no forbidden value was read (`sound`).
-fn finish(c: Decoder, sound: bool, i: usize, unit: &Unit) -> Result<()> {
-    let end = unit.payload_offset + unit.payload.len();
-    match c.finish() {
-        Err(expected) if sound || expected.starts_with("more") => Err(Error::bitstream(end, unit.label(i), expected)),
-        _ if !sound => Err(Error::bitstream(
-            unit.payload_offset,
-            unit.label(i),
-            "values within the range of spec 6.5 and 10",
-        )),
-        _ => Ok(()),
+    /// The corrections of a layer (spec 10.2): 0 where it has none.
+    fn correction(&self, layer: u8) -> Result<[f32; 2]> {
+        let mut out = [0.0; 2];
+        for (value, a) in out.iter_mut().zip([Attribute::LogScales, Attribute::LogitOpacities]) {
+            if let Some(unit) = self.sound.get((UnitType::LayerCorrection, layer, a as u16)) {
+                let mut r = Reader::new(unit.payload);
+                let read = r.f32(value, "a correction");
+                let read = read.and_then(|()| r.must(r.rest() == 0, || "one number".into()));
+                read.map_err(|e| e.at(unit.offset, &unit.label()))?;
+            }
+        }
+        Ok(out)
     }
 }

@@ -11,23 +11,17 @@ use crate::fields::Writer;
 use crate::group::Group;
 use crate::lifetimes;
 use crate::morton;
-use crate::neighbors::{self, Contexts, Near};
+use crate::neighbors;
 use crate::positions;
 use crate::range_coder::Encoder;
-use crate::trajectories::{self, Kind, Trajectories};
-use crate::unit::{self, UnitType};
+use crate::tile::{self, Models, Stream, StreamModel};
+use crate::trajectories::{self, Kind, Trajectories, TrajectoryModel};
+use crate::unit::{self, Entry, UnitKey, UnitType};
 use rayon::prelude::*;
-
-/// Entropy-codes the payload of a unit.
-type Code<'a> = Box<dyn Fn() -> Vec<u8> + Sync + 'a>;
+use std::ops::Range;
 
 /// A unit to be written.
-struct Pending<'a> {
-    kind: UnitType,
-    layer: usize,
-    attribute: Option<Attribute>,
-    code: Code<'a>,
-}
+type Coded = (UnitKey, Vec<u8>);
 
 /// The payload of a group (one MP4 sample). `reference`: the group that a predicted one refers to.
 ///
@@ -36,171 +30,171 @@ struct Pending<'a> {
 pub fn encode_group(group: &Group, reference: Option<&Group>) -> Result<Vec<u8>> {
     group.validate(reference)?;
     let h = &group.header;
-    if group.layers != h.layers {
-        return Err(Error::Input("expected the layers that the header announces".into()));
+    let tiles: Vec<Vec<u32>> = h.tiles.iter().map(|t| t.iter().map(|t| t.count).collect()).collect();
+    if group.layers != h.layers || group.tiles != tiles {
+        return Err(Error::Input(
+            "expected the layers and tiles that the header announces".into(),
+        ));
     }
-    let contexts: Vec<Contexts> = (0..group.layers.len())
-        .into_par_iter()
-        .map(|k| {
-            let survivors = group.layers[k].survivors() as usize;
-            Contexts::new(&group.positions[group.range(k..k + 1)], survivors)
-        })
-        .collect();
-    let near_nodes = neighbors::nearest(&group.node_positions);
-    let mut units = Vec::new();
-    for (k, contexts) in contexts.iter().enumerate() {
-        layer(&mut units, group, reference, k, contexts);
-        if k == 0 && h.nodes.count > 0 {
-            nodes(&mut units, group, &near_nodes);
+    let encoder = GroupEncoder { group, reference };
+    let (layers, nodes) = rayon::join(
+        || {
+            (0..h.layers.len())
+                .into_par_iter()
+                .map(|k| encoder.layer(k))
+                .collect::<Vec<_>>()
+        },
+        || encoder.nodes(),
+    );
+    let mut units: Vec<Coded> = Vec::new();
+    for (k, layer) in layers.into_iter().enumerate() {
+        units.extend(layer);
+        if k == 0 {
+            units.extend(nodes.iter().cloned());
         }
+        let corrected = [Attribute::LogScales, Attribute::LogitOpacities]
+            .into_iter()
+            .zip(group.corrections[k]);
+        let named = corrected.filter(|(_, v)| *v != 0.0);
+        units.extend(named.map(|(a, v)| ((UnitType::LayerCorrection, k as u8, a as u16), v.to_be_bytes().to_vec())));
     }
-    let payloads: Vec<Vec<u8>> = units.par_iter().map(|u| (u.code)()).collect();
-    let (mut body, mut sizes) = (Vec::new(), Vec::new());
-    for (u, payload) in units.iter().zip(&payloads) {
-        let attribute = u.attribute.map_or(0, |a| a as u8);
-        let start = body.len();
-        unit::write(
-            &mut body,
-            [u.kind as u8, u.layer as u8, attribute],
-            &dependencies(u, &units),
-            payload,
-        )?;
-        sizes.push((body.len() - start) as u32);
+    if units.len() > usize::from(u16::MAX) {
+        return Err(Error::Input(format!(
+            "{} units, at most 65535 fit a group",
+            units.len()
+        )));
+    }
+    let mut directory = Vec::with_capacity(units.len());
+    for (key, payload) in &units {
+        directory.push(Entry::new(*key, payload)?);
     }
     let mut header = Writer::default();
     h.clone()
-        .fields(&mut header, &mut sizes, reference.map(|r| &r.header))?;
-    let mut out = Vec::new();
-    unit::write(&mut out, [UnitType::GroupHeader as u8, 0, 0], &[], &header.0)?;
-    out.extend(body);
-    Ok(out)
+        .fields(&mut header, &mut directory, reference.map(|r| &r.header))?;
+    let payloads: Vec<Vec<u8>> = units.into_iter().map(|(_, payload)| payload).collect();
+    unit::write(&header.0, &payloads)
 }
 
-/// Indices of the units that `u` depends on. Unit 0 is the header, so the first of `units` has index 1.
-fn dependencies(u: &Pending, units: &[Pending]) -> Vec<u8> {
-    let needs = u.kind.needs(u.attribute);
-    let needed = |d: &Pending| d.layer == u.layer && needs.contains(&(d.kind, d.attribute));
-    let found = units.iter().zip(1..).filter(|(d, _)| needed(d));
-    found.map(|(_, i)| i).collect()
-}
-
-/// Appends the units of layer `k`, without nodes; positions come first, since the other units depend on them.
-fn layer<'a>(
-    units: &mut Vec<Pending<'a>>,
+struct GroupEncoder<'a> {
     group: &'a Group,
     reference: Option<&'a Group>,
-    k: usize,
-    contexts: &'a Contexts,
-) {
-    let h = &group.header;
-    let (range, births) = (group.range(k..k + 1), group.layers[k].births as usize);
-    let mut push = |kind, attribute, code| {
-        units.push(Pending {
-            kind,
-            layer: k,
-            attribute,
-            code,
-        });
-    };
-    if let (Some(r), Some(parents)) = (reference, &group.parents)
-        && h.candidates(k, Some(&r.header)) > 0
-    {
-        let survivors = &parents[range.start..range.end - births];
-        push(UnitType::Deaths, None, deaths_of(r, k, survivors));
-    }
-    if h.reference == 0 || births > 0 {
-        let own = &group.positions[range.end - births..range.end];
-        let shift = h.shift(k, Attribute::Means);
-        push(UnitType::Positions, None, points(own, u32::from(h.grid_bits), shift));
-        for (a, values) in h.attributes().iter().zip(&group.channels) {
-            let c = a.channels(h.sh_degree);
-            let own = &values[(range.end - births) * c..range.end * c];
-            let code = channels_of(*a, c, own, contexts.births(), h.shift(k, *a));
-            push(UnitType::Channels, Some(*a), code);
+}
+
+impl GroupEncoder<'_> {
+    /// The tiles of layer `k`.
+    fn layer(&self, k: usize) -> Vec<Coded> {
+        let h = &self.group.header;
+        let (mut models, leading) = (Models::default(), h.leading_tiles(k));
+        let mut coded = Vec::new();
+        for (i, t) in leading.into_iter().enumerate() {
+            if let Some(t) = t.filter(|_| !leading[..i].contains(&t)) {
+                let (payload, learned) = self.tile(k, t, &models);
+                learned
+                    .into_iter()
+                    .for_each(|(stream, model)| models.learn(stream, model));
+                coded.push((t, payload));
+            }
         }
+        let wanted = |t: &usize| h.tiles[k][*t].count > 0 && !leading.contains(&Some(*t));
+        let others = (0..h.tiles[k].len()).into_par_iter().filter(wanted);
+        coded.par_extend(others.map(|t| (t, self.tile(k, t, &models).0)));
+        coded.sort_by_key(|(t, _)| *t);
+        let key = |t| (UnitType::Tile, k as u8, t as u16);
+        coded.into_iter().map(|(t, payload)| (key(t), payload)).collect()
     }
-    for (head, t) in h.trajectories.iter().zip(&group.trajectories) {
-        let own = t.part(range.start, range.len());
-        let code = trajectory(Kind::Gaussians, usize::from(head.coefficients), &contexts.all, own);
-        push(UnitType::Trajectories, Some(head.attribute), code);
-    }
-    if let Some(l) = &group.lifetimes {
-        let own = &l[range];
-        let code = coded(move |e| _ = lifetimes::code(e, h.frames, &contexts.all, &mut own.to_vec()));
-        push(UnitType::Lifetimes, None, code);
-    }
-    let corrected = [Attribute::LogScales, Attribute::LogitOpacities];
-    for (a, v) in corrected
-        .into_iter()
-        .zip(group.corrections[k])
-        .filter(|(_, v)| *v != 0.0)
-    {
-        push(
-            UnitType::LayerCorrection,
-            Some(a),
-            Box::new(move || v.to_be_bytes().to_vec()),
-        );
-    }
-}
 
-/// Appends the units of the nodes.
-fn nodes<'a>(units: &mut Vec<Pending<'a>>, group: &'a Group, near: &'a [Near]) {
-    let h = &group.header;
-    let k = usize::from(h.nodes.coefficients);
-    let motion = trajectory(Kind::Node, k, near, group.node_trajectories.clone());
-    let coded = [
-        (
-            UnitType::NodePositions,
-            points(&group.node_positions, u32::from(h.grid_bits), 0),
-        ),
-        (UnitType::NodeTrajectories, motion),
-    ];
-    units.extend(coded.map(|(kind, code)| Pending {
-        kind,
-        layer: 0,
-        attribute: None,
-        code,
-    }));
-}
+    /// The payload of tile `t` of layer `k`, and what its models have learned.
+    fn tile(&self, k: usize, t: usize, models: &Models) -> (Vec<u8>, Vec<(Stream, StreamModel)>) {
+        let h = &self.group.header;
+        let range = self.group.tile_range(k, t);
+        let near = neighbors::nearest(&self.group.positions[range.clone()]);
+        let streams = Stream::of(h, k, t, self.reference.map(|r| &r.header));
+        let coded: Vec<_> = streams
+            .into_par_iter()
+            .map(|stream| {
+                let mut model = models.of(stream, h);
+                let bytes = self.stream((k, t), range.clone(), stream, &near, &mut model);
+                (bytes, (stream, model))
+            })
+            .collect();
+        let (bytes, learned): (Vec<_>, _) = coded.into_iter().unzip();
+        (tile::join(&bytes), learned)
+    }
 
-/// A unit whose payload is one range coder stream.
-fn coded<'a>(f: impl Fn(&mut Encoder) + Sync + 'a) -> Code<'a> {
-    Box::new(move || {
-        let mut c = Encoder::default();
-        f(&mut c);
-        c.finish()
-    })
-}
+    fn stream(
+        &self,
+        (k, t): (usize, usize),
+        range: Range<usize>,
+        stream: Stream,
+        near: &[neighbors::Near],
+        model: &mut StreamModel,
+    ) -> Vec<u8> {
+        let (g, h) = (self.group, &self.group.header);
+        let mut e = Encoder::default();
+        match (stream, model) {
+            (Stream::Positions, StreamModel::Counters(model)) => {
+                return points(
+                    model,
+                    &g.positions[range],
+                    u32::from(h.grid_bits),
+                    h.shift(k, Attribute::Means),
+                );
+            }
+            (Stream::Deaths, _) => self.deaths(&mut e, k, t, range),
+            (Stream::Channels(i, a), StreamModel::Channels(model)) => {
+                let (c, shift) = (a.channels(h.sh_degree), h.shift(k, a));
+                let own = &g.channels[i][range.start * c..range.end * c];
+                let mut coarse: Vec<i32> = own.iter().map(|v| v >> shift).collect();
+                channels::code(&mut e, model, near, &mut coarse);
+            }
+            (Stream::Trajectories(i), StreamModel::Trajectories(model)) => {
+                let own = g.trajectories[i].part(range.start, range.len());
+                let most = usize::from(h.trajectories[i].coefficients);
+                let _ = trajectories::code(&mut e, model, most, near, &own, u64::MAX); // an encoder never stops
+            }
+            (Stream::Lifetimes, StreamModel::Counters(model)) => {
+                let mut own = g.lifetimes.as_ref().map_or(Vec::new(), |l| l[range].to_vec());
+                lifetimes::code(&mut e, model, h.frames, near, &mut own);
+            }
+            _ => {}
+        }
+        e.finish()
+    }
 
-/// The `c` channels of attribute `a` without their lowest `shift` bits.
-fn channels_of<'a>(a: Attribute, c: usize, values: &'a [i32], near: &'a [Near], shift: u32) -> Code<'a> {
-    coded(move |e| {
-        let mut coarse: Vec<i32> = values.iter().map(|v| v >> shift).collect();
-        channels::code(e, a, c, near, &mut coarse);
-    })
+    /// Which Gaussians of a tile of the reference have no survivor at `range`.
+    fn deaths(&self, e: &mut Encoder, k: usize, t: usize, range: Range<usize>) {
+        let (Some(r), Some(parents)) = (self.reference, &self.group.parents) else {
+            return;
+        };
+        let all = r.tile_range(k, t);
+        let mut dead = vec![true; all.len()];
+        for i in &parents[range] {
+            dead[*i as usize - all.start] = false;
+        }
+        deaths::code(e, &neighbors::nearest(&r.positions[all]), &mut dead);
+    }
+
+    /// The units of the nodes.
+    fn nodes(&self) -> Vec<Coded> {
+        let (g, h) = (self.group, &self.group.header);
+        if h.nodes.count == 0 {
+            return Vec::new();
+        }
+        let near = neighbors::nearest(&g.node_positions);
+        let places = points(&mut positions::model(), &g.node_positions, u32::from(h.grid_bits), 0);
+        let mut e = Encoder::default();
+        let (k, mut model) = (usize::from(h.nodes.coefficients), TrajectoryModel::new(Kind::Node));
+        let own: &Trajectories = &g.node_trajectories;
+        let _ = trajectories::code(&mut e, &mut model, k, &near, own, u64::MAX);
+        vec![
+            ((UnitType::NodePositions, 0, 0), places),
+            ((UnitType::NodeTrajectories, 0, 0), e.finish()),
+        ]
+    }
 }
 
 /// `points` without their lowest `shift` bits.
-fn points(points: &[[u32; 3]], bits: u32, shift: u32) -> Code<'_> {
-    Box::new(move || {
-        let codes: Vec<u64> = points.iter().map(|p| morton::encode(p.map(|v| v >> shift))).collect();
-        positions::encode(&codes, bits - shift)
-    })
-}
-
-fn deaths_of<'a>(reference: &'a Group, k: usize, survivors: &'a [u32]) -> Code<'a> {
-    coded(move |c| {
-        let range = reference.range(k..k + 1);
-        let mut dead = vec![true; range.len()];
-        for i in survivors {
-            dead[*i as usize - range.start] = false;
-        }
-        deaths::code(c, &neighbors::nearest(&reference.positions[range]), &mut dead);
-    })
-}
-
-fn trajectory(model: Kind, k: usize, near: &[Near], t: Trajectories) -> Code<'_> {
-    coded(move |c| {
-        let _ = trajectories::code(c, model, k, near, &t, u64::MAX); // an encoder never stops
-    })
+fn points(model: &mut crate::model::Model, points: &[[u32; 3]], bits: u32, shift: u32) -> Vec<u8> {
+    let codes: Vec<u64> = points.iter().map(|p| morton::encode(p.map(|v| v >> shift))).collect();
+    positions::encode(model, &codes, bits - shift)
 }

@@ -7,6 +7,7 @@ use crate::blend::Blend;
 use crate::dequantize::{self, Quat, values};
 use crate::error::Result;
 use crate::group::Group;
+use crate::header::Header;
 use crate::neighbors;
 use crate::parametric::{AttributeMotion, Frame, FrameMut, Parametric, rgb};
 use crate::trajectories::Trajectories;
@@ -66,6 +67,19 @@ impl Evaluator {
 
     pub fn group(&self) -> &Group {
         &self.group
+    }
+
+    /// The group as it was given, with its rotations.
+    pub fn into_group(self) -> Group {
+        let trajectories = self.motions.into_iter().map(|m| m.coefficients).collect();
+        Group {
+            trajectories,
+            ..self.group
+        }
+    }
+
+    pub fn header_mut(&mut self) -> &mut Header {
+        &mut self.group.header
     }
 
     /// Trajectories in the order of the header.
@@ -133,7 +147,8 @@ fn rotations_of(group: &Group, reference: Option<&Group>) -> Vec<Quat> {
                 .and_then(|v| v.get(3 * born..3 * range.end))
                 .unwrap_or(&[])
         };
-        let near = neighbors::nearest(group.positions.get(born..range.end).unwrap_or(&[]));
+        let births = group.positions.get(born..range.end).unwrap_or(&[]);
+        let near = neighbors::nearest_in_tiles(births, h.tile_cells() as usize);
         out.extend(dequantize::rotations(
             h,
             own(Attribute::Quats),

@@ -21,6 +21,8 @@ pub struct Group {
     pub header: Header,
     /// Gaussians of each decoded layer: those of the header, unless units are damaged.
     pub layers: Vec<LayerHeader>,
+    /// Gaussians of each decoded tile of each layer: those of the header, or 0 where the tile is damaged or was not asked for.
+    pub tiles: Vec<Vec<u32>>,
     /// In a predicted group: index in the reference of each Gaussian, or `BIRTH`.
     pub parents: Option<Vec<u32>>,
     pub positions: Vec<[u32; 3]>,
@@ -47,6 +49,7 @@ impl Group {
     pub fn validate(&self, reference: Option<&Group>) -> Result<()> {
         let h = &self.header;
         let before = reference.map(|r| &r.header);
+        self.validate_parents()?;
         h.clone().fields(&mut Writer::default(), &mut Vec::new(), before)?;
         let top = LEVELS[LEVELS.len() - 1];
         h.check(&top, before).map_err(|e| Error::Input(e.to_string()))?;
@@ -56,6 +59,13 @@ impl Group {
         })?;
         must(self.positions.len() == n, || {
             format!("expected {n} positions, got {}", self.positions.len())
+        })?;
+        let sums = self.tiles.iter().map(|t| t.iter().sum::<u32>());
+        must(sums.eq(self.layers.iter().map(|l| l.count)), || {
+            "expected tiles that make up the layers".into()
+        })?;
+        must(self.lifetimes.is_some() == h.lifetimes, || {
+            "expected lifetimes as the header says".into()
         })?;
         must(self.corrections.len() == self.layers.len(), || {
             "expected a correction for each layer".into()
@@ -78,8 +88,8 @@ impl Group {
         self.validate_time()
     }
 
-    /// Checks that survivors have the order and the integers of the reference, and that births are in Morton order.
-    fn validate_layers(&self, reference: Option<&Group>) -> Result<()> {
+    /// Checks that a predicted group, and no other, tells where its Gaussians come from.
+    fn validate_parents(&self) -> Result<()> {
         let h = &self.header;
         must(self.parents.is_some() == (h.reference > 0), || {
             "expected parents in a predicted group only".into()
@@ -88,7 +98,13 @@ impl Group {
         must(
             parents.len() == if h.reference > 0 { self.positions.len() } else { 0 },
             || format!("expected {} parents, got {}", self.positions.len(), parents.len()),
-        )?;
+        )
+    }
+
+    /// Checks that survivors have the order and the integers of the reference, and that births are in Morton order.
+    fn validate_layers(&self, reference: Option<&Group>) -> Result<()> {
+        let h = &self.header;
+        let parents = self.parents.as_deref().unwrap_or(&[]);
         for (k, layer) in self.layers.iter().enumerate() {
             let range = self.range(k..k + 1);
             let middle = range.start + layer.survivors() as usize;
@@ -148,6 +164,48 @@ impl Group {
     pub fn range(&self, layers: std::ops::Range<usize>) -> std::ops::Range<usize> {
         let sum = |k: usize| self.layers.iter().take(k).map(|l| l.count as usize).sum();
         sum(layers.start)..sum(layers.end)
+    }
+
+    /// Index range of the Gaussians of tile `t` of layer `k`; empty if there is no such tile.
+    pub fn tile_range(&self, k: usize, t: usize) -> std::ops::Range<usize> {
+        let tiles = self.tiles.get(k).map_or(&[][..], Vec::as_slice);
+        let first = self.range(k..k + 1).start + tiles.iter().take(t).map(|n| *n as usize).sum::<usize>();
+        first..first + tiles.get(t).map_or(0, |n| *n as usize)
+    }
+
+    /// Divides the Gaussians of each layer into tiles: survivors as those of the reference are, births in order. Bounds are left
+    /// as they are.
+    pub fn divide(&mut self, reference: Option<&Group>) {
+        let cells = self.header.tile_cells() as usize;
+        self.tiles = (0..self.layers.len())
+            .map(|k| self.tiles_of(k, cells, reference))
+            .collect();
+        self.header.tiles.resize(self.tiles.len(), Vec::new());
+        for (tiles, counts) in self.header.tiles.iter_mut().zip(&self.tiles) {
+            tiles.resize(counts.len(), Default::default());
+            tiles.iter_mut().zip(counts).for_each(|(tile, n)| tile.count = *n);
+        }
+    }
+
+    fn tiles_of(&self, k: usize, cells: usize, reference: Option<&Group>) -> Vec<u32> {
+        let range = self.range(k..k + 1);
+        let born = range.start + self.layers[k].survivors() as usize;
+        let parents = self
+            .parents
+            .as_deref()
+            .and_then(|p| p.get(range.start..born))
+            .unwrap_or(&[]);
+        let mut out = Vec::new();
+        if let Some(r) = reference {
+            for t in 0..r.tiles.get(k).map_or(0, Vec::len) {
+                let theirs = r.tile_range(k, t);
+                let own = parents.iter().filter(|p| theirs.contains(&(**p as usize)));
+                out.push(own.count() as u32);
+            }
+        }
+        let births = range.end - born;
+        out.extend((0..births.div_ceil(cells)).map(|t| (births - t * cells).min(cells) as u32));
+        out
     }
 
     /// The correction of the last decoded layer, for log_scales and logit_opacities.

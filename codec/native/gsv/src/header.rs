@@ -16,6 +16,8 @@ pub const COMPANDED_CHANNELS: usize = 4;
 pub const SCALE_EXPONENT_UNIT: f32 = 32.0;
 /// Most low bits that a layer may leave out.
 pub const SHIFT_MAX: u8 = 15;
+/// Sides of tiles, log2.
+pub const TILE_SIDES: std::ops::RangeInclusive<u8> = 4..=7;
 /// Most layers of a group.
 pub const LAYERS_MAX: usize = 16;
 
@@ -44,6 +46,15 @@ pub struct NodeHeader {
     pub translation_step: f32,
 }
 
+/// What the index tells of one tile (spec 4).
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct TileHeader {
+    /// Gaussians: survivors of the tile of the same index of the reference, or births.
+    pub count: u32,
+    /// Lower corner and upper corner, both included, in parts of the grid (tile_bounds.rs).
+    pub bounds: [u16; 6],
+}
+
 /// Gaussians of one layer.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct LayerHeader {
@@ -68,6 +79,12 @@ pub struct Header {
     pub grid_bits: u8,
     pub sh_degree: u8,
     pub layers: Vec<LayerHeader>,
+    /// A tile has up to 2^tile_side_log2 x 2^tile_side_log2 cells of the map.
+    pub tile_side_log2: u8,
+    /// Of each layer: first a tile of survivors for each tile of the reference, then the tiles of births.
+    pub tiles: Vec<Vec<TileHeader>>,
+    /// Every tile tells in which frames its Gaussians are shown; otherwise they are in all.
+    pub lifetimes: bool,
     /// In the order of `Attribute::canonical(sh_degree)`.
     pub scales: Vec<Scale>,
     /// [channel of quats][channel of log_scales]: the step of the channel is divided by 2^(scale_exponent /
@@ -91,6 +108,38 @@ impl Header {
     /// Gaussians in all layers.
     pub fn count(&self) -> u64 {
         self.layers.iter().map(|l| u64::from(l.count)).sum()
+    }
+
+    /// Most Gaussians of a tile.
+    pub fn tile_cells(&self) -> u32 {
+        1 << (2 * u32::from(self.tile_side_log2))
+    }
+
+    /// Number of tiles of layer `k` that hold survivors; the tiles of births follow.
+    pub fn survivor_tiles(&self, k: usize) -> usize {
+        let births = self.layers.get(k).map_or(0, |l| l.births.div_ceil(self.tile_cells()));
+        self.tiles.get(k).map_or(0, |t| t.len().saturating_sub(births as usize))
+    }
+
+    /// The tiles of layer `k` from whose models the others start: the first one, unless it is empty, and the first one of
+    /// births.
+    pub fn leading_tiles(&self, k: usize) -> [Option<usize>; 2] {
+        let tiles = self.tiles.get(k).map_or(&[][..], Vec::as_slice);
+        let born = self.survivor_tiles(k);
+        let first = tiles.first().filter(|t| t.count > 0);
+        [first.map(|_| 0), (born < tiles.len()).then_some(born)]
+    }
+
+    /// Gaussians of the reference among which a tile of survivors tells the dead; 0: none has died, or a tile of births.
+    pub fn candidates(&self, k: usize, t: usize, reference: Option<&Header>) -> u32 {
+        let before = reference.filter(|_| t < self.survivor_tiles(k));
+        let all = before.and_then(|r| r.tiles.get(k)?.get(t)).map_or(0, |r| r.count);
+        let own = self
+            .tiles
+            .get(k)
+            .and_then(|tiles| tiles.get(t))
+            .map_or(0, |own| own.count);
+        if own > 0 && own < all { all } else { 0 }
     }
 
     /// Low bits that layer `k` leaves out of the integers of an attribute; `Means`: of positions.
@@ -119,21 +168,16 @@ impl Header {
         level.cap(unit, "pairs of Gaussian and node", count * nodes, level.pairs)?;
         let channels: u64 = self.scales.iter().map(|s| s.steps.len() as u64).sum();
         let births: u64 = self.layers.iter().map(|l| u64::from(l.births)).sum();
-        let deaths: u64 = (0..self.layers.len()).map(|k| self.candidates(k, reference)).sum();
+        let pairs = self.tiles.iter().enumerate();
+        let deaths: u64 = pairs
+            .flat_map(|(k, tiles)| (0..tiles.len()).map(move |t| (k, t)))
+            .map(|(k, t)| u64::from(self.candidates(k, t, reference)))
+            .sum();
         let symbols = births * (3 + channels)
             + count * self.trajectories.len() as u64
             + nodes * (3 + 6 * u64::from(self.nodes.coefficients))
             + deaths;
         level.cap(unit, "symbols", symbols, level.symbols)?;
         Ok(symbols)
-    }
-
-    /// Gaussians of the reference that the deaths unit of layer `k` codes; 0: there is no such unit.
-    pub fn candidates(&self, k: usize, reference: Option<&Header>) -> u64 {
-        let before = reference.filter(|_| self.reference > 0).and_then(|r| r.layers.get(k));
-        match (self.layers.get(k), before) {
-            (Some(own), Some(before)) if own.survivors() < before.count => u64::from(before.count),
-            _ => 0,
-        }
     }
 }

@@ -9,9 +9,13 @@ const POINT: usize = 16; // first context of the end points; the flag has those 
 const NODES: usize = 256;
 const BITS: usize = 8;
 
+/// A new model of lifetimes.
+pub fn model() -> Model {
+    Model::new(POINT + 2 * NODES, POINT + 2 * BITS * 3, 1 + 2 * BITS)
+}
+
 /// Codes the lifetimes of a group of `frames` frames. False if a forbidden one was read.
-pub fn code<C: Bins>(c: &mut C, frames: u16, near: &[Near], lifetimes: &mut [[u16; 2]]) -> bool {
-    let mut model = Model::new(POINT + 2 * NODES, POINT + 2 * BITS * 3, 1 + 2 * BITS);
+pub fn code<C: Bins>(c: &mut C, model: &mut Model, frames: u16, near: &[Near], lifetimes: &mut [[u16; 2]]) -> bool {
     let bits = 16 - (frames - 1).leading_zeros();
     let whole = [0, frames];
     for (i, near) in near.iter().enumerate() {
@@ -23,8 +27,8 @@ pub fn code<C: Bins>(c: &mut C, frames: u16, near: &[Near], lifetimes: &mut [[u1
             continue;
         }
         let [first, end] = done.get(near[0] as usize).copied().unwrap_or(whole);
-        let t0 = point(c, &mut model, 0, bits, own[0], first);
-        let t1 = point(c, &mut model, 1, bits, own[1].wrapping_sub(1), end - 1) + 1;
+        let t0 = point(c, model, 0, bits, own[0], first);
+        let t1 = point(c, model, 1, bits, own[1].wrapping_sub(1), end - 1) + 1;
         if t0 >= t1 || t1 > frames || !c.alive() {
             return false;
         }

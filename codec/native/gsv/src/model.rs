@@ -18,6 +18,8 @@ const STRETCH_MAX: i32 = 12 * 256 - 1;
 const P_MIN: i32 = 16;
 /// Bins after which a counter stops slowing down.
 const AGE_MAX: u32 = 255;
+/// The same in a model that another tile starts from.
+const AGE_SETTLED: u32 = 20;
 /// Initial weight of each counter, 0.4, and the range of weights, in 1/65536.
 const WEIGHT_NEW: i32 = 26214;
 const WEIGHT_MAX: i32 = 4 << 16;
@@ -88,6 +90,7 @@ impl Counter {
 }
 
 /// Counters and mixing weights for the syntax elements of one kind.
+#[derive(Clone)]
 pub struct Model {
     a: Vec<u32>,
     b: Vec<u32>,
@@ -107,6 +110,14 @@ impl Model {
             stretch: &STRETCH,
             squash: &SQUASH,
             steps: &STEPS,
+        }
+    }
+
+    /// Prepares the model for the other tiles of a layer: what it has learned from the first one counts less.
+    pub fn settle(&mut self) {
+        for v in self.a.iter_mut().chain(&mut self.b) {
+            let n = (*v & 255).min(AGE_SETTLED);
+            *v = *v >> 10 << 10 | age(n) << 8 | n;
         }
     }
 

@@ -21,36 +21,19 @@ pub fn distance(p: [u32; 3], q: [u32; 3]) -> u64 {
 
 /// For each point the four nearest within the window before it; of equal distances the most recent.
 pub fn nearest(points: &[[u32; 3]]) -> Vec<Near> {
-    (0..points.len())
-        .into_par_iter()
-        .with_min_len(4096)
-        .map(|i| nearest_before(points, i))
-        .collect()
+    (0..points.len()).map(|i| nearest_before(points, i, 0)).collect()
 }
 
-/// Neighbours in a layer: of all its Gaussians, and of its births among themselves.
-pub struct Contexts {
-    pub all: Vec<Near>,
-    births: Option<Vec<Near>>,
+/// The same of points in tiles of `cells` points: neighbours are of the same tile.
+pub fn nearest_in_tiles(points: &[[u32; 3]], cells: usize) -> Vec<Near> {
+    let start = |i: usize| i - i % cells.max(1);
+    let all = (0..points.len()).into_par_iter().with_min_len(4096);
+    all.map(|i| nearest_before(points, i, start(i))).collect()
 }
 
-impl Contexts {
-    /// `positions` of a layer, of which the first `survivors` are those of the reference.
-    pub fn new(positions: &[[u32; 3]], survivors: usize) -> Contexts {
-        let births = positions.get(survivors..).unwrap_or(&[]);
-        Contexts {
-            all: nearest(positions),
-            births: (survivors > 0).then(|| nearest(births)),
-        }
-    }
-
-    pub fn births(&self) -> &[Near] {
-        self.births.as_ref().unwrap_or(&self.all)
-    }
-}
-
-fn nearest_before(points: &[[u32; 3]], i: usize) -> Near {
-    let from = i.saturating_sub(WINDOW);
+/// `first`: the first point that may be a neighbour.
+fn nearest_before(points: &[[u32; 3]], i: usize, first: usize) -> Near {
+    let from = i.saturating_sub(WINDOW).max(first);
     let mut best = [u64::MAX; NEAR]; // distance << 5 | how far back, less one
     for (back, q) in points[from..i].iter().rev().enumerate() {
         let mut key = distance(points[i], *q) << 5 | back as u64;

@@ -2,65 +2,38 @@
 //!
 //! An octree, breadth first, whose nodes know how many points they hold. One question, how many points are in the lower
 //! half, codes emptiness, single points and duplicates; its contexts are the points of the face neighbours. A point with few
-//! neighbours leaves the tree and its remaining bits are coded plainly, since they can hardly be predicted. Many points are
-//! coded as two trees, so that two threads decode them.
+//! neighbours leaves the tree and its remaining bits are coded plainly, since they can hardly be predicted.
 
 mod octree;
 mod split;
 
+use crate::model::Model;
 use crate::range_coder::{Bins, Decoder, Encoder};
 use octree::{Children, Node, link};
+pub use split::model;
 use split::{Seen, Split, SplitCoder, seen};
 
 const LONELY: usize = 2; // most face neighbours of a point that leaves the tree
-const SPLIT_FROM: u32 = 1 << 14; // from this many points on there are two trees
 
 /// Encodes points of `bits` bits per axis, given as sorted Morton codes.
-pub fn encode(points: &[u64], bits: u32) -> Vec<u8> {
-    let tree = |points: &[u64]| {
-        let mut c = Encoder::default();
-        code(&mut c, points, points.len() as u32, bits);
-        c.finish()
-    };
-    let Some(half) = halves_of(points.len() as u32) else {
-        return tree(points);
-    };
-    let (first, second) = points.split_at(half as usize);
-    let (first, second) = rayon::join(|| tree(first), || tree(second));
-    [&(first.len() as u32).to_be_bytes()[..], &first, &second].concat()
+pub fn encode(model: &mut Model, points: &[u64], bits: u32) -> Vec<u8> {
+    let mut c = Encoder::default();
+    code(&mut c, model, points, points.len() as u32, bits);
+    c.finish()
 }
 
 /// Decodes `count` points; returns their sorted Morton codes, or what was expected of the payload.
-pub fn decode(payload: &[u8], count: u32, bits: u32) -> Result<Vec<u64>, &'static str> {
-    let tree = |payload: &[u8], count: u32| {
-        let mut c = Decoder::new(payload);
-        let points = code(&mut c, &[], count, bits);
-        c.finish().map(|()| points)
-    };
-    let Some(half) = halves_of(count) else {
-        return tree(payload, count);
-    };
-    let parts = payload
-        .split_first_chunk()
-        .and_then(|(size, rest)| rest.split_at_checked(u32::from_be_bytes(*size) as usize));
-    let (first, second) = parts.ok_or("more payload: the size of its first half")?;
-    let (first, second) = rayon::join(|| tree(first, half), || tree(second, count - half));
-    let mut points = first?;
-    points.extend(second?);
-    points.sort_unstable(); // as a rule they are
-    Ok(points)
-}
-
-/// Number of points in the first of two trees; None: one tree.
-fn halves_of(count: u32) -> Option<u32> {
-    (count >= SPLIT_FROM).then_some(count / 2)
+pub fn decode(model: &mut Model, payload: &[u8], count: u32, bits: u32) -> Result<Vec<u64>, &'static str> {
+    let mut c = Decoder::new(payload);
+    let points = code(&mut c, model, &[], count, bits);
+    c.finish().map(|()| points)
 }
 
 /// Codes `count` points of `bits` bits per axis as one tree. `points`: their sorted Morton codes, in the decoder empty.
 /// Returns the codes.
-fn code<C: Bins>(c: &mut C, points: &[u64], count: u32, bits: u32) -> Vec<u64> {
+fn code<C: Bins>(c: &mut C, model: &mut Model, points: &[u64], count: u32, bits: u32) -> Vec<u64> {
     let mut out = Vec::with_capacity(count as usize);
-    let mut coder = SplitCoder::new(c);
+    let mut coder = SplitCoder { c, model };
     let mut level = if count > 0 {
         vec![Node::new(0, count, 0)]
     } else {

@@ -8,6 +8,8 @@ use std::sync::LazyLock;
 
 /// A distribution that has seen this many symbols adapts no slower.
 const SEEN_MAX: u8 = 126;
+/// The same in a model that another tile starts from.
+const SEEN_SETTLED: u8 = 30;
 /// Least probability of a symbol, times 65536.
 const LEAST: u16 = 4;
 /// Weights adapt by 1 / 128 and have 7 extra fractional bits.
@@ -55,6 +57,7 @@ fn high(a: u16, b: u16) -> u16 {
 }
 
 /// The distributions of one kind of context, and how many symbols each has seen.
+#[derive(Clone)]
 struct Table {
     distributions: Vec<Distribution>,
     seen: Vec<u8>,
@@ -83,6 +86,7 @@ static SEEN: LazyLock<[(u16, u8); 256]> = LazyLock::new(|| {
 });
 
 /// Adaptive model of symbols.
+#[derive(Clone)]
 pub struct SymbolModel {
     tables: [Table; 3],
     weights: Vec<[u32; 2]>, // of the first two distributions, in 1/65536, times 2^RATE_BITS
@@ -97,6 +101,12 @@ impl SymbolModel {
             weights: vec![[21845 << RATE_BITS; 2]; sets * 64],
             seen: &SEEN,
         }
+    }
+
+    /// Prepares the model for the other tiles of a layer: what it has learned from the first one counts less.
+    pub fn settle(&mut self) {
+        let seen = self.tables.iter_mut().flat_map(|t| &mut t.seen);
+        seen.for_each(|n| *n = (*n).min(SEEN_SETTLED));
     }
 
     /// Codes one symbol in three contexts, mixed with weight set `w`.

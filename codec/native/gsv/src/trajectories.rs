@@ -134,18 +134,13 @@ pub enum Stop {
 /// most values to decode.
 pub fn code<C: Bins>(
     c: &mut C,
-    kind: Kind,
+    model: &mut TrajectoryModel,
     k_max: usize,
     near: &[Near],
     source: &Trajectories,
     budget: u64,
 ) -> Result<Trajectories, Stop> {
     let channels = source.channels;
-    let mut model = TrajectoryModel {
-        kind,
-        lengths: Model::new(16 * LENGTHS + 4, 16 * LENGTHS + 2, LENGTHS + 1),
-        values: ValueModel::new(if kind == Kind::Node { 24 } else { 12 }),
-    };
     let mut out = Trajectories::new(channels);
     let mut before = [false; 2]; // whether the two blocks before have coefficients, the last one first
     for (block, near) in near.chunks(BLOCK).enumerate() {
@@ -173,13 +168,29 @@ pub fn code<C: Bins>(
     Ok(out)
 }
 
-struct TrajectoryModel {
+/// Adaptive model of the trajectories of one attribute, or of the nodes.
+#[derive(Clone)]
+pub struct TrajectoryModel {
     kind: Kind,
     lengths: Model,
     values: ValueModel,
 }
 
 impl TrajectoryModel {
+    pub fn new(kind: Kind) -> Self {
+        TrajectoryModel {
+            kind,
+            lengths: Model::new(16 * LENGTHS + 4, 16 * LENGTHS + 2, LENGTHS + 1),
+            values: ValueModel::new(if kind == Kind::Node { 24 } else { 12 }),
+        }
+    }
+
+    /// As of `Model`.
+    pub fn settle(&mut self) {
+        self.lengths.settle();
+        self.values.settle();
+    }
+
     /// Codes whether any Gaussian of a block has coefficients.
     fn any<C: Bins>(&mut self, c: &mut C, want: bool, before: [bool; 2]) -> bool {
         let [last, other] = before.map(usize::from);

@@ -1,40 +1,29 @@
-//! Units (spec 3): a group payload <-> typed, checksummed pieces.
+//! Units (spec 3): a group payload <-> the group header and typed, checksummed pieces.
+//!
+//! The header has a directory of the units: type, layer, index, size and checksum of each. So damage never hides where the
+//! next unit begins, and a reader that has the header can fetch the units that it wants.
 
-use crate::attributes::Attribute;
 use crate::crc::crc32;
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader, Writer};
 use crate::header::Header;
+use crate::parallel;
 
 /// The unit types of this version (spec 3.1).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub enum UnitType {
     GroupHeader = 0,
-    Positions = 1,
-    Channels = 2,
-    Lifetimes = 3,
-    NodePositions = 4,
-    NodeTrajectories = 5,
-    Trajectories = 6,
-    Deaths = 8,
-    LayerCorrection = 9,
+    Tile = 1,
+    NodePositions = 2,
+    NodeTrajectories = 3,
+    LayerCorrection = 4,
 }
 
 use UnitType::*;
 
 impl UnitType {
-    const ALL: [UnitType; 9] = [
-        GroupHeader,
-        Positions,
-        Channels,
-        Lifetimes,
-        NodePositions,
-        NodeTrajectories,
-        Trajectories,
-        Deaths,
-        LayerCorrection,
-    ];
+    const ALL: [UnitType; 5] = [GroupHeader, Tile, NodePositions, NodeTrajectories, LayerCorrection];
 
     pub fn from_number(n: u8) -> Option<UnitType> {
         Self::ALL.into_iter().find(|u| *u as u8 == n)
@@ -43,227 +32,215 @@ impl UnitType {
     pub fn name(self) -> &'static str {
         match self {
             GroupHeader => "group_header",
-            Positions => "positions",
-            Channels => "channels",
-            Lifetimes => "lifetimes",
+            Tile => "tile",
             NodePositions => "node_positions",
             NodeTrajectories => "node_trajectories",
-            Trajectories => "trajectories",
-            Deaths => "deaths",
             LayerCorrection => "layer_correction",
         }
     }
+}
 
-    /// The units that a unit of this type and `attribute` must depend on, where its layer has them.
-    pub fn needs(self, attribute: Option<Attribute>) -> &'static [(UnitType, Option<Attribute>)] {
-        match (self, attribute) {
-            (Channels, Some(Attribute::Quats)) => &[(Positions, None), (Channels, Some(Attribute::LogScales))],
-            (Channels, _) => &[(Positions, None)],
-            (Lifetimes | Trajectories, _) => &[(Positions, None), (Deaths, None)],
-            (NodeTrajectories, _) => &[(NodePositions, None)],
-            _ => &[],
-        }
+/// What the directory tells of a unit.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Entry {
+    pub number: u8,
+    pub layer: u8,
+    pub index: u16,
+    pub size: u32,
+    pub crc: u32,
+}
+
+impl Entry {
+    pub fn new((kind, layer, index): UnitKey, payload: &[u8]) -> Result<Entry> {
+        let size = u32::try_from(payload.len()).map_err(|_| Error::Input("a unit of more than 4 GiB".into()))?;
+        Ok(Entry {
+            number: kind as u8,
+            layer,
+            index,
+            size,
+            crc: crc32(&[payload]),
+        })
+    }
+
+    pub fn fields<F: Fields>(&mut self, f: &mut F) -> Result<()> {
+        f.u8(&mut self.number)?;
+        f.u8(&mut self.layer)?;
+        f.u16(&mut self.index)?;
+        f.u32(&mut self.size)?;
+        f.u32(&mut self.crc)
     }
 }
 
-/// One unit of a group; `kind` is None for a type that this version skips.
+/// What identifies a unit in a group: type, layer, and the index of a tile, or the attribute of a correction.
+pub type UnitKey = (UnitType, u8, u16);
+
+/// One unit of a group; unit 0 is the group header. `kind` is None for a type that this version skips.
 #[derive(Debug, Clone)]
 pub struct Unit<'a> {
-    pub number: u8,
+    /// Its index in the group.
+    pub number: usize,
     pub kind: Option<UnitType>,
     pub layer: u8,
-    pub attribute: Option<Attribute>,
-    attribute_number: u8,
-    /// Offset of the unit in the group payload.
-    pub offset: usize,
+    pub index: u16,
     /// Offset of its payload in the group payload.
-    pub payload_offset: usize,
+    pub offset: usize,
     pub size: usize,
     pub payload: &'a [u8],
-    /// What was expected, if the unit is damaged; then the other fields are what its bytes claim.
+    crc: u32,
+    /// What was expected, if the unit is damaged.
     pub damage: Option<Error>,
-    pub dependencies: Vec<u8>,
 }
 
 impl Unit<'_> {
-    /// For messages: "unit 3 (channels sh0)".
-    pub fn label(&self, index: usize) -> String {
-        let kind = self.kind.map_or("unknown", UnitType::name);
-        let attribute = self.attribute.map_or(String::new(), |a| format!(" {}", a.name()));
-        let layer = if self.layer > 0 {
-            format!(" of layer {}", self.layer)
-        } else {
-            String::new()
-        };
-        format!("unit {index} ({kind}{attribute}{layer})")
+    pub fn key(&self) -> Option<UnitKey> {
+        Some((self.kind?, self.layer, self.index))
+    }
+
+    /// For messages: "unit 3 (tile 2)".
+    pub fn label(&self) -> String {
+        let name = self.key().map_or("unknown".into(), unit_name);
+        format!("unit {} ({name})", self.number)
     }
 }
 
-const UNITS_MAX: usize = 255;
+/// "tile 2 of layer 1".
+pub fn unit_name((kind, layer, index): UnitKey) -> String {
+    let index = if kind == Tile {
+        format!(" {index}")
+    } else {
+        String::new()
+    };
+    let of = if layer > 0 {
+        format!(" of layer {layer}")
+    } else {
+        String::new()
+    };
+    format!("{}{index}{of}", kind.name())
+}
 
 /// A number of layers that no group exceeds.
 pub const ALL_LAYERS: usize = 256;
+const HEAD: usize = 8; // length and checksum of the group header
 
-/// Splits a group payload; checks every CRC and dependency.
+/// Splits a group payload; damage is an error.
 pub fn split(payload: &[u8], layers: usize) -> Result<Vec<Unit<'_>>> {
-    let mut units = scan(payload, layers)?;
-    let later = |u: &Unit| u.damage.is_some() && usize::from(u.layer) >= layers; // or so it claims: then others are missing
-    units.truncate(units.iter().position(later).unwrap_or(units.len()));
+    let mut units = scan(payload, layers, |_, _| true)?;
     match units.iter_mut().find_map(|u| u.damage.take()) {
         Some(damage) => Err(damage),
         None => Ok(units),
     }
 }
 
-/// Splits a group payload and marks damaged units (spec 3): wrong CRC; a dependency on a damaged unit; cut off by the end of
-/// the payload; or a broken rule behind a damaged unit whose length may be wrong (where the header has no unit sizes).
+/// Splits a group payload and marks damaged units (spec 3): a wrong CRC, or cut off by the end of the payload.
 ///
-/// Returns the units of the first `layers` layers only; the payload may end anywhere behind them.
+/// Returns the units of the first `layers` layers only; the payload may end anywhere behind them. Of the tiles only those for
+/// which `wanted(layer, index)` holds; the bytes of the others are not looked at.
 ///
 /// # Errors
-/// Unit 0 is damaged; undamaged bytes break a rule.
-pub fn scan(payload: &[u8], layers: usize) -> Result<Vec<Unit<'_>>> {
-    let mut units: Vec<Unit> = Vec::new();
-    let (mut offset, mut damaged, mut sizes) = (0, false, Vec::new().into_iter());
-    while (offset < payload.len() && units.len() <= UNITS_MAX) || units.is_empty() {
-        let index = units.len();
-        let mut unit = read(
-            &payload[offset..],
-            offset,
-            index,
-            sizes.next().map(|size| size as usize),
-        );
-        if unit.damage.is_none() && usize::from(unit.layer) >= layers {
-            break;
+/// The header is damaged, or its directory breaks a rule.
+pub fn scan(payload: &[u8], layers: usize, wanted: impl Fn(u8, u16) -> bool) -> Result<Vec<Unit<'_>>> {
+    let first = first(payload)?;
+    let at_header = |e: Error| e.at(HEAD, "unit 0 (group_header)");
+    let (_, directory) = Header::open(first.payload).map_err(at_header)?;
+    let mut offset = first.offset + first.size;
+    let mut units = vec![first];
+    for (i, entry) in directory.iter().enumerate() {
+        let fail = |expected: &str| {
+            Err(Error::bitstream(
+                HEAD,
+                format!("unit {} of the directory", i + 1),
+                expected,
+            ))
+        };
+        let kind = UnitType::from_number(entry.number);
+        match (kind, entry.index) {
+            (Some(GroupHeader), _) => return fail("no second group_header"),
+            (Some(NodePositions | NodeTrajectories), 1..) => return fail("an index of 0"),
+            (Some(LayerCorrection), 0 | 1 | 3 | 5..) => return fail("a layer_correction of attribute 2 or 4"),
+            _ => {}
         }
-        if unit.damage.is_none() {
-            let checked = check(&unit, &units).map_err(|e| Error::bitstream(offset, unit.label(index), e));
-            unit.damage = checked.err();
-            if !damaged && let Some(e) = unit.damage {
-                return Err(e);
+        let before = i.checked_sub(1).and_then(|i| directory.get(i));
+        if before.is_some_and(|b| b.layer > entry.layer) {
+            return fail("layers in increasing order");
+        }
+        if usize::from(entry.layer) >= layers {
+            return Ok(checked(units));
+        }
+        let size = entry.size as usize;
+        let own = payload.get(offset..).and_then(|rest| rest.get(..size));
+        let rest = payload.len().saturating_sub(offset);
+        if kind != Some(Tile) || wanted(entry.layer, entry.index) {
+            let mut unit = Unit {
+                number: i + 1,
+                kind,
+                layer: entry.layer,
+                index: entry.index,
+                offset,
+                size,
+                payload: own.unwrap_or(&[]),
+                crc: entry.crc,
+                damage: None,
+            };
+            if own.is_none() {
+                let expected = format!("{size} more bytes, found {rest}");
+                unit.damage = Some(Error::bitstream(offset, unit.label(), expected));
             }
+            units.push(unit);
         }
-        if index == 0
-            && let Some(e) = unit.damage
-        {
-            return Err(e);
-        }
-        if index == 0 {
-            let told = Header::open(unit.payload).map_or(Vec::new(), |(_, sizes)| sizes);
-            sizes = told.into_iter(); // a header that breaks a rule is an error of who reads all of it
-        }
-        damaged |= unit.damage.is_some();
-        offset += unit.size;
-        units.push(unit);
+        offset = offset.saturating_add(size);
     }
-    Ok(units)
+    if offset < payload.len() {
+        let expected = format!("the end of the group, found {} more bytes", payload.len() - offset);
+        return Err(Error::bitstream(offset, "group", expected));
+    }
+    Ok(checked(units))
+}
+
+/// Compares the checksums of units, which were cut off or are as the directory says.
+fn checked(mut units: Vec<Unit>) -> Vec<Unit> {
+    let computed = parallel::map(&units, |u| crc32(&[u.payload]));
+    for (u, computed) in units.iter_mut().zip(computed).skip(1) {
+        if u.damage.is_none() && u.crc != computed {
+            let expected = format!("CRC-32 {:08x}, found {computed:08x}: the unit is damaged", u.crc);
+            u.damage = Some(Error::bitstream(u.offset, u.label(), expected));
+        }
+    }
+    units
 }
 
 /// The group header of a payload, which may end behind it.
 pub fn first(payload: &[u8]) -> Result<Unit<'_>> {
-    let mut unit = read(payload, 0, 0, None);
-    match unit.damage.take() {
-        Some(damage) => Err(damage),
-        None if unit.kind == Some(GroupHeader) => Ok(unit),
-        None => Err(Error::bitstream(0, "unit 0", "a group header")),
+    let mut r = Reader::new(payload);
+    let (mut length, mut told) = (0, 0);
+    let fail = |e: Error| e.at(0, "unit 0 (group_header)");
+    r.u32(&mut length).map_err(fail)?;
+    r.u32(&mut told).map_err(fail)?;
+    let header = r.take(length as usize).map_err(fail)?;
+    let computed = crc32(&[header]);
+    if told != computed {
+        let expected = format!("CRC-32 {told:08x}, found {computed:08x}: the unit is damaged");
+        return Err(Error::bitstream(HEAD, "unit 0 (group_header)", expected));
     }
-}
-
-/// The unit at the start of `data`, of the size in the header (`told`); the rest of the data, damaged, if that is too short.
-fn read(data: &[u8], offset: usize, index: usize, told: Option<usize>) -> Unit<'_> {
-    let data = told.and_then(|size| data.get(..size)).unwrap_or(data);
-    let mut h = [0u8; 4];
-    h.iter_mut().zip(data).for_each(|(h, b)| *h = *b);
-    let [number, layer, attribute, dependency_count] = h;
-    let kind = UnitType::from_number(number);
-    let mut unit = Unit {
-        number,
-        kind,
-        layer,
-        attribute: Attribute::from_number(attribute).filter(|_| kind.is_some()),
-        attribute_number: attribute,
-        offset,
-        payload_offset: offset + data.len(),
-        size: data.len(),
-        payload: &[],
+    Ok(Unit {
+        number: 0,
+        kind: Some(GroupHeader),
+        layer: 0,
+        index: 0,
+        offset: HEAD,
+        size: header.len(),
+        payload: header,
+        crc: told,
         damage: None,
-        dependencies: Vec::new(),
-    };
-    let mut r = Reader::new(data);
-    if let Err(e) = body(&mut unit, &mut r, data, usize::from(dependency_count)) {
-        unit.damage = Some(e.at(offset, &format!("unit {index}")));
-    }
-    if told.is_some_and(|size| size != unit.size) || (told.is_some() && unit.damage.is_some()) {
-        unit.size = data.len();
-        let differ = || Error::bitstream(offset, format!("unit {index}"), "the size that the header tells");
-        unit.damage = unit.damage.or_else(|| Some(differ()));
-    }
-    unit
+    })
 }
 
-fn body<'a>(unit: &mut Unit<'a>, r: &mut Reader<'a>, data: &'a [u8], dependency_count: usize) -> Result<()> {
-    r.take(4)?;
-    unit.dependencies = r.take(dependency_count)?.to_vec();
-    let (mut length, mut crc) = (0, 0);
-    r.u32(&mut length)?;
-    let head = &data[..r.position()];
-    r.u32(&mut crc)?;
-    let payload_offset = r.position();
-    unit.payload = r.take(length as usize)?;
-    (unit.payload_offset, unit.size) = (unit.offset + payload_offset, r.position());
-    let computed = crc32(&[head, unit.payload]);
-    if crc == computed {
-        return Ok(());
-    }
-    let expected = format!("CRC-32 {computed:08x}, found {crc:08x}: the unit is damaged");
-    Err(Error::bitstream(0, "", expected))
-}
-
-/// Checks the rules of spec 3 for a unit behind those in `before`; returns what was expected if one is broken.
-fn check(unit: &Unit, before: &[Unit]) -> std::result::Result<(), String> {
-    let index = before.len();
-    if index >= UNITS_MAX {
-        return Err(format!("at most {UNITS_MAX} units in a group"));
-    }
-    if (index == 0) != (unit.kind == Some(GroupHeader)) {
-        return Err("unit 0, and no other, to be the group header".into());
-    }
-    if !unit.dependencies.is_sorted_by(|a, b| a < b) || unit.dependencies.iter().any(|d| usize::from(*d) >= index) {
-        return Err("dependencies on earlier units in increasing order".into());
-    }
-    let damaged = |d: &&u8| before[usize::from(**d)].damage.is_some();
-    if let Some(d) = unit.dependencies.iter().find(damaged) {
-        return Err(format!("sound units to depend on, but unit {d} is damaged"));
-    }
-    let sound = || before.iter().filter(|u| u.damage.is_none());
-    if sound().any(|u| u.layer > unit.layer) {
-        return Err("layers in increasing order".into());
-    }
-    let Some(kind) = unit.kind else { return Ok(()) };
-    let allowed = match kind {
-        Channels => 2..=6,
-        Trajectories => 1..=6,
-        LayerCorrection => 2..=4,
-        _ => 0..=0,
-    };
-    if !allowed.contains(&unit.attribute_number) || (kind, unit.attribute_number) == (LayerCorrection, 3) {
-        return Err(format!("an attribute of {allowed:?}, found {}", unit.attribute_number));
-    }
-    if sound().any(|u| (u.number, u.layer, u.attribute) == (unit.number, unit.layer, unit.attribute)) {
-        return Err("one unit of each type, layer and attribute".into());
-    }
-    Ok(())
-}
-
-/// Appends a unit without checks. `id`: type, layer and attribute; `dependencies`: indices of earlier units.
-pub fn write(out: &mut Vec<u8>, id: [u8; 3], dependencies: &[u8], payload: &[u8]) -> Result<()> {
-    let length = u32::try_from(payload.len()).map_err(|_| Error::Input("a unit of more than 4 GiB".into()))?;
-    let mut w = Writer([&id[..], &[dependencies.len() as u8]].concat());
-    w.0.extend_from_slice(dependencies);
-    w.0.extend_from_slice(&length.to_be_bytes());
-    let crc = crc32(&[&w.0, payload]);
-    w.0.extend_from_slice(&crc.to_be_bytes());
-    out.extend_from_slice(&w.0);
-    out.extend_from_slice(payload);
-    Ok(())
+/// The payload of a group: header, then units.
+pub fn write(header: &[u8], units: &[Vec<u8>]) -> Result<Vec<u8>> {
+    let mut w = Writer::default();
+    let mut length = u32::try_from(header.len()).map_err(|_| Error::Input("a header of more than 4 GiB".into()))?;
+    w.u32(&mut length)?;
+    w.u32(&mut crc32(&[header]))?;
+    w.0.extend_from_slice(header);
+    units.iter().for_each(|u| w.0.extend_from_slice(u));
+    Ok(w.0)
 }

@@ -21,7 +21,8 @@ const ESCAPE_MAX: u32 = 25;
 /// Weights of the neighbours in the mean, nearest first.
 pub const NEAR_WEIGHT: [i32; NEAR] = [4, 3, 2, 2];
 
-/// Adaptive model of the values of one unit.
+/// Adaptive model of the values of trajectories.
+#[derive(Clone)]
 pub struct ValueModel {
     model: Model,
     /// A value that the spec forbids was read.
@@ -107,6 +108,11 @@ impl Expected {
 }
 
 impl ValueModel {
+    /// As of `Model`.
+    pub fn settle(&mut self) {
+        self.model.settle();
+    }
+
     pub fn new(classes: usize) -> Self {
         ValueModel {
             model: Model::new(classes * 230 * SLOTS, classes * 675 * SLOTS, classes * SLOTS),

@@ -6,8 +6,10 @@ use common::{Random, group, small};
 use gsv::decode::{Decoding, decode_group, decode_units};
 use gsv::encode::encode_group;
 use gsv::error::Error;
+use gsv::header::Header;
 use gsv::levels::Level;
-use gsv::unit::{self, ALL_LAYERS};
+use gsv::unit::UnitType::Tile;
+use gsv::unit::{self, ALL_LAYERS, Entry};
 
 fn level() -> Level {
     Level::get(1).unwrap()
@@ -33,8 +35,7 @@ fn any_truncation_is_noticed() {
     let payload = encode_group(&small(), None).unwrap();
     for n in 0..payload.len() {
         match decode_group(&payload[..n], &Decoding::at(&level())) {
-            // what is left may be whole units: then one is missing, unless only the optional last one is
-            Ok(g) => assert!(g.lifetimes.is_none()),
+            Ok(_) => panic!("{n} bytes are a group"),
             Err(Error::Bitstream { offset, .. }) => assert!(offset <= n as u64),
             Err(e) => panic!("{e}"),
         }
@@ -107,7 +108,7 @@ fn limits_come_before_memory() {
             other => panic!("{part}: {other:?}"),
         }
     };
-    g.header.layers[0].count = u32::MAX;
+    g.header.layers[0].count = 65_537;
     over(&g, "Gaussians");
     g = small();
     g.header.frames = 65;
@@ -121,9 +122,7 @@ fn limits_come_before_memory() {
 fn header_only(g: &gsv::group::Group) -> Vec<u8> {
     let mut w = gsv::fields::Writer::default();
     g.header.clone().fields(&mut w, &mut Vec::new(), None).unwrap();
-    let mut out = Vec::new();
-    unit::write(&mut out, [0; 3], &[], &w.0).unwrap();
-    out
+    unit::write(&w.0, &[]).unwrap()
 }
 
 /// Many trajectories from a few bytes: the cap on symbols is enforced during decoding.
@@ -147,58 +146,93 @@ fn symbols_are_counted_while_they_grow() {
 #[test]
 fn later_versions() {
     let payload = encode_group(&small(), None).unwrap();
-    let mut header = unit::split(&payload, ALL_LAYERS).unwrap()[0].payload.to_vec();
+    let header = unit::split(&payload, ALL_LAYERS).unwrap()[0].payload.to_vec();
     for (flags, part) in [
-        (1, "refers to"),
         (3, "reserved flags"),
         (9, "reserved flags"),
-        (16, "reserved flags"),
+        (4, "reserved flags"),
+        (32, "reserved flags"),
     ] {
-        header[2] = flags | header[2] & 4;
-        let mut bad = Vec::new();
-        unit::write(&mut bad, [0; 3], &[], &header).unwrap();
+        let mut header = header.clone();
+        header[2] = flags;
+        let bad = unit::write(&header, &[]).unwrap();
         let message = decode_group(&bad, &Decoding::at(&level())).unwrap_err().to_string();
         assert!(message.contains(part), "{message}");
     }
-    for (number, part) in [(7, ""), (8, "announces"), (10, ""), (255, "")] {
-        let mut more = payload.clone();
-        unit::write(&mut more, [number, 0, 0], &[], b"later").unwrap();
-        match decode_group(&more, &Decoding::at(&level())) {
-            Ok(_) => assert!(part.is_empty(), "{number}"),
+    let later = |number: u8, layer: u8, index: u16| Entry {
+        number,
+        layer,
+        index,
+        ..Entry::new((Tile, 0, 0), b"").unwrap()
+    };
+    for (entry, part) in [
+        (later(5, 0, 9), ""),
+        (later(255, 3, 0), ""),
+        (later(0, 0, 0), "no second"),
+        (later(1, 0, 9), "announces"),
+        (later(1, 0, 0), "one unit of each"),
+        (later(2, 0, 1), "index of 0"),
+        (later(4, 0, 3), "attribute 2 or 4"),
+    ] {
+        match decode_group(&with_directory(|units| units.push(entry)), &Decoding::at(&level())) {
+            Ok(_) => assert!(part.is_empty(), "{entry:?}"),
             Err(e) => assert!(!part.is_empty() && e.to_string().contains(part), "{e}"),
         }
     }
 }
 
+/// The small group with another directory.
+fn with_directory(edit: impl Fn(&mut Vec<Entry>)) -> Vec<u8> {
+    let payload = encode_group(&small(), None).unwrap();
+    let units = unit::split(&payload, ALL_LAYERS).unwrap();
+    let (_, mut directory) = Header::open(units[0].payload).unwrap();
+    edit(&mut directory);
+    let mut w = gsv::fields::Writer::default();
+    small().header.fields(&mut w, &mut directory, None).unwrap();
+    let bodies: Vec<Vec<u8>> = units[1..].iter().map(|u| u.payload.to_vec()).collect();
+    unit::write(&w.0, &bodies).unwrap()
+}
+
 /// Each rule on units.
 #[test]
 fn broken_units() {
-    let payload = encode_group(&small(), None).unwrap();
-    let first = unit::split(&payload, ALL_LAYERS).unwrap()[0].size;
-    let with = |number, attribute, dependencies: &[u8], part: &str| {
-        let mut bad = header_only(&small());
-        unit::write(&mut bad, [number, 0, attribute], dependencies, b"").unwrap();
-        let message = decode_group(&bad, &Decoding::at(&level())).unwrap_err().to_string();
+    let fails = |payload: &[u8], part: &str| {
+        let message = decode_group(payload, &Decoding::at(&level())).unwrap_err().to_string();
         assert!(message.contains(part), "{message}");
     };
-    with(0, 0, &[], "no other");
-    with(1, 0, &[1], "earlier units");
-    with(1, 0, &[0, 0], "earlier units");
-    with(1, 3, &[], "attribute of");
-    with(2, 2, &[], "found none");
-    with(1, 0, &[], "a node_positions unit");
-    let twice = [payload.as_slice(), &payload[first..]].concat();
-    assert!(
-        decode_group(&twice, &Decoding::at(&level()))
-            .unwrap_err()
-            .to_string()
-            .contains("one unit of each")
+    fails(
+        &with_directory(|units| units[0].layer = 1),
+        "layers in increasing order",
     );
-    assert!(decode_group(&[], &Decoding::at(&level())).is_err());
-    assert!(
-        decode_group(&payload[first..], &Decoding::at(&level()))
-            .unwrap_err()
-            .to_string()
-            .contains("group header")
+    fails(&with_directory(|units| units[1].size += 1), "CRC-32");
+    fails(&with_directory(|units| _ = units.pop()), "the end of the group");
+    fails(
+        &with_directory(|units| units.last_mut().unwrap().size += 1),
+        "more bytes",
     );
+    fails(
+        &with_directory(|units| units[0].number = 77),
+        "a unit tile 0, found none",
+    );
+    fails(&[], "4 more bytes");
+    fails(&[0; 8], "2 more bytes");
+    fails(&[1; 8], "more bytes");
+}
+
+/// Each rule on the streams of a tile.
+#[test]
+fn broken_tiles() {
+    let fails = |edit: fn(&mut Vec<u8>), part: &str| {
+        let payload = encode_group(&small(), None).unwrap();
+        let mut units = unit::split(&payload, ALL_LAYERS).unwrap();
+        let mut tile = units[1].payload.to_vec();
+        edit(&mut tile);
+        units[1].payload = &tile;
+        let message = decode_units(&units, &Decoding::at(&level())).unwrap_err().to_string();
+        assert!(message.contains(part) && message.contains("tile 0"), "{message}");
+    };
+    fails(|t| t.clear(), "the size of a stream");
+    fails(|t| t[..6].fill(0xFF), "of at most 5 bytes");
+    fails(|t| t[0] = 0x7F, "found");
+    fails(|t| t.extend([1; 8]), "lifetimes: expected the payload to end");
 }

@@ -2,13 +2,13 @@
 
 mod common;
 
-use common::{Random, Shape, group, layered, predicted, shape, small, with};
+use common::{Random, Shape, group, layered, predicted, shape, small, tiled, with};
 use gsv::decode::{Decoding, decode_group};
 use gsv::encode::encode_group;
 use gsv::error::Error;
 use gsv::evaluate::Evaluator;
 use gsv::group::Group;
-use gsv::levels::Level;
+use gsv::levels::{LEVELS, Level};
 use gsv::parametric::Frame;
 use gsv::unit::{self, ALL_LAYERS};
 use proptest::prelude::*;
@@ -28,8 +28,8 @@ fn decoded(g: &Group) -> Group {
 fn same(a: &Group, b: &Group) {
     assert_eq!(a.header, b.header);
     assert_eq!(
-        (&a.layers, &a.parents, &a.corrections),
-        (&b.layers, &b.parents, &b.corrections)
+        (&a.layers, &a.tiles, &a.parents, &a.corrections),
+        (&b.layers, &b.tiles, &b.parents, &b.corrections)
     );
     assert_eq!(a.positions, b.positions);
     assert_eq!(a.channels, b.channels);
@@ -85,9 +85,9 @@ proptest! {
             prop_assert_eq!(&prefix, &decode_group(&payload[..end], &how).unwrap());
             let mut cut = payload.clone();
             if end < cut.len() {
-                cut[end + 4] ^= 1; // damage behind the prefix does not matter
+                cut[end] ^= 1; // damage behind the prefix does not matter
                 prop_assert_eq!(&prefix, &decode_group(&cut, &how).unwrap());
-                cut.truncate(end + 9);
+                cut.truncate(end + 1);
                 prop_assert_eq!(&prefix, &decode_group(&cut, &how).unwrap());
             }
             let range = g.range(0..layers);
@@ -117,6 +117,60 @@ proptest! {
     }
 }
 
+/// Any tiles alone are what they are in the whole group, also where the other bytes are not there; so are those of a group
+/// that is predicted from a part.
+#[test]
+fn tiles_come_alone() {
+    let g = group(&tiled());
+    let later = predicted(&g, &tiled());
+    let payload = encode_group(&g, None).unwrap();
+    let second = encode_group(&later, Some(&g)).unwrap();
+    let whole = decode_group(&payload, &Decoding::at(&Level::get(1).unwrap())).unwrap();
+    let mut r = Random(3);
+    for _ in 0..30 {
+        let wanted: Vec<Vec<bool>> = g
+            .tiles
+            .iter()
+            .map(|t| t.iter().map(|_| r.below(3) == 0).collect())
+            .collect();
+        let how = Decoding {
+            tiles: Some(&wanted),
+            ..Decoding::at(&LEVELS[0])
+        };
+        let mut holes = payload.clone();
+        let lead = |u: &unit::Unit| u.index == 0 || wanted[usize::from(u.layer)][usize::from(u.index)];
+        for u in unit::split(&payload, ALL_LAYERS).unwrap() {
+            if u.kind == Some(unit::UnitType::Tile) && !lead(&u) {
+                holes[u.offset..u.offset + u.size].fill(0);
+            }
+        }
+        let part = decode_group(&holes, &how).unwrap();
+        part.validate(None).unwrap();
+        for (k, own) in wanted.iter().enumerate() {
+            for (t, asked) in own.iter().enumerate() {
+                let (mine, all) = (part.tile_range(k, t), whole.tile_range(k, t));
+                assert_eq!(mine.len(), if t == 0 || *asked { all.len() } else { 0 });
+                if !mine.is_empty() {
+                    assert_eq!(part.positions[mine.clone()], whole.positions[all.clone()]);
+                    assert_eq!(part.rotations[mine.clone()], whole.rotations[all.clone()]);
+                    assert_eq!(
+                        part.channels[1][3 * mine.start..3 * mine.end],
+                        whole.channels[1][3 * all.start..3 * all.end]
+                    );
+                    assert!(
+                        mine.clone()
+                            .zip(all)
+                            .all(|(i, j)| part.trajectories[0].get(i) == whole.trajectories[0].get(j))
+                    );
+                }
+            }
+        }
+        let from_part = decode_group(&second, &with(&part)).unwrap();
+        from_part.validate(Some(&part)).unwrap();
+        assert!(from_part.positions.len() < later.positions.len() || part.positions.len() == whole.positions.len());
+    }
+}
+
 #[test]
 fn all_points_in_one_place() {
     let mut g = group(&Shape {
@@ -126,6 +180,8 @@ fn all_points_in_one_place() {
         lifetimes: false,
         ..tiny()
     });
+    g.header.tile_side_log2 = 6;
+    g.divide(None);
     for corner in [0, 63] {
         g.positions.fill([corner; 3]);
         same(&g, &decoded(&g));
@@ -185,12 +241,16 @@ fn impossible_groups_are_refused() {
     refused(|g| g.header.grid_bits = 22, "grid_bits");
     refused(|g| g.header.grid_step = f32::NAN, "grid_step");
     refused(|g| g.positions.truncate(11), "positions");
-    refused(|g| g.header.layers[0].count += 1, "layers that the header");
+    refused(|g| g.header.layers[0].count += 1, "layers and tiles that the header");
+    refused(|g| g.header.tile_side_log2 = 3, "tile_side_log2");
+    refused(|g| g.header.tiles[0][0].bounds[0] = u16::MAX, "bounds");
+    refused(|g| g.tiles[0][0] -= 1, "make up the layers");
     refused(|g| g.header.layers.clear(), "1 to 16 layers");
     refused(|g| g.channels[1][0] = (1 << 24) + 1, "quats");
     refused(|g| g.header.trajectories[0].coefficients = 6, "coefficients");
     refused(|g| g.header.nodes.neighbors = 9, "neighbors");
     refused(|g| g.lifetimes = Some(vec![[3, 3]; 12]), "lifetime of Gaussian 0");
+    refused(|g| g.lifetimes = None, "lifetimes as the header");
     refused(|g| g.header.frames = 300, "frames, level 4");
 }
 

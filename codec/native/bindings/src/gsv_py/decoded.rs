@@ -3,15 +3,15 @@
 use super::group_from::group_from;
 use super::parametric::{canonical, carried, frame};
 use super::quantized_from::{parents_into, quantized};
+use super::report;
 use super::values::{bytes_of, raise};
 use gsv::attributes::sh_coefficients;
 use gsv::conformance::Damage;
-use gsv::decode::{Decoding, decode_damaged, decode_group};
+use gsv::decode::{Decoding, decode_damaged, decode_group, read_header};
 use gsv::evaluate::Evaluator;
 use gsv::group::Group;
-use gsv::hilbert_layout::HilbertLayout;
 use gsv::levels::Level;
-use gsv::unit::{self, ALL_LAYERS};
+use gsv::unit::{ALL_LAYERS, UnitType};
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods};
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
@@ -21,16 +21,16 @@ use pyo3::types::{PyDict, PyList};
 #[pyclass(frozen, module = "gscodec._native")]
 pub struct DecodedGroup {
     evaluator: Evaluator,
-    units: Vec<(String, Option<&'static str>, u8, usize, usize)>,
+    units: Vec<report::UnitReport>,
     damage: Vec<Damage>,
 }
 
 #[pymethods]
 impl DecodedGroup {
     /// `strict`: damage is an error; otherwise `damage` lists what was not decoded. `reference`: the group that a predicted
-    /// one refers to. `layers`: only so many, the payload may end behind them.
+    /// one refers to. `layers`: only so many, the payload may end behind them. `tiles`: of each layer, which tiles; None: all.
     #[new]
-    #[pyo3(signature = (payload, level, strict = true, *, reference = None, layers = ALL_LAYERS))]
+    #[pyo3(signature = (payload, level, strict = true, *, reference = None, layers = ALL_LAYERS, tiles = None))]
     fn new(
         py: Python,
         payload: &Bound<PyAny>,
@@ -38,6 +38,7 @@ impl DecodedGroup {
         strict: bool,
         reference: Option<Py<DecodedGroup>>,
         layers: usize,
+        tiles: Option<Vec<Vec<bool>>>,
     ) -> PyResult<Self> {
         let bytes = bytes_of(payload)?.as_slice()?.to_vec(); // ours while the GIL is released
         let reference = reference.as_ref().map(|r| r.get().group());
@@ -46,19 +47,16 @@ impl DecodedGroup {
                 level: &Level::get(level)?,
                 reference,
                 layers: layers.max(1),
+                tiles: tiles.as_deref(),
             };
             let (group, damage) = if strict {
                 (decode_group(&bytes, &how)?, Vec::new())
             } else {
                 decode_damaged(&bytes, &how)?
             };
-            let units = unit::scan(&bytes, how.layers)?;
-            let label = |u: &unit::Unit| u.kind.map_or("unknown", |k| k.name()).to_string();
-            let units = units
-                .iter()
-                .map(|u| (label(u), u.attribute.map(|a| a.name()), u.layer, u.offset, u.size));
+            let header = read_header(&bytes, &how)?;
             Ok(DecodedGroup {
-                units: units.collect(),
+                units: report::units(&bytes, &header, reference.map(|r| &r.header), how.layers)?,
                 damage,
                 evaluator: Evaluator::new(group),
             })
@@ -151,62 +149,27 @@ impl DecodedGroup {
 
     /// What the payload consists of.
     fn units<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
-        let list = PyList::empty(py);
-        for (kind, attribute, layer, offset, bytes) in &self.units {
-            let d = PyDict::new(py);
-            d.set_item("type", kind)?;
-            d.set_item("attribute", attribute)?;
-            d.set_item("layer", layer)?;
-            d.set_item("offset", offset)?;
-            d.set_item("bytes", bytes)?;
-            list.append(d)?;
-        }
-        Ok(list)
+        report::units_into(py, &self.units)
     }
 
-    /// Units that are damaged, or missing where others are (unit: None): dicts of unit, type, attribute, message.
+    /// The tiles of each layer, as dicts of gaussians (decoded), low, high: the corners of the box where they show, world units.
+    fn tiles<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
+        report::tiles(py, self.group())
+    }
+
+    /// Units that are damaged, or need one that is: dicts of unit, type, layer, tile, message.
     fn damage<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
         let list = PyList::empty(py);
         for damage in &self.damage {
             let d = PyDict::new(py);
             d.set_item("unit", damage.unit)?;
             d.set_item("type", damage.kind.map_or("unknown", |k| k.name()))?;
-            d.set_item("attribute", damage.attribute.map(|a| a.name()))?;
             d.set_item("layer", damage.layer)?;
+            d.set_item("tile", (damage.kind == Some(UnitType::Tile)).then_some(damage.index))?;
             d.set_item("message", &damage.message)?;
             list.append(d)?;
         }
         Ok(list)
-    }
-
-    /// Attribute maps (spec 7.2): name of the channel, behind that of the layer if there are several -> [H, W] i32; cells
-    /// without a Gaussian are 0.
-    fn maps<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let group = self.group();
-        let d = PyDict::new(py);
-        for k in 0..group.layers.len() {
-            let range = group.range(k..k + 1);
-            let map = HilbertLayout::new(range.len());
-            let layer = if group.layers.len() > 1 {
-                format!("layer{k}_")
-            } else {
-                String::new()
-            };
-            let set = |name: String, value: &dyn Fn(usize) -> i32| {
-                let cells = map.arrange(|i| value(range.start + i)).into_pyarray(py);
-                d.set_item(layer.clone() + &name, cells.reshape([map.height, map.width])?)
-            };
-            for a in 0..3 {
-                set(format!("means_{a}"), &|i| group.positions[i][a] as i32)?;
-            }
-            for (a, values) in group.header.attributes().iter().zip(&group.channels) {
-                let channels = a.channels(group.header.sh_degree);
-                for c in 0..channels {
-                    set(format!("{}_{c}", a.name()), &|i| values[i * channels + c])?;
-                }
-            }
-        }
-        Ok(d)
     }
 }
 

@@ -4,7 +4,7 @@ use super::values::{array, invalid, item, optional, points, value};
 use gsv::attributes::{Attribute, sh_coefficients};
 use gsv::companding::{Companding, PIECES};
 use gsv::group::{BIRTH, Group};
-use gsv::header::{Header, LayerHeader, NodeHeader, Scale, TrajectoryHeader};
+use gsv::header::{Header, LayerHeader, NodeHeader, Scale, TILE_SIDES, TrajectoryHeader};
 use gsv::trajectories::Trajectories;
 use numpy::{PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
 use pyo3::prelude::*;
@@ -19,6 +19,7 @@ pub fn group_from(d: &Bound<PyAny>, reference: Option<&Group>) -> PyResult<Group
         grid_step: value(d, "grid_step")?,
         grid_bits: value(d, "grid_bits")?,
         sh_degree: sh_degree(&channels)?,
+        tile_side_log2: value(d, "tile_side_log2")?,
         ..Header::default()
     };
     let mut group = Group {
@@ -35,13 +36,21 @@ pub fn group_from(d: &Bound<PyAny>, reference: Option<&Group>) -> PyResult<Group
         nodes_from(&n, &mut header, &mut group)?;
     }
     group.lifetimes = lifetimes_from(d)?;
+    header.lifetimes = group.lifetimes.is_some();
     if header.reference > 0 && !reference.is_some_and(|r| same_parameters(&r.header, &header)) {
         return invalid(
             "a predicted group: expected its reference, with the same grid, steps, offsets, companding and exponents"
                 .into(),
         );
     }
+    if !TILE_SIDES.contains(&header.tile_side_log2) {
+        return invalid(format!(
+            "tile_side_log2: expected 4 to 7, got {}",
+            header.tile_side_log2
+        ));
+    }
     group.header = header;
+    group.divide(reference);
     Ok(group)
 }
 
@@ -80,7 +89,7 @@ fn lifetimes_from(d: &Bound<PyAny>) -> PyResult<Option<Vec<[u16; 2]>>> {
 /// Whether a predicted group of header `own` has the parameters of its reference.
 fn same_parameters(reference: &Header, own: &Header) -> bool {
     let (r, h) = (reference, own);
-    (r.origin, r.grid_step, r.grid_bits) == (h.origin, h.grid_step, h.grid_bits)
+    (r.origin, r.grid_step, r.grid_bits, r.tile_side_log2) == (h.origin, h.grid_step, h.grid_bits, h.tile_side_log2)
         && (&r.scales, &r.scale_exponents) == (&h.scales, &h.scale_exponents)
         && (&r.shifts, &r.companding) == (&h.shifts, &h.companding)
 }

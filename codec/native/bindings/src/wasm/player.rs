@@ -74,6 +74,7 @@ impl Player {
                     .and_then(Option::as_ref)
                     .map(Evaluator::group),
                 layers,
+                tiles: None,
             };
             decode_group(&self.input, &how)
         });

@@ -74,9 +74,9 @@ impl Config {
     }
 
     fn fields<F: Fields>(&mut self, f: &mut F) -> Result<()> {
-        let mut version = 3;
+        let mut version = 4;
         f.u8(&mut version)?;
-        f.must(version == 3, || format!("configuration_version 3, found {version}"))?;
+        f.must(version == 4, || format!("configuration_version 4, found {version}"))?;
         f.u8(&mut self.level)?;
         f.u32(&mut self.frame_duration)?;
         f.must(self.frame_duration > 0, || "frame_duration > 0, found 0".into())?;

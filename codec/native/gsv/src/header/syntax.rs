@@ -1,16 +1,17 @@
 //! The syntax of the group header (spec 4): one description reads and writes the fields, and checks them.
 
-use super::{Header, LAYERS_MAX, LayerHeader, SHIFT_MAX, Scale, TrajectoryHeader};
+use super::{Header, LAYERS_MAX, LayerHeader, SHIFT_MAX, Scale, TILE_SIDES, TileHeader, TrajectoryHeader};
 use crate::attributes::Attribute;
 use crate::blend::NEIGHBORS_MAX;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader};
-use crate::hilbert_layout;
+use crate::levels::LEVELS;
+use crate::unit::Entry;
 
 const FLAG_PREDICTED: u8 = 1;
 const FLAG_COMPANDING: u8 = 2;
-const FLAG_UNIT_SIZES: u8 = 4;
 const FLAG_LAYER_SHIFTS: u8 = 8;
+const FLAG_LIFETIMES: u8 = 16;
 
 impl Header {
     /// Parses the payload of unit 0. `reference`: the header of the group that a predicted one refers to.
@@ -25,17 +26,16 @@ impl Header {
         Ok(h)
     }
 
-    /// The first fields of a header: the reference (groups back, 0: independent), and the sizes of the units behind the
-    /// header.
-    pub fn open(payload: &[u8]) -> Result<(u16, Vec<u32>)> {
-        let (mut h, mut sizes) = (Header::default(), Vec::new());
-        h.opening(&mut Reader::new(payload), &mut sizes)?;
-        Ok((h.reference, sizes))
+    /// The first fields of a header: the reference (groups back, 0: independent), and the directory of the units.
+    pub fn open(payload: &[u8]) -> Result<(u16, Vec<Entry>)> {
+        let (mut h, mut units) = (Header::default(), Vec::new());
+        h.opening(&mut Reader::new(payload), &mut units)?;
+        Ok((h.reference, units))
     }
 
-    /// Reads or writes all fields, and checks them. `sizes`: sizes of the units behind the header; empty: not in the header.
-    pub fn fields<F: Fields>(&mut self, f: &mut F, sizes: &mut Vec<u32>, reference: Option<&Header>) -> Result<()> {
-        self.opening(f, sizes)?;
+    /// Reads or writes all fields, and checks them. `units`: the directory.
+    pub fn fields<F: Fields>(&mut self, f: &mut F, units: &mut Vec<Entry>, reference: Option<&Header>) -> Result<()> {
+        self.opening(f, units)?;
         if self.reference > 0 {
             let Some(r) = reference.filter(|r| r.reference == 0) else {
                 return f.fail("the independent group that this predicted one refers to".into());
@@ -44,7 +44,9 @@ impl Header {
             *self = Header {
                 frames: self.frames,
                 reference: self.reference,
+                lifetimes: self.lifetimes,
                 layers: std::mem::take(&mut self.layers),
+                tiles: std::mem::take(&mut self.tiles),
                 trajectories: std::mem::take(&mut self.trajectories),
                 nodes: self.nodes,
                 ..r.clone()
@@ -64,15 +66,16 @@ impl Header {
             }
         }
         self.trajectories(f)?;
-        self.nodes(f)
+        self.nodes(f)?;
+        self.tiles(f, reference)
     }
 
-    fn opening<F: Fields>(&mut self, f: &mut F, sizes: &mut Vec<u32>) -> Result<()> {
+    fn opening<F: Fields>(&mut self, f: &mut F, units: &mut Vec<Entry>) -> Result<()> {
         f.u16(&mut self.frames)?;
         f.must(self.frames > 0, || "frames >= 1, found 0".into())?;
         let mut flags = if self.reference > 0 { FLAG_PREDICTED } else { 0 };
-        if !sizes.is_empty() {
-            flags |= FLAG_UNIT_SIZES;
+        if self.lifetimes {
+            flags |= FLAG_LIFETIMES;
         }
         if self.reference == 0 && !self.shifts.is_empty() {
             flags |= FLAG_LAYER_SHIFTS;
@@ -82,12 +85,13 @@ impl Header {
         }
         f.u8(&mut flags)?;
         let known = match flags & FLAG_PREDICTED {
-            0 => FLAG_UNIT_SIZES | FLAG_LAYER_SHIFTS | FLAG_COMPANDING,
-            _ => FLAG_UNIT_SIZES | FLAG_PREDICTED,
+            0 => FLAG_LIFETIMES | FLAG_LAYER_SHIFTS | FLAG_COMPANDING,
+            _ => FLAG_LIFETIMES | FLAG_PREDICTED,
         };
         f.must(flags & !known == 0, || {
             format!("reserved flags to be 0, found {flags:#04x}")
         })?;
+        self.lifetimes = flags & FLAG_LIFETIMES != 0;
         if flags & FLAG_LAYER_SHIFTS != 0 {
             self.shifts.resize(self.layers.len().max(1), Default::default());
         }
@@ -98,13 +102,10 @@ impl Header {
             f.u16(&mut self.reference)?;
             f.must(self.reference > 0, || "a reference >= 1, found 0".into())?;
         }
-        if flags & FLAG_UNIT_SIZES != 0 {
-            let mut count = sizes.len() as u8;
-            f.u8(&mut count)?;
-            sizes.resize(usize::from(count), 0);
-            sizes.iter_mut().try_for_each(|size| f.u32(size))?;
-        }
-        Ok(())
+        let mut count = units.len().min(usize::from(u16::MAX)) as u16;
+        f.u16(&mut count)?;
+        units.resize(usize::from(count), Entry::default());
+        units.iter_mut().try_for_each(|unit| unit.fields(f))
     }
 
     fn grid<F: Fields>(&mut self, f: &mut F) -> Result<()> {
@@ -132,10 +133,6 @@ impl Header {
         self.layers.resize(usize::from(n), LayerHeader::default());
         for (k, layer) in self.layers.iter_mut().enumerate() {
             f.u32(&mut layer.count)?;
-            let width = hilbert_layout::width_log2(layer.count as usize) as u8;
-            let mut found = width;
-            f.u8(&mut found)?;
-            f.must(found == width, || format!("map_width_log2 {width}, found {found}"))?;
             let Some(before) = reference.and_then(|r| r.layers.get(k)) else {
                 layer.births = layer.count;
                 continue;
@@ -148,6 +145,52 @@ impl Header {
                     before.count
                 )
             })?;
+        }
+        if reference.is_none() {
+            f.u8(&mut self.tile_side_log2)?;
+            let (found, sides) = (self.tile_side_log2, TILE_SIDES);
+            f.must(sides.contains(&found), || {
+                format!("tile_side_log2 of {} to {}, found {found}", sides.start(), sides.end())
+            })?;
+        }
+        Ok(())
+    }
+
+    /// The index of tiles, whose length follows from the layers and the reference.
+    fn tiles<F: Fields>(&mut self, f: &mut F, reference: Option<&Header>) -> Result<()> {
+        let most = LEVELS[LEVELS.len() - 1].gaussians;
+        if self.count() > u64::from(most) {
+            let found = format!("{} Gaussians, no level allows more than {most}", self.count());
+            return Err(Error::limit("group header", found));
+        }
+        let cells = self.tile_cells();
+        self.tiles.resize(self.layers.len(), Vec::new());
+        for (k, (tiles, layer)) in self.tiles.iter_mut().zip(&self.layers).enumerate() {
+            let before = reference.and_then(|r| r.tiles.get(k)).map_or(&[][..], Vec::as_slice);
+            let mut survivors = layer.survivors();
+            for (t, known) in before.iter().enumerate() {
+                let tile = slot(tiles, t);
+                f.u32(&mut tile.count)?;
+                let (count, most) = (tile.count, known.count.min(survivors));
+                f.must(count <= most, || {
+                    format!("at most {most} survivors in tile {t}, found {count}")
+                })?;
+                survivors -= count;
+                tile.bounds(f)?;
+            }
+            f.must(survivors == 0, || {
+                format!("{survivors} more survivors in the tiles of layer {k}")
+            })?;
+            let mut births = layer.births;
+            let mut t = before.len();
+            while births > 0 {
+                let tile = slot(tiles, t);
+                tile.count = births.min(cells);
+                births -= tile.count;
+                tile.bounds(f)?;
+                t += 1;
+            }
+            tiles.truncate(t);
         }
         Ok(())
     }
@@ -234,6 +277,25 @@ impl Header {
         coefficients(f, n.coefficients, self.frames)?;
         f.step(&mut n.rotation_step, "rotation_step")?;
         f.step(&mut n.translation_step, "translation_step")
+    }
+}
+
+/// Tile `t`, added if it is the next one.
+fn slot(tiles: &mut Vec<TileHeader>, t: usize) -> &mut TileHeader {
+    if t >= tiles.len() {
+        tiles.push(TileHeader::default());
+    }
+    let last = tiles.len() - 1;
+    &mut tiles[t.min(last)]
+}
+
+impl TileHeader {
+    fn bounds<F: Fields>(&mut self, f: &mut F) -> Result<()> {
+        self.bounds.iter_mut().try_for_each(|v| f.u16(v))?;
+        let [a, b, c, d, e, g] = self.bounds;
+        f.must(a <= d && b <= e && c <= g, || {
+            format!("bounds whose lower corner is below, found {:?}", [a, b, c, d, e, g])
+        })
     }
 }
 

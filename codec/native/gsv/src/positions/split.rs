@@ -17,16 +17,14 @@ pub fn seen(k: usize, count: u32) -> Seen {
     u64::from(count.min(255)) << (8 * k)
 }
 
-pub struct SplitCoder<'a, C> {
-    pub c: &'a mut C,
-    model: Model,
+/// A new model of splits.
+pub fn model() -> Model {
+    Model::new(BUCKETS * TREE * EVIDENCE, BUCKETS * TREE * 3 * 7 * 8, BUCKETS * TREE)
 }
 
-impl<'a, C: Bins> SplitCoder<'a, C> {
-    pub fn new(c: &'a mut C) -> Self {
-        let model = Model::new(BUCKETS * TREE * EVIDENCE, BUCKETS * TREE * 3 * 7 * 8, BUCKETS * TREE);
-        SplitCoder { c, model }
-    }
+pub struct SplitCoder<'a, C> {
+    pub c: &'a mut C,
+    pub model: &'a mut Model,
 }
 
 /// The inputs of the contexts of the seven splits of a node.

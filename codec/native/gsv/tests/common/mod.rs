@@ -31,7 +31,7 @@ pub struct Shape {
 pub fn shape() -> impl Strategy<Value = Shape> {
     let sizes = (
         prop_oneof![
-            prop_oneof![Just(0usize), Just(1), 2..200usize].prop_map(|n| vec![n]),
+            prop_oneof![Just(0usize), Just(1), 2..700usize].prop_map(|n| vec![n]),
             proptest::collection::vec(0..60usize, 1..5),
         ],
         1..40u16,
@@ -121,6 +121,8 @@ pub fn group(s: &Shape) -> Group {
         grid_bits: s.bits,
         sh_degree: s.sh_degree,
         layers: s.counts.iter().map(|n| layer(*n, *n)).collect(),
+        tile_side_log2: 4,
+        lifetimes: s.lifetimes,
         scale_exponents: [[0, 40, -8], [20, 0, 0], [127, -128, 3]],
         companding: (s.counts.len() > 1).then(|| std::array::from_fn(|c| companding(c as f32))),
         ..Header::default()
@@ -143,7 +145,17 @@ pub fn group(s: &Shape) -> Group {
     }
     motion(&mut g, &mut header, s, &mut r);
     g.header = header;
+    divide(&mut g, None, &mut r);
     g
+}
+
+/// Tiles with any bounds.
+fn divide(g: &mut Group, reference: Option<&Group>, r: &mut Random) {
+    g.divide(reference);
+    for tile in g.header.tiles.iter_mut().flatten() {
+        let (a, b) = (r.next() as u16, r.next() as u16);
+        tile.bounds = [a.min(b), 0, 9, a.max(b), 0, u16::MAX];
+    }
 }
 
 fn companding(low: f32) -> Companding {
@@ -238,10 +250,12 @@ pub fn predicted(reference: &Group, s: &Shape) -> Group {
         layers: g.layers.clone(),
         trajectories: Vec::new(),
         nodes: NodeHeader::default(),
+        lifetimes: s.lifetimes,
         ..before.clone()
     };
     motion(&mut g, &mut header, s, &mut r);
     g.header = header;
+    divide(&mut g, Some(reference), &mut r);
     g
 }
 
@@ -265,6 +279,16 @@ pub fn layered() -> Shape {
         lifetimes: true,
         moving: 0xFF,
         seed: 11,
+    }
+}
+
+/// The shape of a group of several tiles in its first layer.
+pub fn tiled() -> Shape {
+    Shape {
+        counts: vec![900, 300],
+        seed: 19,
+        moving: 0b110,
+        ..layered()
     }
 }
 
