@@ -1,9 +1,11 @@
-//! The unit parser: any bytes as a group payload, alone or with a group to refer to, all of its tiles or some. Damaged or not, what is decoded is a group.
+//! The header and unit parsers: any bytes as a group payload, alone or with a group to refer to, all of its tiles or some.
+//! Every other input is a header that gets its checksum, and what follows it. Damaged or not, what is decoded is a group.
 #![no_main]
 
 use gsv::decode::{Decoding, decode_damaged, decode_group, reference_of};
 use gsv::group::Group;
 use gsv::levels::LEVELS;
+use gsv::unit;
 use libfuzzer_sys::fuzz_target;
 use std::sync::LazyLock;
 
@@ -11,8 +13,10 @@ static REFERENCE: LazyLock<Group> = LazyLock::new(|| {
     decode_group(include_bytes!("../layered.bin"), &Decoding::at(&LEVELS[0])).expect("the seed is sound")
 });
 
-fuzz_target!(|input: (u8, &[u8])| {
-    let (how, data) = (input.0, input.1);
+fuzz_target!(|input: (u8, bool, Vec<u8>, &[u8])| {
+    let (how, sealed, header, rest) = input;
+    let payload = if sealed { unit::write(&header, &[rest.to_vec()]).expect("it is short") } else { rest.to_vec() };
+    let data = &payload[..];
     let wanted: Vec<Vec<bool>> = (0..3).map(|k| (0..8).map(|t| how >> 5 & 1 << (t + k) % 3 != 0).collect()).collect();
     let how = Decoding {
         reference: (how & 1 != 0).then(|| &*REFERENCE),

@@ -214,9 +214,11 @@ impl GroupDecoder<'_> {
                 return Ok(tiles); // lost with the reference, and so are those that start from it
             }
             let (tile, learned) = self.tile(k, t, &models)?;
-            learned
-                .into_iter()
-                .for_each(|(stream, model)| models.learn(stream, model));
+            if count > 1 {
+                learned
+                    .into_iter()
+                    .for_each(|(stream, model)| models.learn(stream, model));
+            }
             tiles[t] = tile;
         }
         let others: Vec<usize> = (0..count).filter(|t| !leading.contains(&Some(*t))).collect();

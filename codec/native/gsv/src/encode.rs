@@ -89,9 +89,11 @@ impl GroupEncoder<'_> {
         for (i, t) in leading.into_iter().enumerate() {
             if let Some(t) = t.filter(|_| !leading[..i].contains(&t)) {
                 let (payload, learned) = self.tile(k, t, &models);
-                learned
-                    .into_iter()
-                    .for_each(|(stream, model)| models.learn(stream, model));
+                if h.tiles[k].len() > 1 {
+                    learned
+                        .into_iter()
+                        .for_each(|(stream, model)| models.learn(stream, model));
+                }
                 coded.push((t, payload));
             }
         }
