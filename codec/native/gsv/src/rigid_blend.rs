@@ -190,7 +190,8 @@ fn dot(a: [f32; 4], b: [f32; 4]) -> f32 {
     (0..4).map(|i| a[i] * b[i]).sum()
 }
 
-fn matrix([w, x, y, z]: Quat) -> [[f32; 3]; 3] {
+/// The rotation matrix of a unit quaternion, row by row.
+pub fn matrix([w, x, y, z]: Quat) -> [[f32; 3]; 3] {
     [
         [
             1.0 - 2.0 * (y * y + z * z),

@@ -3,6 +3,7 @@
 use crate::evaluate::Evaluator;
 use crate::header::Header;
 use crate::parametric::Frame;
+use crate::rigid_blend;
 
 /// Corners of a box, world units.
 pub type Bounds = [[f32; 3]; 2];
@@ -52,27 +53,9 @@ const EMPTY: Bounds = [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]];
 
 /// Adds where Gaussian `i` shows: along each axis as far as its standard deviation and its opacity reach.
 fn extend([low, high]: &mut Bounds, f: &Frame, i: usize) {
-    let [w, x, y, z] = f.quats[i];
-    let rows = [
-        [
-            1.0 - 2.0 * (y * y + z * z),
-            2.0 * (x * y - w * z),
-            2.0 * (x * z + w * y),
-        ],
-        [
-            2.0 * (x * y + w * z),
-            1.0 - 2.0 * (x * x + z * z),
-            2.0 * (y * z - w * x),
-        ],
-        [
-            2.0 * (x * z - w * y),
-            2.0 * (y * z + w * x),
-            1.0 - 2.0 * (x * x + y * y),
-        ],
-    ];
     let opacity = 1.0 / (1.0 + (-f.logit_opacities[i]).exp());
     let reach = (2.0 * (opacity / ALPHA).ln()).max(0.0).sqrt();
-    for (a, row) in rows.iter().enumerate() {
+    for (a, row) in rigid_blend::matrix(f.quats[i]).iter().enumerate() {
         let axis = |c: usize| row[c] * f.log_scales[3 * i + c].exp();
         let deviation = (axis(0).powi(2) + axis(1).powi(2) + axis(2).powi(2)).sqrt();
         low[a] = low[a].min(f.means[i][a] - reach * deviation);
