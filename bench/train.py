@@ -19,6 +19,7 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,6 +32,9 @@ from gscodec.model.parametric_group import ParametricGroup
 from .drawn import Rig, animated_capture
 from .machine import update_entries
 from .still import still_share
+
+if TYPE_CHECKING:
+    from gscodec.encode.encode import EncodeReport
 
 RECIPES = ("gscodec", "alone", "v3")
 V3_PACKING = {"qp": 25, "raw": True}  # its default qp, and the better of its two scripts
@@ -163,9 +167,17 @@ def _ours(capture: Capture, frames: range, settings, encoding) -> Iterator[tuple
     own = part(capture, frames)
     groups, trained = sequence(own, settings)
     yield "model", trained, None, shown(groups)
-    size, decoded, seconds, quality = coded(own, groups, settings, encoding)
-    share, bits = still_share(groups[0], quality, training_cameras(own, len(groups[0]) // 2))
-    found = {"still_gaussians": round(share, 3), "still_bits": round(bits, 4), "coded_quality": round(quality, 2)}
+    size, decoded, seconds, report = coded(own, groups, settings, encoding)
+    share, bits = still_share(groups[0], report.quality, training_cameras(own, len(groups[0]) // 2))
+    first, later = report.group_rates()
+    found = {
+        "still_gaussians": round(share, 3),
+        "still_bits": round(bits, 4),
+        "coded_quality": round(report.quality, 2),
+        "kb_per_frame_of_first_group": round(first, 3),
+        "kb_per_frame_of_later_groups": later and round(later, 3),
+        "groups": report.group_list,
+    }
     yield "gscodec", trained + seconds, size, decoded, found
 
 
@@ -212,11 +224,11 @@ def training_cameras(capture: Capture, t: int) -> list[Camera]:
 
 def coded(
     capture: Capture, groups: list[ParametricGroup], settings, encoding
-) -> tuple[int, list[Gaussians], float, float]:
+) -> tuple[int, list[Gaussians], float, EncodeReport]:
     """Codes the groups, refined by the pictures of the capture where training has calibrated its cameras.
 
     Returns:
-        Bytes of the stream, its decoded frames, seconds of coding, the quality.
+        Bytes of the stream, its decoded frames, seconds of coding, the report.
     """
     from gscodec.decode import open_stream
     from gscodec.encode.encode import StreamOutput, encode_groups, stream_config
@@ -234,7 +246,7 @@ def coded(
             refine_by_pictures=PictureRefinement(capture, settings.refinement),
         )
         seconds, stream = time.perf_counter() - start, open_stream(out)
-        return out.stat().st_size, [stream.frame(t) for t in range(stream.frame_count)], seconds, report.quality
+        return out.stat().st_size, [stream.frame(t) for t in range(stream.frame_count)], seconds, report
 
 
 def every_frame_alone(capture: Capture, frames: range, settings) -> tuple[list[Gaussians], float]:

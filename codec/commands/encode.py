@@ -22,6 +22,13 @@ if TYPE_CHECKING:
     from .sources import TrainOptions
 
 
+ENDED = {  # ParametricGroup.ended
+    "cut": "it cannot be tracked",
+    "drift": "tracking had come too far from the keyframe",
+    "change": "much that stood still begins to change",
+}
+
+
 def encode(
     seq: SequencePath,
     out: StreamPath,
@@ -72,6 +79,13 @@ def encode(
         f"{out}: {r['frames']} frames, {r['gaussians']} Gaussians, {r['bytes']} bytes, "
         f"{r['kb_per_frame']:.2f} kB/frame, {r['bits_per_gaussian_frame']:.2f} bits per Gaussian and frame"
     )
+    first, later = result.group_rates()
+    if first and later:
+        stdout.print(f"{result.groups} groups: {first:.2f} kB/frame in the first, {later:.2f} in the others")
+    for group in result.group_list:
+        if group["ended"]:
+            end = group["frame"] + group["frames"]
+            stdout.print(f"the group from frame {group['frame']} ends before frame {end}: {ENDED[group['ended']]}")
     if result.chosen_quality:
         stdout.print(
             f"quality {result.quality:.1f}, at which coding costs at most {result.loss} dB of what was trained"

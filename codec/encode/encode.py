@@ -39,6 +39,14 @@ class EncodeReport:
     interrupted: bool = False
     seconds: dict = field(default_factory=dict)
     units: dict = field(default_factory=dict)
+    group_list: list[dict] = field(default_factory=list)  # of this run: frame, frames, bytes, predicted, ended
+
+    def group_rates(self) -> tuple[float | None, float | None]:
+        """kB a frame of the first group of the stream and of all behind it; None: this run has coded none."""
+        first = [g for g in self.group_list if g["frame"] == 0]
+        later = [g for g in self.group_list if g["frame"] > 0]
+        rate = lambda some: sum(g["bytes"] for g in some) / sum(g["frames"] for g in some) / 1000  # noqa: E731
+        return rate(first) if first else None, rate(later) if later else None
 
     def to_json(self) -> dict:
         """The report with the derived rates of DESIGN's measures."""
@@ -162,13 +170,22 @@ def _code_all(groups: Iterable[ParametricGroup], coder: GroupCoder, writer: Stre
         report.seconds["code"] += clock() - mark
         kept = {"quality": np.array(quality)} | (state.to_arrays() if state else {})
         writer.append(coded.payload, len(group), sync=coded.independent, state=kept)
-        _account(report, writer, coded)
+        _account(report, writer, coded, group)
         if on_group:
             on_group(report)
         mark = clock()
 
 
-def _account(report: EncodeReport, writer: StreamWriter, coded: CodedGroup) -> None:
+def _account(report: EncodeReport, writer: StreamWriter, coded: CodedGroup, group: ParametricGroup) -> None:
+    report.group_list.append(
+        {
+            "frame": writer.frames - len(group),
+            "frames": len(group),
+            "bytes": len(coded.payload),
+            "predicted": not coded.independent,
+            "ended": group.ended,
+        }
+    )
     report.frames, report.groups, report.bytes = writer.frames, writer.groups, writer.bytes
     report.gaussians = max(report.gaussians, coded.gaussians)
     report.predicted += not coded.independent

@@ -76,6 +76,8 @@ class ParametricGroup:
             have the same parent. None: nothing is known, as in the first group.
         calibration: what training learned of the capture's cameras; None: there is no capture.
         rate_optimized: training had a rate term, which has dropped what is not worth its bits.
+        ended: why it is shorter than it may be: "cut" (the next frame cannot be tracked), "drift" (nor well enough,
+            since the keyframe is too far), "change" (much that rests begins to change); empty: it is not.
     """
 
     frame_count: int
@@ -86,6 +88,7 @@ class ParametricGroup:
     parents: np.ndarray | None = None
     calibration: Calibration | None = None
     rate_optimized: bool = False
+    ended: str = ""
 
     def __len__(self) -> int:
         return self.frame_count
@@ -128,6 +131,7 @@ class ParametricGroup:
             pick(self.parents),
             self.calibration,
             self.rate_optimized,
+            self.ended,
         )
 
     @cached_property

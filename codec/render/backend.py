@@ -18,6 +18,7 @@ STATISTICS = ("grad2d", "max_weight", "sum_weight")
 Region = tuple[int, int, int, int]  # x, y, width, height in pixels
 Params = Mapping[str, np.ndarray]  # PARAMETERS -> numpy arrays or torch CPU tensors, f32, contiguous
 PixelGradient = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+PendingLoss = Callable[[], "RenderLoss"]
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,15 @@ class Backend(Protocol):
         self, params: Params, crops: Sequence[Crop], *, ssim_lambda: float, mask_lambda: float
     ) -> RenderLoss:
         """Loss of Gaussians against the targets of `crops`, and its gradients."""
+
+    def start_photometric_loss(
+        self, params: Params, crops: Sequence[Crop], *, ssim_lambda: float, mask_lambda: float
+    ) -> PendingLoss:
+        """Starts `photometric_loss` of the Gaussians as they are now, beside the caller.
+
+        Returns:
+            What waits for the result, which stays valid until the second start after this one.
+        """
 
     def backpropagate(
         self, params: Params, camera: Camera, background: Sequence[float], pixel_gradient: PixelGradient

@@ -6,6 +6,7 @@ One native call renders, compares and differentiates, so that nothing of the siz
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from .. import _native
 from ..errors import UsageError
 from ..model.camera import Camera
 from ..model.gaussians import PARAMETERS
-from .backend import STATISTICS, Crop, Params, PixelGradient, Region, RenderLoss
+from .backend import STATISTICS, Crop, Params, PendingLoss, PixelGradient, Region, RenderLoss
 from .workspace import Workspace, call, host_array, rgb, view
 
 
@@ -30,6 +31,7 @@ class CpuBackend:
 
     def __init__(self, threads: int = 0, simd: str = "auto"):
         self.workspace = Workspace(threads, simd)
+        self._worker = ThreadPoolExecutor(1, "render")
 
     def render(
         self, params: Params, camera: Camera, background: Sequence[float], region: Region | None = None
@@ -45,12 +47,24 @@ class CpuBackend:
         Raises:
             UsageError: shapes disagree, a camera has distortion, or there are no crops.
         """
+        return self._photometric_loss(params, _arrays(params), crops, (ssim_lambda, mask_lambda))
+
+    def start_photometric_loss(
+        self, params: Params, crops: Sequence[Crop], *, ssim_lambda: float = 0.2, mask_lambda: float = 0.0
+    ) -> PendingLoss:
+        """As of `Backend`."""
+        arrays = tuple(a.copy() for a in _arrays(params))
+        return self._worker.submit(self._photometric_loss, params, arrays, crops, (ssim_lambda, mask_lambda)).result
+
+    def _photometric_loss(
+        self, params: Params, arrays: tuple[np.ndarray, ...], crops: Sequence[Crop], lambdas: tuple[float, float]
+    ) -> RenderLoss:
+        """`photometric_loss` of the six `arrays`; `params`: what the gradients look like."""
         if not crops:
             raise UsageError("a batch has at least one crop, got none")
-        arrays = _arrays(params)
         grads, statistics = self.workspace.gradients(arrays)
         step, native = self.workspace.native.step, [_native_crop(crop) for crop in crops]
-        values, radii = call(step, arrays, native, (ssim_lambda, mask_lambda), (grads, statistics))
+        values, radii = call(step, arrays, native, lambdas, (grads, statistics))
         losses, exposure = np.array([v[:5] for v in values]), np.array([v[5:] for v in values])
         loss, means = float(losses[:, 0].sum()), losses[:, 1:].mean(0).tolist()
         return RenderLoss(

@@ -35,7 +35,7 @@ class Workspace:
             self.native = _native.Rasterizer(threads, simd)
         except ValueError as e:
             raise UsageError(str(e)) from None
-        self._grads: dict[str, np.ndarray] = {}
+        self._grads: tuple[dict[str, np.ndarray], ...] = ({}, {})
 
     @property
     def simd(self) -> str:
@@ -68,14 +68,17 @@ class Workspace:
         return flat.reshape(camera.height, camera.width, 3)
 
     def gradients(self, params) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-        """Arrays in the shapes of `params`, and three statistics [N]; the same arrays while the shapes stay."""
+        """Arrays in the shapes of `params`, and three statistics [N]; every second call gives the same ones while the
+        shapes stay, so that those of the step before can still be read."""
+        self._grads = self._grads[::-1]
+        grads = self._grads[0]
         n = len(params[0])
         shapes = {name: p.shape for name, p in zip(PARAMETERS, params, strict=True)}
         shapes |= {name: (n,) for name in STATISTICS}
         for name, shape in shapes.items():
-            if name not in self._grads or self._grads[name].shape != shape:
-                self._grads[name] = np.zeros(shape, np.float32)
-        return tuple(self._grads[k] for k in PARAMETERS), tuple(self._grads[k] for k in STATISTICS)
+            if name not in grads or grads[name].shape != shape:
+                grads[name] = np.zeros(shape, np.float32)
+        return tuple(grads[k] for k in PARAMETERS), tuple(grads[k] for k in STATISTICS)
 
 
 def view(camera: Camera, region: Region) -> dict:

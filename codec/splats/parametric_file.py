@@ -17,7 +17,7 @@ OPTIONAL = ("lifetimes", "parents")
 
 def to_arrays(group: ParametricGroup) -> dict[str, np.ndarray]:
     """Everything in a group as named arrays."""
-    arrays = {"frame_count": np.array(group.frame_count), "rate_optimized": np.array(group.rate_optimized)}
+    arrays = {n: np.array(getattr(group, n)) for n in ("frame_count", "rate_optimized", "ended")}
     parts = {"canonical": group.canonical, "nodes": group.nodes, "calibration": group.calibration}
     for part, value in parts.items():
         if value is not None:
@@ -45,4 +45,5 @@ def from_arrays(arrays: Mapping[str, np.ndarray]) -> ParametricGroup:
         *(arrays.get(n) for n in OPTIONAL),
         part("calibration", Calibration),
         bool(arrays["rate_optimized"]),
+        str(arrays["ended"]),
     )

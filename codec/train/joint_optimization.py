@@ -5,7 +5,8 @@ node and frame.
 The loss is that of the image and a rate term (V3's residual-entropy loss, made differentiable): the entropy of the
 coefficients under noise-relaxed quantization at the step sizes of the stream, with a learned Laplace scale for each
 attribute and temporal frequency. It pulls coefficients to zero that lower the image loss by less than they cost.
-Canonical attributes have noise in place of their quantization and a rate term of their own (entropy_model.py).
+Canonical attributes have noise in place of their quantization and a rate term of their own (entropy_model.py). While
+one view is rendered, the step along the one before is taken: a gradient is one step old.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from ..render.backend import PendingLoss
 from ..render.optimizer import Adam, TrajectoryAdam
 from .finetune import Frame, GroupModel
 from .keyframe import Statistics, split_or_clone
 from .motion_field import MotionField
 from .settings import TrainSettings
-from .views import Views, photometric_loss
+from .views import Views, start_photometric_loss
 
 
 class _Finetuner:
@@ -46,14 +48,27 @@ class _Finetuner:
         self.steps = 0
         self._draw_canonical()
         self.statistics = Statistics(len(group.key), settings.keyframe.mse_min)
+        self.started: tuple[int, Frame, PendingLoss, float] | None = None  # frame of the group, decay of the rates
         self.bits = sum(self._step_coefficients(0, None, 0.0, 0.0))
 
     def step(self, t: int, decay: float) -> float:
-        """One step on frame `t`, all learning rates times `decay`; returns the image loss."""
-        f, group = self.settings.finetune, self.group
-        frame = group.frame(t, self.views.backend, self.noise)
-        target = self.views.draw(self.frames[t])
-        result = photometric_loss(frame.params, target, self.settings, self.rng, self.views.backend)
+        """Starts a view of frame `t`, whose step has all learning rates times `decay`, and meanwhile takes the step
+        along the view before; returns the mean image loss of late."""
+        frame, backend = self.group.frame(t, self.views.backend, self.noise), self.views.backend
+        pending = start_photometric_loss(
+            frame.params, self.views.draw(self.frames[t]), self.settings, self.rng, backend
+        )
+        self.finish()
+        self.started = t, frame, pending, decay
+        return self.loss
+
+    def finish(self) -> None:
+        """Takes the step along the view that was started last."""
+        if self.started is None:
+            return
+        t, frame, pending, decay = self.started
+        self.started = None
+        f, group, result = self.settings.finetune, self.group, pending()
         self.loss += (result.loss - self.loss) * (f.loss_smoothing if self.loss else 1.0)
         self.statistics.add(result)
         k = self.settings.keyframe
@@ -67,7 +82,6 @@ class _Finetuner:
             self._step_coefficients(t, residuals, 0.0, decay)
         if self.canonical_rates:
             self._step_canonical(canonical, decay)
-        return result.loss
 
     def _step_canonical(self, grads: dict[str, torch.Tensor], decay: float) -> None:
         """One step of the new canonical Gaussians along the gradients of the image and of the rate term, as that was at
@@ -86,8 +100,12 @@ class _Finetuner:
 
     def change_topology(self) -> None:
         """Removes new Gaussians that all frames together do without, and gives a second one to those whose screen
-        gradient is still large: what the keyframe did not show, or a motion has stretched."""
+        gradient is still large: what the keyframe did not show, or a motion has stretched. Does nothing where too few
+        views have been drawn to tell."""
+        self.finish()
         group, k, stats = self.group, self.settings.keyframe, self.statistics
+        if stats.views < self.settings.finetune.topology_views * len(self.views.train_cameras):
+            return
         opacities = torch.sigmoid(group.key.params["logit_opacities"])
         contribution = stats.contribution(opacities)
         keep = contribution >= k.contribution_min
@@ -190,9 +208,9 @@ def finetune(
     for step in range(steps):
         # The first and the last frame come twice: they have neighbours on one side only.
         order = order or run.rng.permutation([0, *range(len(frames)), len(frames) - 1]).tolist()
-        enough = run.statistics.views >= settings.finetune.topology_views * len(views.train_cameras)
-        if step == round(settings.finetune.topology_at * steps) and enough:
+        if step == round(settings.finetune.topology_at * steps):
             run.change_topology()
         loss = run.step(order.pop(), settings.finetune.rate_decay ** (step / steps))
         if on_step:
             on_step(step, loss)
+    run.finish()

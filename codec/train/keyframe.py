@@ -2,21 +2,24 @@
 
 The recipe of 3D Gaussian Splatting (Kerbl et al. 2023), shortened: of the Gaussians with the largest screen gradients
 small ones are cloned and large ones split, and Gaussians with a small contribution to all views are pruned. Spherical
-harmonics are added on the way, and removed again where they lower the error by less than their bits cost.
+harmonics are added on the way, and removed again where they lower the error by less than their bits cost. While one
+view is rendered, the step along the one before is taken: a gradient is one step old.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from ..model.rotations import quat_normalize, rotate
-from ..render.backend import RenderLoss
+from ..render.backend import PendingLoss, RenderLoss
 from .model import REMOVED_LOGIT, Model
 from .settings import KeyframeSettings, TrainSettings
-from .views import Views, photometric_loss, view_losses
+from .views import Target, Views, start_photometric_loss, view_losses
 
 
 class Statistics:
@@ -82,41 +85,93 @@ def train_keyframe(
         radius: size of the subject in world units, scales the learning rate of the means.
         on_step: called with (step, loss).
     """
-    k = settings.keyframe
-    rng = np.random.default_rng([settings.seed, frame])
-    stats, losses = Statistics(len(model), k.mse_min), []
-    few = k.dropout * min(1.0, k.dropout_views / len(views.train_cameras)) ** 2 if views.capture.has_alpha else 0.0
+    run, k = _Run(model, views, frame, settings, steps, radius), settings.keyframe
     densify_every = max(k.densify_every, round(k.densify_share * steps))
-    model.start_optimizer(views.backend, settings.adam)
-    views.reset_calibration(frame, model.params["means"].numpy().mean(0, dtype=np.float64), radius)
     for step in range(steps):
-        target = views.draw(frame, picture_scale(step / steps, views.largest_side, k))
-        dropped = few * step / steps
-        params = _without_some(model.params, dropped, rng) if dropped else model.params
-        result = photometric_loss(params, target, settings, rng, views.backend)
-        stats.add(result)
-        losses.append(result.loss - settings.mask_lambda * result.mask)
-        progress = step / max(steps - 1, 1)
-        decay = k.rate_decay**progress
-        views.exposure.learn(target.index, result.grad_exposure[0], decay)
-        if step >= k.appearance_from * steps:
-            views.extrinsics.learn(target.index, model.params, result.grads, decay)
-        result.grads["shN"].add_(model.params["shN"], alpha=k.harmonics_weight / len(model))
-        means_rate = radius * k.rates["means"] * (k.means_rate_end / k.rates["means"]) ** progress
-        model.step(result.grads, {**k.rates.scaled(radius, decay), "means": means_rate})
+        run.step(step)
         if step == int(k.appearance_from * steps):
-            model.set_degree(settings.sh_degree)
+            run.set_degree(settings.sh_degree)
         if step == int(k.thin_until * steps):
-            model.set_degree(harmonics_degree(model, views, frame, settings))
+            run.set_degree(None)
         if (step + 1) % densify_every == 0:
-            if k.densify_from * steps < step < k.densify_until * steps:
-                densify(model, stats, int(k.gaussians_share * settings.gaussians_max), rng, k)
-            elif step >= k.densify_until * steps:
-                prune(model, stats, k, thin=step < k.thin_until * steps)
-            stats = Statistics(len(model), k.mse_min)
+            run.change_topology(step)
         if on_step:
-            on_step(step, result.loss)
-    return float(np.mean(losses[-len(views.train_cameras) :]))
+            on_step(step, run.losses[-1] if run.losses else math.inf)
+    run.finish()
+    return float(np.mean(run.losses[-len(views.train_cameras) :]))
+
+
+@dataclass(frozen=True)
+class _View:
+    """A view that is being rendered: its number, the camera of its `target`, and its loss."""
+
+    step: int
+    target: Target
+    pending: PendingLoss
+
+
+class _Run:
+    """State of one keyframe's optimisation.
+
+    Attributes:
+        losses: image loss of each step that was taken, without the mask term.
+    """
+
+    def __init__(self, model: Model, views: Views, frame: int, settings: TrainSettings, steps: int, radius: float):
+        k = settings.keyframe
+        self.model, self.views, self.frame, self.settings = model, views, frame, settings
+        self.steps, self.radius, self.losses = steps, radius, []
+        self.rng = np.random.default_rng([settings.seed, frame])
+        few = k.dropout * min(1.0, k.dropout_views / len(views.train_cameras)) ** 2
+        self.dropout = few if views.capture.has_alpha else 0.0
+        self.statistics = Statistics(len(model), k.mse_min)
+        self._started: _View | None = None
+        model.start_optimizer(views.backend, settings.adam)
+        views.reset_calibration(frame, model.params["means"].numpy().mean(0, dtype=np.float64), radius)
+
+    def step(self, step: int) -> None:
+        """Starts one view, and meanwhile takes the step along the one before."""
+        s, views = self.settings, self.views
+        target = views.draw(self.frame, picture_scale(step / self.steps, views.largest_side, s.keyframe))
+        params, dropped = self.model.params, self.dropout * step / self.steps
+        params = _without_some(params, dropped, self.rng) if dropped else params
+        pending = start_photometric_loss(params, target, s, self.rng, views.backend)
+        self.finish()
+        self._started = _View(step, target, pending)
+
+    def finish(self) -> None:
+        """Takes the last step that was started."""
+        if self._started is None:
+            return
+        view, self._started = self._started, None
+        k, model, result = self.settings.keyframe, self.model, view.pending()
+        self.statistics.add(result)
+        self.losses.append(result.loss - self.settings.mask_lambda * result.mask)
+        progress = view.step / max(self.steps - 1, 1)
+        decay = k.rate_decay**progress
+        self.views.exposure.learn(view.target.index, result.grad_exposure[0], decay)
+        if view.step >= k.appearance_from * self.steps:
+            self.views.extrinsics.learn(view.target.index, model.params, result.grads, decay)
+        result.grads["shN"].add_(model.params["shN"], alpha=k.harmonics_weight / len(model))
+        means_rate = self.radius * k.rates["means"] * (k.means_rate_end / k.rates["means"]) ** progress
+        model.step(result.grads, {**k.rates.scaled(self.radius, decay), "means": means_rate})
+
+    def set_degree(self, degree: int | None) -> None:
+        """Gives the Gaussians harmonics of this degree; None: of the one that pays."""
+        self.finish()
+        if degree is None:
+            degree = harmonics_degree(self.model, self.views, self.frame, self.settings)
+        self.model.set_degree(degree)
+
+    def change_topology(self, step: int) -> None:
+        """Densification in the first part of the steps, pruning after it."""
+        self.finish()
+        s, k = self.settings, self.settings.keyframe
+        if k.densify_from * self.steps < step < k.densify_until * self.steps:
+            densify(self.model, self.statistics, int(k.gaussians_share * s.gaussians_max), self.rng, k)
+        elif step >= k.densify_until * self.steps:
+            prune(self.model, self.statistics, k, thin=step < k.thin_until * self.steps)
+        self.statistics = Statistics(len(self.model), k.mse_min)
 
 
 def _without_some(params: dict[str, torch.Tensor], share: float, rng: np.random.Generator) -> dict[str, torch.Tensor]:

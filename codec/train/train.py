@@ -62,9 +62,9 @@ def train_groups(
 
     A group continues the Gaussians of the one before (`parents`). It ends before a frame whose image loss is
     `cut_ratio` times that of the frame before, or `drift_ratio` times that of the keyframe, and the next group starts
-    with a keyframe. It also ends before a frame in
-    which a large fraction of the Gaussians begins to change; then the next group continues. Every segment of
-    `random_access` frames starts with a keyframe: a segment depends on no frames but its own.
+    with a keyframe. It also ends before a frame in which a large fraction of the Gaussians begins to change; then the
+    next group continues. Every segment of `random_access` frames starts with a keyframe: a segment depends on no frames
+    but its own.
 
     Args:
         first_frame: where an earlier run stopped, the first frame of a group.
@@ -138,24 +138,25 @@ class _Run:
         """Trains one group, of all `frames` or of the first ones."""
         track = _TrackedFrames()
         self.views.restart_order()
-        cut = self.subject is not None and self._track(frames, track)
+        ended = "" if self.subject is None else self._track(frames, track)
         parents = self.subject.parents if track.models else None
         if parents is None:  # no Gaussians to track, or cut at once
             self.subject = self._keyframe(frames)
             track.add(self.subject.tracker)
-            cut = self._track(frames[1:], track)
+            ended = self._track(frames[1:], track)
         subject, done = self.subject, frames[: len(track.models)]
-        if cut:
+        if ended in ("cut", "drift"):
             self.subject = None
         if len(done) == 1 and parents is None:
             subject.canonical = track.models[0]
             subject.parents = np.arange(len(subject.canonical))
-            return ParametricGroup(1, subject.canonical.gaussians(), rate_optimized=False)
+            return ParametricGroup(1, subject.canonical.gaussians(), rate_optimized=False, ended=ended)
         model = self._finetuned(subject, done, track)
         subject.tracker.adopt(model)
         known = len(model.key) if parents is None else len(parents)
         new = np.full(len(model.key) - known, -1)
         group = model.group(None if parents is None else np.append(parents, new).astype(np.int32))
+        group = replace(group, ended=ended)
         subject.start_next_group(model.key)
         if not len(subject.parents):
             self.subject = None
@@ -171,28 +172,26 @@ class _Run:
         loss = train_keyframe(model, self.views, frames[0], s, steps=budget.steps, radius=radius, on_step=on_step)
         return Subject(Tracker.start(model, self.views, s, loss, frames), loss, radius)
 
-    def _track(self, frames: range, track: _TrackedFrames) -> bool:
-        """Tracks `frames` up to the end of the group and adds them to `track`.
+    def _track(self, frames: range, track: _TrackedFrames) -> str:
+        """Tracks `frames` up to the end of the group and adds them to `track`; returns why that came early
+        (`ParametricGroup.ended`). After a cut or a drift the next group needs a keyframe.
 
         The group ends where a large fraction of resting Gaussians changes at once: with few temporal frequencies, a
         light that is switched on would show in all frames of the group.
-
-        Returns:
-            Whether the group was cut, so that the next one needs a keyframe.
         """
         subject, g = self.subject, self.settings.group
         for frame in frames:
             long_enough = len(track.models) >= g.changed_frames_min
             if long_enough and subject.tracker.changed_fraction(frame, track.moved()) > g.changed_fraction_max:
-                return False
-            known = min(self.settings.cut_ratio * subject.tracker.loss, g.drift_ratio * subject.loss)
+                return "change"
+            near, far = self.settings.cut_ratio * subject.tracker.loss, g.drift_ratio * subject.loss
             loss = subject.tracker.advance(frame, self._report(f"track {frame}"))
-            if loss is not None and loss > known + g.cut_loss_floor:
-                return True
+            if loss is not None and loss > min(near, far) + g.cut_loss_floor:
+                return "cut" if near < far else "drift"
             if loss is not None:
                 subject.tracker.densify(frame, self._report(f"densify {frame}"))
             track.add(subject.tracker)
-        return False
+        return ""
 
     def _finetuned(self, subject: Subject, frames: range, track: _TrackedFrames) -> GroupModel:
         """The fine-tuned model of a group."""

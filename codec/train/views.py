@@ -16,7 +16,7 @@ from ..capture import View, cropped
 from ..capture.epipolar import epipolar_error
 from ..model.camera import Calibration, Camera
 from ..model.gaussians import Gaussians
-from ..render.backend import Backend, Crop, RenderLoss
+from ..render.backend import Backend, Crop, PendingLoss, RenderLoss
 from ..render.sensitivity import params_of
 from .calibration import Exposure, Extrinsics
 from .settings import TrainSettings
@@ -175,14 +175,28 @@ def shrink(target: Target, scale: float) -> Target:
     )
 
 
+def _crop(target: Target, rng: np.random.Generator) -> Crop:
+    background = GREY if target.opaque else tuple(rng.uniform(0, 1, 3))
+    return Crop(target.camera, target.rgb, target.alpha, background, target.exposure)
+
+
 def photometric_loss(
     params: dict, target: Target, settings: TrainSettings, rng: np.random.Generator, backend: Backend
 ) -> RenderLoss:
     """Loss of Gaussians against one target (`Backend.photometric_loss`). Behind a target with alpha the background is
     random: with a known one, Gaussians in its colour could stand for transparency. An opaque one is to be covered."""
-    background = GREY if target.opaque else tuple(rng.uniform(0, 1, 3))
-    crop = Crop(target.camera, target.rgb, target.alpha, background, target.exposure)
+    crop = _crop(target, rng)
     return backend.photometric_loss(params, [crop], ssim_lambda=settings.ssim_lambda, mask_lambda=settings.mask_lambda)
+
+
+def start_photometric_loss(
+    params: dict, target: Target, settings: TrainSettings, rng: np.random.Generator, backend: Backend
+) -> PendingLoss:
+    """`photometric_loss` of Gaussians as they are now, beside the caller (`Backend.start_photometric_loss`)."""
+    crop = _crop(target, rng)
+    return backend.start_photometric_loss(
+        params, [crop], ssim_lambda=settings.ssim_lambda, mask_lambda=settings.mask_lambda
+    )
 
 
 def view_losses(
