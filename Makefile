@@ -47,7 +47,7 @@ format: venv
 	$(BIN)/ruff format .
 	$(CARGO) fmt --all
 
-# The web player's decoder: codec/native -> player/native.wasm, which is committed.
+# The web player's decoder: codec/native -> player/native.wasm.gz, which is committed.
 player:
 	$(PYTHON) player/build.py
 

@@ -75,7 +75,7 @@ FREE = """async ([count]) => {
 # decodes groups and evaluates their frames in one wasm module; ms per frame of three runs
 DECODE = """async ([limit]) => {
     const { Native, load } = await import("/native.js");
-    const native = await Native.create(await load(new URL("/native.wasm", location.href)));
+    const native = await Native.create(await load(new URL("/native.wasm.gz", location.href)));
     const file = new Uint8Array(await (await fetch("/stream.gsv")).arrayBuffer());
     native.push(file);
     const { config, groups } = native.describe();

@@ -1,4 +1,4 @@
-"""`make player`: codec/native -> player/native.wasm, and the hash of what it was built from (native.sha256).
+"""`make player`: codec/native -> player/native.wasm.gz, and the hash of what it was built from (native.sha256).
 `make spark`: three.js and Spark, of the versions and hashes in spark/package-lock.json -> spark.js, and its hashes.
 
 All are committed, so that a checkout and the wheel play offline and without toolchains; a test fails when a hash is
@@ -8,6 +8,7 @@ where rustup cannot be used, Debian's rustc-web, cargo-web and rust-web-src will
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import os
 import shutil
@@ -19,12 +20,12 @@ from pathlib import Path
 PLAYER = Path(__file__).resolve().parent
 NATIVE = PLAYER.parent / "codec" / "native"
 TARGET = "wasm32-unknown-unknown"
-WASM, HASH = PLAYER / "native.wasm", PLAYER / "native.sha256"
+WASM, HASH = PLAYER / "native.wasm.gz", PLAYER / "native.sha256"
 SPARK, SPARK_HASH = PLAYER / "spark.js", PLAYER / "spark.sha256"
 
 
 def source_hash() -> str:
-    """SHA-256 over the sources of native.wasm."""
+    """SHA-256 over the sources of native.wasm.gz."""
     files = [NATIVE / "Cargo.toml", NATIVE / "Cargo.lock", NATIVE / "bindings" / "src" / "lib.rs"]
     files += [NATIVE / crate / "Cargo.toml" for crate in ("gsv", "raster", "bindings")]
     for folder in ("gsv/src", "raster/src", "bindings/src/wasm"):
@@ -38,7 +39,7 @@ def source_hash() -> str:
 
 
 def build() -> None:
-    """Builds native.wasm.
+    """Builds native.wasm.gz: packed, since few static hosts pack wasm.
 
     Raises:
         SystemExit: the toolchain is missing or the build fails.
@@ -54,7 +55,7 @@ def build() -> None:
         sys.exit(f"error: the wasm build failed; it needs the Rust target {TARGET} (rustup target add {TARGET})")
     folder = Path(os.environ.get("CARGO_TARGET_DIR", NATIVE / "target"))
     built = folder / TARGET / "wasm" / "gscodec_native.wasm"
-    shutil.copyfile(built, WASM)
+    WASM.write_bytes(gzip.compress(built.read_bytes(), 9, mtime=0))
     HASH.write_text(source_hash() + "\n")
     print(f"{WASM.name}: {WASM.stat().st_size / 1000:.0f} kB")
 
@@ -109,7 +110,7 @@ def build_spark() -> None:
 def check_committed() -> None:
     """Raises SystemExit if the files in the repository are not those of its sources."""
     if not HASH.exists() or HASH.read_text().strip() != source_hash():
-        sys.exit("error: player/native.wasm was built from other sources; run `make player` and commit player/native.*")
+        sys.exit("error: player/native.wasm.gz was built from other sources; run `make player` and commit player/native.*")
     if not SPARK_HASH.exists() or SPARK_HASH.read_text().strip() != spark_hashes():
         sys.exit("error: player/spark.js is not that of player/spark; run `make spark` and commit player/spark.*")
 

@@ -50,7 +50,7 @@ export class Engine extends EventTarget {
 
   // Resolves when the config and the first groups are known.
   async open() {
-    const module = load(new URL("native.wasm", this.base)); // while the first bytes of the file are on their way
+    const module = load(new URL("native.wasm.gz", this.base)); // while the first bytes of the file are on their way
     module.then((m) => this.closed || this.#connect(m), () => {});
     await this.source.open(async () => Native.create(await module));
   }

@@ -15,7 +15,17 @@ export async function load(url) {
   }
   const response = await fetch(url);
   if (!response.ok) throw new Error(`The decoder could not be loaded: ${url} answered ${response.status}.`);
-  return WebAssembly.compile(await response.arrayBuffer());
+  const module = await plain(response.body);
+  return WebAssembly.compileStreaming(new Response(module, { headers: { "Content-Type": "application/wasm" } }));
+}
+
+// A stream of gzip, unpacked; as it is where the server has declared it as Content-Encoding, which the browser has undone.
+async function plain(stream) {
+  const [look, all] = stream.tee();
+  const reader = look.getReader();
+  const { value } = await reader.read();
+  reader.cancel();
+  return value?.[0] === 0x1f ? all.pipeThrough(new DecompressionStream("gzip")) : all;
 }
 
 export class Native {

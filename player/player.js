@@ -305,7 +305,8 @@ export class GsvPlayer extends HTMLElement {
 
   #pictured(detail) {
     const now = performance.now();
-    if (!this.shown) this.#render(); // not before: the first image does not wait for it
+    const { engine } = this;
+    if (!this.shown) requestAnimationFrame(() => setTimeout(() => this.engine === engine && this.#render())); // after the first paint
     this.shown = detail;
     this.#times.push(now);
     this.#busySince = 0;

@@ -1,15 +1,19 @@
 """The server behind `gscodec play`: one stream and the page's own files, by default for this machine only.
 
-Ranges as in RFC 9110 (206, 416, HEAD, If-Range), since the page reads nothing but ranges; a range of several parts is
-answered with the whole file, which the RFC allows. A file that is still being written (OUT.gsv.part) grows under the
+Of the stream ranges as in RFC 9110 (206, 416, HEAD, If-Range), since the page reads nothing but ranges; a range of
+several parts is answered with the whole file, which the RFC allows. The page's files are packed with gzip, and not sent
+again to a browser that has them. A file that is still being written (OUT.gsv.part) grows under the
 same address: it is held open, so that it stays readable when the encoder replaces it by the finished file.
 """
 
 from __future__ import annotations
 
+import functools
+import gzip
 import os
 import re
 import socket
+import zlib
 from email.utils import formatdate, parsedate_to_datetime
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -33,7 +37,7 @@ FILES = {
     "camera.js": "text/javascript; charset=utf-8",
     "controls.js": "text/javascript; charset=utf-8",
     "player.css": "text/css; charset=utf-8",
-    "native.wasm": "application/wasm",
+    "native.wasm.gz": "application/gzip",
 }
 STREAM = "/stream.gsv"
 PIECE = 1 << 18  # bytes read and sent at a time
@@ -59,6 +63,12 @@ def parse_range(value: str | None, size: int) -> tuple[int, int] | None:
     if int(first) >= size:
         raise ValueError("the range starts after the end")
     return int(first), min(int(last) + 1, size) if last else size
+
+
+@functools.lru_cache(maxsize=len(FILES))
+def _packed(data: bytes) -> bytes:
+    """`data` in gzip."""
+    return gzip.compress(data, mtime=0)
 
 
 class Stream:
@@ -106,8 +116,7 @@ class Handler(BaseHTTPRequestHandler):
                 with self.stream.open() as f:
                     self._send(f, "video/mp4", body)
             elif name in FILES:
-                with open(PAGE / name, "rb") as f:
-                    self._send(f, FILES[name], body)
+                self._send_page(name, body)
             else:
                 self._refuse(HTTPStatus.NOT_FOUND)
         except (BrokenPipeError, ConnectionError, TimeoutError):
@@ -121,6 +130,22 @@ class Handler(BaseHTTPRequestHandler):
             self.send_header(key.replace("_", "-"), value)
         self.send_header("Content-Length", "0")
         self.end_headers()
+
+    def _send_page(self, name: str, body: bool) -> None:
+        """A file of the page: packed where the browser takes that, and only if it has none or another one."""
+        data, headers = (PAGE / name).read_bytes(), {"Content-Type": FILES[name]}
+        if "gzip" in self.headers.get("Accept-Encoding", "") and not name.endswith(".gz"):
+            data, headers["Content-Encoding"] = _packed(data), "gzip"
+        headers |= {"ETag": f'"{zlib.crc32(data):08x}-{len(data):x}"', "Vary": "Accept-Encoding"}
+        known = self.headers.get("If-None-Match") == headers["ETag"]
+        self.send_response(HTTPStatus.NOT_MODIFIED if known else HTTPStatus.OK)
+        headers |= {"Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff"}
+        headers |= {} if known else {"Content-Length": str(len(data))}
+        for key, value in headers.items():
+            self.send_header(key, value)
+        self.end_headers()
+        if body and not known:
+            self.wfile.write(data)
 
     def _send(self, f, kind: str, body: bool) -> None:
         facts = os.fstat(f.fileno())

@@ -32,6 +32,7 @@ export class Source extends EventTarget {
   settled = false; // not complete, but it has not grown for a while
   received = 0;
   #cache = new Map(); // group -> {bytes, whole}
+  #head = new Uint8Array(); // first bytes of a finished file
   #whole = null; // all bytes so far, from a server without Range
   #closing = new AbortController();
 
@@ -60,6 +61,7 @@ export class Source extends EventTarget {
     if (!d.config) throw new StreamError("The file ends before its header does.");
     this.config = d.config;
     if (d.index.length && !this.#whole) {
+      this.#head = head;
       this.#useIndex(d.index, d.layers);
     } else {
       this.#list();
@@ -193,8 +195,8 @@ export class Source extends EventTarget {
   // Bytes start .. end of the file, fewer where it ends.
   async #read(start, end, signal) {
     if (this.#whole) return this.#whole.subarray(start, end);
-    const parts = [];
-    let [at, since, wait] = [start, performance.now(), 250];
+    const parts = [this.#head.subarray(start, end)];
+    let [at, since, wait] = [start + parts[0].length, performance.now(), 250];
     while (at < end && (this.total === null || at < this.total || start >= this.total)) {
       const before = at;
       try {

@@ -217,7 +217,7 @@ def test_layers_follow_the_device(browser, server):
 
 INSTANCE = """
 const { Native, load } = await import("/native.js");
-const native = await Native.create(await load(new URL("/native.wasm", location.href)));
+const native = await Native.create(await load(new URL("/native.wasm.gz", location.href)));
 const file = new Uint8Array(await (await fetch(SRC)).arrayBuffer());
 native.push(file);
 const { config, groups } = native.describe();

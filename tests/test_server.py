@@ -1,6 +1,7 @@
 """The server of `gscodec play` and its ranges; the files that `make player` builds."""
 
 import contextlib
+import gzip
 import http.client
 import importlib.util
 import signal
@@ -114,7 +115,19 @@ def test_only_the_stream_and_the_page(server):
     for path in outside:
         assert ask(server, path)[0] == 404, path
     assert ask(server, "/", method="POST")[0] == 501
-    assert {f.name for f in PAGE.iterdir() if f.suffix in (".html", ".js", ".css", ".wasm")} == set(FILES)
+    assert {f.name for f in PAGE.iterdir() if f.suffix in (".html", ".js", ".css", ".gz")} == set(FILES)
+
+
+def test_the_page_is_packed_and_sent_once(server):
+    for name in ("player.js", "native.wasm.gz"):
+        plain = (PAGE / name).read_bytes()
+        status, headers, body = ask(server, f"/{name}", Accept_Encoding="gzip, br")
+        assert (status, headers.get("Content-Encoding")) == (200, "gzip" if name == "player.js" else None)
+        assert (gzip.decompress(body) if name == "player.js" else body) == plain
+        status, headers, body = ask(server, f"/{name}", Accept_Encoding="gzip, br", If_None_Match=headers["ETag"])
+        assert (status, body) == (304, b"")
+        assert "Content-Length" not in headers
+        assert ask(server, f"/{name}", If_None_Match='"another"')[2] == plain
 
 
 def test_it_serves_this_machine_only_unless_asked(server):
@@ -207,11 +220,13 @@ def test_the_built_files_are_those_of_the_sources():
 
 
 def test_the_player_is_small():
-    size = sum((PAGE / name).stat().st_size for name in FILES if name != "spark.js")  # which only the GPU path loads
-    assert size <= 500_000
+    files = [(PAGE / name).read_bytes() for name in FILES if name != "spark.js"]  # which only the GPU path loads
+    plain = [gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data for data in files]
+    assert sum(map(len, plain)) <= 500_000
+    assert sum(len(gzip.compress(data)) for data in plain) <= 200_000  # as they are sent
 
 
 def test_nothing_of_the_builders_machine_is_in_the_module():
-    data = (PAGE / "native.wasm").read_bytes()
+    data = gzip.decompress((PAGE / "native.wasm.gz").read_bytes())
     for word in (b"/root/", b"/home/", b"/tmp/", str(ROOT).encode()):
         assert word not in data

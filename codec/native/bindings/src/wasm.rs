@@ -104,7 +104,7 @@ pub extern "C" fn bounds() {
     with(Player::bounds);
 }
 
-/// Output: an attribute of the evaluated frame as f32, in the order of `codec.gaussians.Gaussians`: for tests.
+/// Output: an attribute of the evaluated frame as f32, in the order of `codec.gaussians.Gaussians`.
 #[unsafe(no_mangle)]
 pub extern "C" fn attribute(which: usize) {
     with(|p| p.attribute(which));
@@ -137,11 +137,11 @@ pub extern "C" fn band_rows(i: usize) -> usize {
     with(|p| p.band(i).map_or(0, |b| b.rows))
 }
 
-/// Input: as for `project`. Output: the visible Gaussians of the evaluated frame in the format of Spark, relative to an
-/// origin.
+/// Input: as for `project`. Output: the visible Gaussians of the evaluated frame, or all that are not transparent, in the
+/// format of Spark, relative to an origin; their colours are those of the view.
 #[unsafe(no_mangle)]
-pub extern "C" fn pack(x: f32, y: f32, z: f32) -> bool {
-    with(|p| p.pack([x, y, z]))
+pub extern "C" fn pack(x: f32, y: f32, z: f32, all: bool) -> bool {
+    with(|p| p.pack([x, y, z], all))
 }
 
 /// Bytes of one element of a band.

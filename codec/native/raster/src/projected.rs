@@ -1,5 +1,7 @@
 //! A Gaussian after projection, and the tile grid that it refers to. Binning, blending and gradients read it.
 
+use crate::constants::LOG2_ALPHA_MIN;
+
 /// Side of a tile in pixels.
 pub const TILE: usize = 16;
 /// Relative and absolute margin of the box and the ellipse, so that rounding never loses a pixel that blending would draw.
@@ -35,6 +37,11 @@ pub const MANY: u16 = 1 << 4;
 impl Projected {
     pub fn visible(&self) -> bool {
         self.rx >= 0.0
+    }
+
+    /// Whether it can be seen from somewhere.
+    pub fn opaque(&self) -> bool {
+        self.log2_opacity >= LOG2_ALPHA_MIN
     }
 
     /// Larger half side of the box in pixels, 0 if invisible.

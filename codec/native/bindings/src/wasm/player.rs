@@ -164,11 +164,11 @@ impl Player {
         count
     }
 
-    pub fn pack(&mut self, origin: [f32; 3]) -> bool {
+    pub fn pack(&mut self, origin: [f32; 3], all: bool) -> bool {
         let f = &self.frame;
         self.output.clear();
         let drawn = self.raster.project(&splats(f, self.sh_k), &view(&self.input));
-        let packed = drawn.map(|projected| pack::pack(f, projected, origin, &mut self.output));
+        let packed = drawn.map(|projected| pack::pack(f, projected, origin, all, &mut self.output));
         self.done(packed)
     }
 
