@@ -110,7 +110,9 @@ def build_spark() -> None:
 def check_committed() -> None:
     """Raises SystemExit if the files in the repository are not those of its sources."""
     if not HASH.exists() or HASH.read_text().strip() != source_hash():
-        sys.exit("error: player/native.wasm.gz was built from other sources; run `make player` and commit player/native.*")
+        sys.exit(
+            "error: player/native.wasm.gz was built from other sources; run `make player` and commit player/native.*"
+        )
     if not SPARK_HASH.exists() or SPARK_HASH.read_text().strip() != spark_hashes():
         sys.exit("error: player/spark.js is not that of player/spark; run `make spark` and commit player/spark.*")
 

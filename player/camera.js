@@ -11,16 +11,20 @@ const FIELD_OF_VIEW = (40 * Math.PI) / 180; // as `gscodec render`
 const PITCH_MAX = 1.5;
 const NEAR = 0.01; // spec 14
 
-function upVector(axis) {
+export function upVector(axis) {
   const v = [0, 0, 0];
   v["xyz".indexOf(axis.at(-1))] = axis[0] === "-" ? -1 : 1;
   return v;
 }
 
+// A view from `eye` for who packs all Gaussians: its direction and lens do not matter.
+export const viewFrom = ([x, y, z]) => new Float32Array([16, 16, 8, 8, 8, 8, 1, 0, 0, -x, 0, 1, 0, -y, 0, 0, 1, -z, NEAR]);
+
 export class Camera {
   // bounds: 1 to 99 % box of the first frame, 6 numbers; references: cameras of the config
   constructor(bounds, up, references = []) {
     const [low, high] = [bounds.slice(0, 3), bounds.slice(3)];
+    Object.assign(this, { low, high });
     this.center = scale(add(low, high), 0.5);
     this.radius = Math.max(length(add(high, low, -1)) / 2, 1e-6);
     this.up = upVector(up);
@@ -103,13 +107,9 @@ export class Camera {
     return view;
   }
 
-  // A wide view from `eye` to the target, for a head that turns.
-  wide(eye) {
-    const z = scale(add(this.target, eye, -1), 1 / length(add(this.target, eye, -1)));
-    let x = cross(z, this.up);
-    x = length(x) > 1e-6 ? scale(x, 1 / length(x)) : this.side;
-    const rows = [x, cross(z, x), z].flatMap((axis) => [...axis, -dot(axis, eye)]);
-    return new Float32Array([1000, 1000, 200, 200, 500, 500, ...rows, NEAR]);
+  // What the scene stands on: the lowest point below its middle.
+  get foot() {
+    return this.center.map((v, i) => (this.up[i] ? (this.up[i] > 0 ? this.low : this.high)[i] : v));
   }
 
   // width, height, fx, fy, cx, cy, 12 of world-to-camera, near: the input of the rasterizer.

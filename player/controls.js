@@ -9,6 +9,7 @@ const ICONS = {
   reset: "M12 5V1L7 6l5 5V7a5 5 0 1 1-5 5H5a7 7 0 1 0 7-7z",
   stats: "M4 20h3V10H4zm6.5 0h3V4h-3zM17 20h3v-7h-3z",
   vr: "M3 7h18v10h-6l-2-3h-2l-2 3H3zm4.5 3a2 2 0 1 0 0 4 2 2 0 0 0 0-4zm9 0a2 2 0 1 0 0 4 2 2 0 0 0 0-4z",
+  ar: "M12 2l8.7 5v10L12 22l-8.7-5V7zm0 2.3L6.7 7.4 12 10.4l5.3-3zM5.3 9v6.8l5.7 3.3v-6.8zm13.4 0L13 12.3v6.8l5.7-3.3z",
   full: "M5 5h5v2H7v3H5zm9 0h5v5h-2V7h-3zM5 14h2v3h3v2H5zm12 0h2v5h-5v-2h3z",
 };
 
@@ -41,6 +42,7 @@ export const MARKUP = `
     ${button("reset", "Reset the camera (R)")}
     ${button("stats", "Statistics (S)", 'aria-pressed="false"')}
     ${button("vr", "Virtual reality", "hidden")}
+    ${button("ar", "Augmented reality: tap the floor to move the scene", "hidden")}
     ${button("full", "Full screen (F)")}
   </div>
 </div>`;

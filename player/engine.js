@@ -2,6 +2,7 @@
 //
 //   source --payload--> group worker (decode, evaluate, project) --Gaussians of a band--> raster worker --pixels--> canvas
 //                                                                \--visible Gaussians--> GPU, on a canvas above
+//                                                                \--an answer--> `ask`, for scenes of other programs
 
 import { AdaptiveSource } from "./abr.js";
 import { ALL, AUTO, Native, load } from "./native.js";
@@ -13,9 +14,13 @@ const AHEAD = 10; // seconds of payloads to fetch ahead
 const GROUP_WORKERS = 2;
 const RASTER_WORKERS_MAX = 8;
 
-// A script from another origin cannot be a worker, but a worker may import it.
-function start(url) {
-  if (url.origin === location.origin) return new Worker(url, { type: "module" });
+// A script from another origin cannot be a worker, but a worker may import it. Bundlers know a worker by these words, and
+// are to leave `script` alone.
+function start(script = "./worker.js") {
+  if (new URL(import.meta.url).origin === location.origin) {
+    return new Worker(new URL("./worker.js", import.meta.url), { type: "module" });
+  }
+  const url = new URL(script, import.meta.url);
   const blob = new Blob([`import ${JSON.stringify(url.href)};`], { type: "text/javascript" });
   return new Worker(URL.createObjectURL(blob), { type: "module" });
 }
@@ -29,19 +34,21 @@ export class Engine extends EventTarget {
   stats = { decode: 0, project: 0, blend: 0, gaussians: 0, link: 0 };
   #workers = [];
   #rasters = [];
+  #asked = new Map(); // id -> {resolve, reject} of a request
+  #requests = 0;
 
-  constructor(canvas, base, src) {
+  // canvas: null if nothing is to be drawn
+  constructor(canvas, src) {
     super();
-    this.base = base;
     this.source = /\.mpd($|[?#])/.test(src) ? new AdaptiveSource(src) : new Source(src);
     this.source.addEventListener("received", ({ detail: { bytes, ms } }) => {
       if (bytes > 20_000) this.stats.link = (8e-3 * bytes) / ms;
     });
     const cores = navigator.hardwareConcurrency || 2;
-    const count = Math.min(Math.max(cores - 1, 2), RASTER_WORKERS_MAX);
-    this.#rasters = Array.from({ length: count }, () => start(new URL("worker.js", base)));
-    this.#workers = Array.from({ length: GROUP_WORKERS }, () => start(new URL("worker.js", base)));
-    this.renderer = new Renderer(canvas, base, { rasters: count, stats: this.stats, say: (type, detail) => this.#say(type, detail) });
+    const count = canvas ? Math.min(Math.max(cores - 1, 2), RASTER_WORKERS_MAX) : 0;
+    this.#rasters = Array.from({ length: count }, () => start());
+    this.#workers = Array.from({ length: GROUP_WORKERS }, () => start());
+    this.renderer = new Renderer(canvas, { rasters: count, stats: this.stats, say: (type, detail) => this.#say(type, detail) });
   }
 
   #say(type, detail) {
@@ -50,7 +57,7 @@ export class Engine extends EventTarget {
 
   // Resolves when the config and the first groups are known.
   async open() {
-    const module = load(new URL("native.wasm.gz", this.base)); // while the first bytes of the file are on their way
+    const module = load(new URL("./native.wasm.gz", import.meta.url)); // while the first bytes of the file are on their way
     module.then((m) => this.closed || this.#connect(m), () => {});
     await this.source.open(async () => Native.create(await module));
   }
@@ -79,6 +86,7 @@ export class Engine extends EventTarget {
     this.source.close();
     for (const g of this.groups.values()) g.abort?.abort();
     for (const w of [...this.#workers, ...this.#rasters]) w.terminate();
+    for (const { reject } of this.#asked.values()) reject(new Error("the stream was closed"));
     this.renderer.close();
   }
 
@@ -97,11 +105,20 @@ export class Engine extends EventTarget {
 
   // Requests the image of frame t, whose group is decoded.
   draw(t, view) {
+    const { header } = this.groups.get(this.groupOf(t));
+    this.#post(t, { ...this.renderer.begin({ t, view, gaussians: header.gaussians }, this.source.config.background), view });
+  }
+
+  // Resolves with the answer of the worker that has the group of frame t, which is decoded.
+  ask(t, message) {
+    const id = `ask ${++this.#requests}`;
+    this.#post(t, { ...message, id });
+    return new Promise((resolve, reject) => this.#asked.set(id, { resolve, reject }));
+  }
+
+  #post(t, message) {
     const group = this.groupOf(t);
-    const { worker, header } = this.groups.get(group);
-    const local = t - this.source.groups[group].start_frame;
-    const how = this.renderer.begin({ t, view, gaussians: header.gaussians }, this.source.config.background);
-    worker.postMessage({ ...how, group, t: local, view });
+    this.groups.get(group).worker.postMessage({ ...message, group, t: t - this.source.groups[group].start_frame });
   }
 
   get fps() {
@@ -243,6 +260,10 @@ export class Engine extends EventTarget {
   }
 
   #onGroup(worker, m) {
+    const asked = this.#asked.get(m.id);
+    this.#asked.delete(m.id);
+    if (asked && m.type !== "failed") return asked.resolve(m);
+    asked?.reject(new Error(m.message));
     const entry = this.groups.get(m.group);
     if (m.type === "decoded") {
       this.stats.decode = m.ms / m.header.frames;

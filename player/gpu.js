@@ -4,6 +4,8 @@
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i; // slower than the wasm rasterizer
 const ALPHA_MIN = 1 / 255;
 const LOW_PASS = 0.3;
+const AHEAD = 2; // metres from the viewer to a scene that stands on the floor
+const REACH = 20; // metres that a tap reaches
 const FAR = 1e6; // of the depth buffer, which nothing else uses
 
 // The name of the GPU behind WebGL2; null where there is none, or one that is software.
@@ -21,6 +23,12 @@ function nameOf(gl) {
   return /^ANGLE \([^,]*, (.*?)(?: \(0x|,|$)/.exec(name)?.[1] ?? name; // of "ANGLE (maker, name (0x..) .., driver)"
 }
 
+// Where a ray (column-major 4 x 4, along -z) meets the floor: x and z; null if it does not.
+function onFloor(m) {
+  const t = m && m[13] / m[9]; // height over fall
+  return t > 0 && t < REACH ? [m[12] - t * m[8], m[14] - t * m[10]] : null;
+}
+
 export class Gpu {
   #busy = Promise.resolve();
   #spark;
@@ -34,8 +42,8 @@ export class Gpu {
   #head = null; // the camera of a session
 
   // origin: middle of the scene, which packed Gaussians are relative to; background: 3 numbers
-  static async create(canvas, base, { origin, background }) {
-    const spark = await import(new URL("spark.js", base));
+  static async create(canvas, { origin, background }) {
+    const spark = await import("./spark.js");
     if (!canvas.getContext("webgl2", { antialias: false, alpha: false })) throw new Error("this browser has no WebGL2 here");
     return new Gpu(spark, canvas, origin, background);
   }
@@ -71,15 +79,27 @@ export class Gpu {
   }
 
   // Shows the scene in a headset until the session ends: from where the view (19 numbers) looks, `metres` for a unit of it.
+  // With `foot`, a point of the scene, it stands on the floor of the room (augmented reality), and a tap moves it there.
   // Calls tick() for each image of the session: meanwhile the window's own clock may stand still.
-  async enter(session, view, metres, tick) {
+  async enter(session, { view, metres, foot }, tick) {
     const { xr } = this.#renderer;
     xr.enabled = true;
-    xr.setReferenceSpaceType("local"); // its origin is the head at the start
+    xr.setReferenceSpaceType(foot ? "local-floor" : "local"); // the origin is the head at the start, or the floor below it
     await xr.setSession(session);
     this.#head = new this.#spark.PerspectiveCamera();
     const { Matrix4 } = this.#spark;
-    this.#place(this.#toCamera(view).premultiply(new Matrix4().makeScale(metres, metres, metres)));
+    const upright = this.#toCamera(view).premultiply(new Matrix4().makeScale(metres, metres, metres));
+    const stand = (x, z) => {
+      const [fx, fy, fz] = this.#mesh.position.clone().set(...foot).applyMatrix4(upright);
+      this.#place(upright.clone().premultiply(new Matrix4().makeTranslation(x - fx, -fy, z - fz)));
+    };
+    if (foot) {
+      stand(0, -AHEAD);
+      session.addEventListener("select", (e) => {
+        const at = onFloor(e.frame.getPose(e.inputSource.targetRaySpace, xr.getReferenceSpace())?.transform.matrix);
+        if (at) stand(...at);
+      });
+    } else this.#place(upright);
     this.#sorter.autoUpdate = true;
     this.#renderer.setAnimationLoop(() => {
       tick();

@@ -90,6 +90,12 @@ export class Native {
     this.check(this.x.frame(slot, t));
   }
 
+  // An attribute of the evaluated frame: 0 means, 1 quats, 2 log scales, 3 logit opacities, 4 sh0, 5 shN.
+  attribute(which) {
+    this.x.attribute(which);
+    return this.floats();
+  }
+
   floats() {
     return new Float32Array(this.output().buffer);
   }
@@ -113,10 +119,10 @@ export class Native {
     return bands;
   }
 
-  // The visible Gaussians for Spark (see pack.rs), relative to an origin: a view into the memory of the instance.
-  pack(view, origin) {
+  // The visible Gaussians, or all, for Spark (see pack.rs), relative to an origin: a view into the memory of the instance.
+  pack(view, origin, all) {
     this.put(new Uint8Array(view.buffer, view.byteOffset, view.byteLength));
-    this.check(this.x.pack(...origin));
+    this.check(this.x.pack(...origin, all));
     return this.bytes(this.x.output(), this.x.output_length());
   }
 

@@ -2,16 +2,15 @@
 //
 // Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the image fills the
 // element); quality="auto" or 0.1 to 1; layers="2" or "all", else as many as link and device sustain; renderer="cpu" or "gpu",
-// else the GPU if it is hardware.
+// else the GPU if it is hardware; camera="NAME", of the file; background="rrggbb"; controls="off".
 // Properties: paused, frame, frameCount, fps, camera, stats. Methods: play(), pause(), show(frame). Events: ready, picture,
 // ended, error.
 
-import { Camera } from "./camera.js";
+import { Camera, viewFrom } from "./camera.js";
 import { MARKUP, clock, onDrag, onKeys, setIcon } from "./controls.js";
 import { Engine } from "./engine.js";
 import { ALL, AUTO } from "./native.js";
 
-const BASE = new URL(".", import.meta.url);
 const PIXELS_MAX = 4e6; // of a still image
 const PIXELS_START = 420_000; // of a moving one, before any measurement
 const PIXELS_MIN = 180_000; // fewer save little: the cost of the Gaussians stays
@@ -37,7 +36,7 @@ export class GsvPlayer extends HTMLElement {
   constructor() {
     super();
     const root = this.attachShadow({ mode: "open" });
-    root.innerHTML = `<link rel="stylesheet" href="${new URL("player.css", BASE)}">${MARKUP}`;
+    root.innerHTML = `<link rel="stylesheet" href="${new URL("./player.css", import.meta.url)}">${MARKUP}`;
     this.$ = (selector) => root.querySelector(selector);
     root.addEventListener("click", (e) => {
       const name = e.target.closest?.("[data-do]")?.dataset.do;
@@ -58,7 +57,9 @@ export class GsvPlayer extends HTMLElement {
       zoom: move((f) => this.camera.zoom(f)),
     });
     this.$("[data-do=full]").hidden = !document.fullscreenEnabled;
-    navigator.xr?.isSessionSupported("immersive-vr").then((yes) => (this.$("[data-do=vr]").hidden = !yes), () => {});
+    for (const way of ["vr", "ar"]) {
+      navigator.xr?.isSessionSupported(`immersive-${way}`).then((yes) => (this.$(`[data-do=${way}]`).hidden = !yes), () => {});
+    }
     this.$("[data-set=speed]").value = "1";
   }
 
@@ -152,7 +153,7 @@ export class GsvPlayer extends HTMLElement {
     this.$(".busy").hidden = false;
     Object.assign(this, { camera: null, paused: true, shown: null });
     [this.#position, this.#scale, this.#drawn] = [0, null, ""];
-    const engine = (this.engine = new Engine(this.$("canvas"), BASE, this.getAttribute("src")));
+    const engine = (this.engine = new Engine(this.$("canvas"), this.getAttribute("src")));
     engine.layers = this.#layers;
     const { source } = engine;
     const on = (target, type, f) => target.addEventListener(type, (e) => this.engine === engine && f(e.detail));
@@ -205,10 +206,14 @@ export class GsvPlayer extends HTMLElement {
     layers.replaceChildren(new Option("Auto layers", "auto"), new Option("All layers", "all"), ...choices);
     layers.value = { [ALL]: "all", [AUTO]: "auto" }[this.#layers] ?? String(Math.min(this.#layers, header.layers - 1));
     const { config } = engine.source;
+    const color = /^#?([0-9a-f]{6})$/i.exec(this.getAttribute("background") ?? "")?.[1];
+    if (color) config.background = [0, 2, 4].map((i) => parseInt(color.slice(i, i + 2), 16) / 255);
     this.camera = new Camera(engine.bounds, config.up, config.cameras);
+    this.camera.use(config.cameras.findIndex((c) => c.name === this.getAttribute("camera")));
     const select = this.$("[data-set=view]");
     select.replaceChildren(new Option("Free view", "orbit"), ...config.cameras.map((c, i) => new Option(c.name, i)));
     select.hidden = !config.cameras.length;
+    select.value = this.camera.reference ? String(config.cameras.indexOf(this.camera.reference)) : "orbit";
     if (this.hasAttribute("autoplay")) this.play();
     this.dispatchEvent(new CustomEvent("ready"));
   }
@@ -277,7 +282,7 @@ export class GsvPlayer extends HTMLElement {
   // The view; `sharp`: at full resolution.
   #view(sharp) {
     const head = this.engine.gpu?.head;
-    if (head) return this.camera.wide(head.map((v) => this.#near(v)));
+    if (head) return viewFrom(head.map((v) => this.#near(v)));
     const fixed = /^(\d+)x(\d+)$/.exec(this.getAttribute("size") ?? "");
     if (fixed) return this.camera.view(Number(fixed[1]), Number(fixed[2]));
     const stage = this.$(".stage");
@@ -325,17 +330,19 @@ export class GsvPlayer extends HTMLElement {
     }
   }
 
-  // Enters virtual reality: a scene as tall as a person, drawn on the GPU.
-  async #enter() {
+  // Enters virtual ("vr") or augmented reality ("ar"): a scene as tall as a person, drawn on the GPU; in "ar" on the floor.
+  async #enter(way) {
     const { engine, camera } = this;
     try {
-      const session = await navigator.xr.requestSession("immersive-vr");
+      const needs = way === "ar" ? { requiredFeatures: ["local-floor"] } : {};
+      const session = await navigator.xr.requestSession(`immersive-${way}`, needs);
       await engine.use("gpu");
       if (!engine.gpu) return session.end();
-      await engine.gpu.enter(session, camera.level(), TALL / (2 * camera.radius), () => this.#step());
+      const how = { view: camera.level(), metres: TALL / (2 * camera.radius), foot: way === "ar" ? camera.foot : null };
+      await engine.gpu.enter(session, how, () => this.#step());
       session.addEventListener("end", () => (this.#drawn = "", this.#render()));
     } catch (e) {
-      this.#note("gpu", `Virtual reality cannot be used here (${e.message}).`);
+      this.#note("gpu", `${way === "ar" ? "Augmented" : "Virtual"} reality cannot be used here (${e.message}).`);
     }
   }
 
@@ -482,7 +489,8 @@ export class GsvPlayer extends HTMLElement {
         this.$(".stats").hidden = !hidden;
         this.$("[data-do=stats]").setAttribute("aria-pressed", hidden);
       },
-      vr: () => this.#enter(),
+      vr: () => this.#enter("vr"),
+      ar: () => this.#enter("ar"),
       full: () => (document.fullscreenElement ? document.exitFullscreen() : this.requestFullscreen()),
       retry: () => this.#open(),
     };

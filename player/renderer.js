@@ -13,9 +13,9 @@ export class Renderer {
   #closed = false;
 
   // rasters: number of raster workers; stats: gets blend and gaussians; say(type, detail): events picture, nogpu, fatal
-  constructor(canvas, base, { rasters, stats, say }) {
-    Object.assign(this, { canvas, base, rasters, stats, say });
-    this.context = canvas.getContext("2d", { alpha: false });
+  constructor(canvas, { rasters, stats, say }) {
+    Object.assign(this, { canvas, rasters, stats, say });
+    this.context = canvas?.getContext("2d", { alpha: false });
   }
 
   close() {
@@ -32,7 +32,7 @@ export class Renderer {
     canvas.hidden = true;
     const [low, high] = [bounds.slice(0, 3), bounds.slice(3)];
     const origin = low.map((v, i) => (v + high[i]) / 2);
-    const gpu = await Gpu.create(canvas, this.base, { origin, background });
+    const gpu = await Gpu.create(canvas, { origin, background });
     if (this.#closed || this.gpu || this.#how !== how) return gpu.close();
     this.canvas.after(canvas);
     canvas.addEventListener("webglcontextlost", () => this.#loseGpu("its context was lost"));
@@ -45,7 +45,7 @@ export class Renderer {
     gpu?.canvas.remove();
     gpu?.close();
     for (const [id, image] of this.#images) if (image.gpu) this.#images.delete(id);
-    this.canvas.hidden = false;
+    if (this.canvas) this.canvas.hidden = false;
   }
 
   #loseGpu(why) {
@@ -68,7 +68,7 @@ export class Renderer {
     const id = this.#next++;
     const gpu = this.gpu;
     this.#images.set(id, { ...image, gpu, parts: [], blend: 0 });
-    return gpu ? { type: "pack", origin: gpu.origin, id } : { type: "draw", background, id };
+    return gpu ? { type: "pack", origin: gpu.origin, all: gpu.head !== null, id } : { type: "draw", background, id };
   }
 
   // The group worker has failed to draw an image.

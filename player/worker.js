@@ -1,7 +1,7 @@
 // A worker of the player, in one of two roles.
 //
 // group:  decodes and keeps groups; frame t + view -> projected Gaussians of each band of rows, to the worker of the band, or
-//         the visible ones packed for the GPU, to the page.
+//         the visible ones packed for the GPU, or the attributes of all, to the page.
 // raster: projected Gaussians of a band -> its pixels, to the page.
 //
 // Two group workers alternate: one shows its group while the other decodes the next, so decoded groups are never copied. Each
@@ -75,11 +75,17 @@ function groupWorker(native, { ports }) {
     return { type: "projected", id, bands, ms: performance.now() - start };
   }
 
-  function pack({ id, group, t, view, origin }) {
+  function pack({ id, group, t, view, origin, all }) {
     const start = performance.now();
     evaluate(group, t);
-    const { buffer } = native.pack(view, origin).slice();
+    const { buffer } = native.pack(view, origin, all).slice();
     self.postMessage({ type: "packed", id, buffer, ms: performance.now() - start }, [buffer]);
+  }
+
+  function attributes({ id, group, t }) {
+    evaluate(group, t);
+    const values = [0, 1, 2, 3, 4, 5].map((which) => native.attribute(which));
+    self.postMessage({ type: "attributes", id, values }, values.map((v) => v.buffer));
   }
 
   self.onmessage = ({ data }) => {
@@ -87,6 +93,7 @@ function groupWorker(native, { ports }) {
       if (data.type === "decode") self.postMessage(decode(data));
       else if (data.type === "draw") self.postMessage(draw(data));
       else if (data.type === "pack") pack(data);
+      else if (data.type === "attributes") attributes(data);
       else if (data.type === "release" && slots.has(data.group)) {
         native.x.release(slots.get(data.group));
         slots.delete(data.group);

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from playing import FPS, GROUPS, LENGTH, PLAYER, canvas, load, part, psnr, screenshot, sequence, show
 from synthetic import encode_sequence
 
@@ -14,6 +15,7 @@ from gscodec.decode import open_stream
 from gscodec.encode.encode import stream_config
 from gscodec.encode.settings import EncodeSettings
 from gscodec.encode.writer import layer_ends
+from gscodec.model.camera import Camera, look_at
 from gscodec.render.image import render_image
 
 HEAD = 400  # bytes of a fragment before its payload, at most
@@ -49,6 +51,40 @@ def test_reference_cameras(browser, server, gsv):
     browser.eval(f"{PLAYER}.camera.orbit(0, 0)")  # a drag goes on from there
     after = browser.eval(f"Array.from({PLAYER}.camera.view(256, 192))")
     np.testing.assert_allclose(np.array(after)[6:18], np.array(before)[6:18], atol=2e-3)
+
+
+def test_a_view_from_where_a_camera_stood_is_never_empty(browser, server, other, tmp_path):
+    """Cameras amid the Gaussians: their pictures, and those of the free view that goes on from there."""
+    K, magenta = np.array([[90.0, 0, 80], [0, 90, 60], [0, 0, 1]]), (1.0, 0.0, 1.0)
+    eyes = ([0.0, 0, 0], [0.3, 0.2, -0.4])
+    inside = [
+        Camera(f"in{i}", K, look_at(np.array(e), np.add(e, [1, 0.1, 0.3]), np.array([0, 1.0, 0])), 160, 120, near=n)
+        for i, (e, n) in enumerate(zip(eyes, (0.005, 0.05), strict=True))
+    ]
+    path = tmp_path / "inside.gsv"
+    config = stream_config(fps=FPS, sh_degree=0, gaussians=4000, frames=LENGTH, cameras=inside, background=magenta)
+    encode_sequence(sequence(4000), path, config, EncodeSettings(quality=70))
+    stream = open_stream(path)
+    empty = lambda picture: (np.abs(picture.astype(int) - [255, 0, 255]).max(-1) < 3).mean()  # noqa: E731
+    for i, camera in enumerate(stream.cameras):
+        url, _ = other(path.read_bytes())
+        load(browser, server.url, src=url, size="160x120", autoplay="off", camera=f"in{i}")
+        assert browser.eval(f"{part('[data-set=view]')}.selectedOptions[0].text") == f"in{i}"
+        seen = show(browser, 2)
+        assert seen.near == pytest.approx(camera.near)
+        want = render_image(stream.frame(2), camera, magenta)
+        assert empty(want) < 0.2
+        assert psnr(canvas(browser), want) >= 35
+        browser.eval(f"{PLAYER}.camera.orbit(0, 0)")
+        assert show(browser, 2).near <= camera.near
+        assert empty(canvas(browser)) < 0.2
+
+
+def test_background_and_controls_of_a_page_that_embeds_it(browser, server):
+    load(browser, server.url, size="160x120", autoplay="off", background="20c040", controls="off")
+    show(browser, 0)
+    assert canvas(browser)[0, 0].tolist() == [0x20, 0xC0, 0x40]
+    assert browser.eval(f"getComputedStyle({part('.bar')}).display") == "none"
 
 
 def test_it_plays_loops_and_ends(browser, server):

@@ -129,6 +129,47 @@ def test_a_headset_sees_the_scene_with_two_eyes(on_gpu, gsv):
     assert comes_to(lambda: gpu_picture(on_gpu, 3)[1], shown)
 
 
+def test_augmented_reality_stands_on_the_floor_and_goes_where_one_taps(on_gpu, gsv):
+    on_gpu.eval(f"{{ {HEADSET.replace('CANVAS', GPU_CANVAS)} window.session.environmentBlendMode = 'alpha-blend'; }}")
+    on_gpu.eval("""{
+        navigator.xr.requestSession = async (...asked) => ((window.asked = asked), window.session);
+        window.session.requestReferenceSpace = async (type) => Object.assign(new EventTarget(), { type });
+    }""")
+    show(on_gpu, 2)
+    script = "[Array.from(c.level()), c.radius, Array.from(c.foot)]"
+    level, radius, foot = on_gpu.eval(f"((c) => {script})({PLAYER}.camera)")
+    bounds = on_gpu.eval(f"{PLAYER}.engine.bounds")
+    assert foot == [(bounds[0] + bounds[3]) / 2, bounds[1], (bounds[2] + bounds[5]) / 2]  # y is up
+    on_gpu.eval(f"{part('[data-do=ar]')}.click()")
+    on_gpu.wait("!!window.eyes")
+    assert on_gpu.eval("window.asked") == ["immersive-ar", {"requiredFeatures": ["local-floor"]}]
+    stream, flip = open_stream(gsv), np.diag([1.0, -1, -1])
+    turn = np.reshape(level[6:18], (3, 4))[:, :3]
+
+    def standing(x, z):
+        """Both eyes at the origin of the floor; the room behind the scene is black in a copy of the canvas."""
+        want = []
+        for eye in (-0.03, 0.03):
+            moved = flip @ np.array([x - eye, 0, z]) * radius - turn @ np.array(foot)  # a scene becomes 2 m high
+            view = [200, 200, 200, 200, 100, 100, *np.c_[turn, moved].ravel(), 0.01]
+            want.append(render_image(stream.frame(2), camera_of(view), (0, 0, 0)))
+        return np.concatenate(want, 1)
+
+    assert standing(0, -2).std() > 10
+    assert comes_to(lambda: pixels(on_gpu, "window.eyes"), standing(0, -2))
+    # a tap: a ray from 1.5 m above the floor, down and ahead to the right, which meets it at (0.5, -3)
+    on_gpu.eval("""{
+        const matrix = new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, -0.5, 1.5, 3, 0, 0, 1.5, 0, 1]);
+        const frame = { getPose: () => ({ transform: { matrix } }) };
+        window.session.dispatchEvent(Object.assign(new Event("select"), { frame, inputSource: {} }));
+    }""")
+    assert comes_to(lambda: pixels(on_gpu, "window.eyes"), standing(0.5, -3))
+    on_gpu.eval("window.session.end()")
+    camera, _ = gpu_picture(on_gpu, 3)
+    shown = render_image(stream.frame(3), camera, tuple(stream.config["background"]))
+    assert comes_to(lambda: gpu_picture(on_gpu, 3)[1], shown)
+
+
 def test_a_lost_context_is_made_up_for(on_gpu):
     on_gpu.eval(f"{GPU_CANVAS}.getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()")
     on_gpu.wait(f"!{PLAYER}.engine.onGpu")

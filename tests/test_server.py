@@ -15,6 +15,7 @@ import pytest
 from playing import ask, serving
 
 from gscodec.errors import UsageError
+from gscodec.player.export import export_page
 from gscodec.player.server import FILES, PAGE, Server, parse_range
 
 ROOT = Path(__file__).parent.parent
@@ -209,6 +210,21 @@ def test_the_command_refuses_what_is_no_stream(tmp_path):
         assert r.returncode == 1
         assert word in r.stderr
         assert "Traceback" not in r.stderr
+
+
+def test_an_exported_folder_is_for_any_static_host(tmp_path, gsv):
+    code = "from gscodec.cli import main; main()"
+    stream = tmp_path / "a film.gsv"
+    stream.write_bytes(gsv.read_bytes())
+    command = [sys.executable, "-c", code, "play", str(stream), "--export", str(tmp_path / "movies")]
+    for _ in range(2):
+        r = subprocess.run(command, capture_output=True, text=True, timeout=60)
+        assert r.returncode == 0, r.stderr
+        assert '<iframe src="movies/index.html?src=a%20film.gsv"' in r.stdout
+        assert {f.name for f in (tmp_path / "movies").iterdir()} == {*FILES, "a film.gsv"}
+        assert (tmp_path / "movies" / "a film.gsv").read_bytes() == gsv.read_bytes()
+    with pytest.raises(UsageError, match="finished stream"):
+        export_page(tmp_path / "a.gsv.part", tmp_path / "movies")
 
 
 def test_the_built_files_are_those_of_the_sources():
