@@ -10,6 +10,8 @@ Streams lie in FOLDER; a missing one is encoded first, which is not measured:
 
 Results of a stream:
   first_picture_ms       from the start of the navigation; page and stream come from this machine, nothing is cached
+  first_picture_slow_ms  the same over 2 Mbit/s with 40 ms to the first byte of each answer, as Chromium throttles a link
+  first_picture_bytes    received by then over that link
   fps_clock              frames per second where 60, the display's limit, are asked for; median of 3 x 2 s
   fps_free               frames per second where all frames are asked for in order, without the display's clock
   project_ms, blend_ms   medians per frame: evaluation and projection; the slower one of the raster workers
@@ -37,12 +39,15 @@ from .run import animated, gscodec
 
 SIZE = "512x512"
 LOADS = 5
+SLOW = {"offline": False, "latency": 40, "downloadThroughput": 2e6 / 8, "uploadThroughput": 2e6 / 8}  # ms, bytes a second
 PLAYER = "document.querySelector('gsv-player')"
 STATUES = {"statue": (40, ()), "statue_all": (40, ("--keep-all",)), "long": (300, ())}
 
 # keeps the time of the first picture in the page
 KEEP = "addEventListener('picture', () => (window.firstPicture ??= performance.now()), true)"
 FIRST = "window.firstPicture"
+RECEIVED = f"""performance.getEntries().filter((e) => e.startTime < {FIRST})
+    .reduce((sum, e) => sum + (e.transferSize ?? 0), 0)"""
 
 # draws `count` frames in order; times of each in ms
 FREE = """async ([count]) => {
@@ -138,16 +143,23 @@ def streams(folder: Path, names: list[str]) -> dict[str, Path]:
     return found
 
 
-def first_pictures(browsers: Browsers, url: str) -> list[float]:
-    """Milliseconds to the first picture, each in a new browser with an empty cache."""
+def first_pictures(browsers: Browsers, url: str, link: dict | None = None) -> tuple[float, int]:
+    """Milliseconds to the first picture, median of new browsers with an empty cache; bytes received by then.
+
+    `link`: how Chromium throttles it (Network.emulateNetworkConditions of its DevTools protocol).
+    """
     times = []
     for _ in range(LOADS):
         browser = browsers.start("--disable-gpu")
         browser.page.add_init_script(KEEP)
+        if link:
+            browser.call("Network.enable")
+            browser.call("Network.emulateNetworkConditions", **link)
         browser.goto(f"{url}?size={SIZE}")
         times.append(browser.wait(FIRST))
+        received = browser.eval(RECEIVED)
         browser.page.context.browser.close()
-    return times
+    return statistics.median(times), received
 
 
 def clocked(browser: Browser, url: str, seconds: int = 2) -> float:
@@ -209,10 +221,12 @@ def measure(browsers: Browsers, name: str, path: Path) -> dict:
     result = {"frames": info["frames"], "gaussians": info["gaussians"], "bytes": path.stat().st_size}
     if name == "long":
         return result | {"memory_mb": round(memory(browsers.start("--disable-gpu"), server.url))}
-    firsts = first_pictures(browsers, server.url)
+    slow, received = first_pictures(browsers, server.url, SLOW)
     browser = browsers.start("--disable-gpu")
     result |= {
-        "first_picture_ms": round(statistics.median(firsts)),
+        "first_picture_ms": round(first_pictures(browsers, server.url)[0]),
+        "first_picture_slow_ms": round(slow),
+        "first_picture_bytes": received,
         "fps_clock": round(clocked(browser, server.url), 1),
     }
     free = browser.page.evaluate(FREE, [100])
