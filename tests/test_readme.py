@@ -82,6 +82,12 @@ def test_table_of_the_player():
         assert all(map(agrees, (f.replace(",", "") for f in figures), values)), (name, figures, values)
 
 
+def test_bytes_before_the_first_picture():
+    found = result("first_picture")["streams"]["demo, preset fast"]
+    for name, text in (("after", "has received {} kB"), ("before", "({} before that")):
+        assert text.format(round(found[f"{name}_bytes"] / 1000)) in README
+
+
 def test_table_of_sparse_points():
     found = result("points")
     for name, *figures in rows("frame 0 of"):
