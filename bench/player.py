@@ -10,7 +10,7 @@ Streams lie in FOLDER; a missing one is encoded first, which is not measured:
 
 Results of a stream:
   first_picture_ms       from the start of the navigation; page and stream come from this machine, nothing is cached
-  first_picture_slow_ms  the same over 2 Mbit/s with 40 ms to the first byte of each answer, as Chromium throttles a link
+  first_picture_slow_ms  the same over 2 Mbit/s with 40 ms to the first byte of each answer, throttled by Chromium
   first_picture_bytes    received by then over that link
   fps_clock              frames per second where 60, the display's limit, are asked for; median of 3 x 2 s
   fps_free               frames per second where all frames are asked for in order, without the display's clock
@@ -39,7 +39,8 @@ from .run import animated, gscodec
 
 SIZE = "512x512"
 LOADS = 5
-SLOW = {"offline": False, "latency": 40, "downloadThroughput": 2e6 / 8, "uploadThroughput": 2e6 / 8}  # ms, bytes a second
+# ms, and bytes a second
+SLOW = {"offline": False, "latency": 40, "downloadThroughput": 2e6 / 8, "uploadThroughput": 2e6 / 8}
 PLAYER = "document.querySelector('gsv-player')"
 STATUES = {"statue": (40, ()), "statue_all": (40, ("--keep-all",)), "long": (300, ())}
 
