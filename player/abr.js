@@ -95,6 +95,10 @@ export class AdaptiveSource extends EventTarget {
     return this.#files[this.#chosen.get(i)]?.source.has(i) ?? false;
   }
 
+  sound(i) {
+    return this.#files[this.#chosen.get(i)]?.source.sound(i);
+  }
+
   level(i) {
     return this.#files[this.#chosen.get(i) ?? 0].source.config.level;
   }

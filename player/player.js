@@ -2,7 +2,8 @@
 //
 // Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the image fills the
 // element); quality="auto" or 0.1 to 1; layers="2" or "all", else as many as link and device sustain; renderer="cpu" or "gpu",
-// else the GPU if it is hardware; camera="NAME", of the file; background="rrggbb"; controls="off".
+// else the GPU if it is hardware; camera="NAME", of the file; background="rrggbb"; controls="off"; of sound: muted,
+// volume="0.5".
 // Properties: paused, frame, frameCount, fps, camera, stats. Methods: play(), pause(), show(frame). Events: ready, picture,
 // ended, error.
 
@@ -19,7 +20,7 @@ const TALL = 2; // metres, height of the scene in a headset
 const STALL = 300; // ms without an image until the busy sign appears
 
 export class GsvPlayer extends HTMLElement {
-  static observedAttributes = ["src", "loop", "speed", "quality", "size", "layers", "renderer"];
+  static observedAttributes = ["src", "loop", "speed", "quality", "size", "layers", "renderer", "muted", "volume"];
   paused = true;
   speed = 1;
   quality = "auto";
@@ -78,6 +79,7 @@ export class GsvPlayer extends HTMLElement {
     if (name === "loop") this.$("[data-do=loop]").setAttribute("aria-pressed", value !== null);
     if (name === "speed" && Number(value) > 0) this.speed = Number(value);
     if (name === "quality" && value) this.quality = value === "auto" ? value : Math.min(Math.max(Number(value) || 1, 0.1), 1);
+    if (name === "muted" || name === "volume") this.sound?.level();
     if (name === "layers") this.engine?.show(this.#layers);
     if (name === "renderer") {
       this.renderer = ["cpu", "gpu"].includes(value) ? value : "auto";
@@ -162,6 +164,7 @@ export class GsvPlayer extends HTMLElement {
     on(engine, "fatal", (message) => this.#fail("The player has stopped", `${message}.`));
     on(engine, "decoded", ({ header }) => this.#begin(engine, header));
     on(engine, "picture", (detail) => this.#pictured(detail));
+    on(engine, "silent", (why) => this.#note("sound", `The sound cannot be played (${why}).`));
     on(source, "retry", (why) => this.#note("link", `Connection lost (${why}). Trying again…`, true));
     on(source, "connected", () => this.#note("link", null));
     on(source, "error", (e) => this.#fail("The file cannot be read on", sentence(e.message)));
@@ -170,6 +173,7 @@ export class GsvPlayer extends HTMLElement {
       this.#request = requestAnimationFrame(() => this.#tick());
       await engine.open();
       if (this.engine !== engine) return;
+      if (source.config.audio) this.#hear(engine);
       if (source.missing) {
         const all = this.frameCount + source.missing;
         this.#note("cut", `The file is cut short: ${this.frameCount} of ${all} frames are there.`, true);
@@ -181,12 +185,19 @@ export class GsvPlayer extends HTMLElement {
     }
   }
 
+  // Not before there is sound to play: others do not load it.
+  async #hear(engine) {
+    const { Sound } = await import("./sound.js");
+    if (this.engine === engine) this.sound = new Sound(this, engine);
+  }
+
   #request = 0;
 
   #close() {
     cancelAnimationFrame(this.#request);
+    this.sound?.close();
     this.engine?.close();
-    this.engine = null;
+    this.sound = this.engine = null;
   }
 
   #grown() {
@@ -228,7 +239,7 @@ export class GsvPlayer extends HTMLElement {
   #step() {
     const { engine } = this;
     const now = performance.now();
-    const passed = Math.min(now - this.#last, 250) / 1000;
+    const passed = this.sound?.passed() ?? Math.min(now - this.#last, 250) / 1000;
     this.#last = now;
     if (!engine?.source?.groups.length || !this.$(".error").hidden) return;
     let group = engine.groupOf(this.frame);
@@ -237,6 +248,7 @@ export class GsvPlayer extends HTMLElement {
     engine.want(group, this.#loops);
     const ready = engine.ready(group) && this.camera;
     if (ready && !this.paused) this.#advance(passed);
+    this.sound?.follow(this.#position, ready && !this.paused, this.#loops);
     const shown = engine.groupOf(this.frame);
     if (ready && engine.ready(shown) && engine.renderer.free) this.#draw(now);
     this.#wait(now, ready && engine.ready(shown));

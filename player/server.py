@@ -32,6 +32,7 @@ FILES = {
     "source.js": "text/javascript; charset=utf-8",
     "abr.js": "text/javascript; charset=utf-8",
     "layers.js": "text/javascript; charset=utf-8",
+    "sound.js": "text/javascript; charset=utf-8",
     "worker.js": "text/javascript; charset=utf-8",
     "native.js": "text/javascript; charset=utf-8",
     "camera.js": "text/javascript; charset=utf-8",

@@ -1,5 +1,5 @@
-// A .gsv file behind a URL: the places of its groups, and their bytes by HTTP Range. With an index of layers (ssix) only the
-// requested layers are fetched.
+// A .gsv file behind a URL: the places of its groups, and their bytes by HTTP Range, sound included. With an index of layers
+// (ssix) only the requested layers are fetched.
 //
 // A finished file has an index (sidx), so one small request finds all groups; without it the headers of the fragments are
 // walked, and a growing file is polled. A server that ignores Range sends the whole file, which is then kept. All request
@@ -31,7 +31,7 @@ export class Source extends EventTarget {
   complete = false; // no more groups will come
   settled = false; // not complete, but it has not grown for a while
   received = 0;
-  #cache = new Map(); // group -> {bytes, whole}
+  #cache = new Map(); // group -> {bytes, size, sound}
   #head = new Uint8Array(); // first bytes of a finished file
   #whole = null; // all bytes so far, from a server without Range
   #closing = new AbortController();
@@ -97,11 +97,19 @@ export class Source extends EventTarget {
       this.#cache.set(i, kept); // least recently used ones are dropped first
       return kept.bytes;
     }
-    let bytes = await this.#read(g.offset, g.offset + size, signal);
-    if (bytes.length < size) throw new StreamError("the file ends within them");
-    if (g.indexed) bytes = this.#unwrap(g, bytes);
-    this.#keep(i, { bytes, size });
+    const at = g.audio?.offset ?? g.offset;
+    let bytes = await this.#read(at, g.offset + size, signal);
+    if (bytes.length < g.offset + size - at) throw new StreamError("the file ends within them");
+    const { audio, offset, size: all } = g.indexed ? this.#inside(g, bytes) : g;
+    const sound = audio && { ...audio, bytes: bytes.slice(audio.offset - at, offset - at) };
+    if (offset > at) bytes = bytes.slice(offset - at, offset - at + all);
+    this.#keep(i, { bytes, size, sound });
     return bytes;
+  }
+
+  // {time, samples: [size, duration] of each, bytes}: the sound that came with group i.
+  sound(i) {
+    return this.#cache.get(i)?.sound;
   }
 
   #say(type, detail) {
@@ -129,8 +137,8 @@ export class Source extends EventTarget {
     this.#say("groups");
   }
 
-  // The payload in a fragment of the index, or in the start of one.
-  #unwrap(g, fragment) {
+  // The entry of the group in a fragment of the index, or in the start of one.
+  #inside(g, fragment) {
     const known = this.native.describe().groups.length;
     this.native.x.seek(g.offset);
     this.native.push(fragment);
@@ -139,7 +147,7 @@ export class Source extends EventTarget {
     if (!found || more || found.start_frame !== g.start_frame || found.frames !== g.frames) {
       throw new StreamError("the index of the file disagrees with its fragments");
     }
-    return fragment.slice(found.offset - g.offset, found.offset - g.offset + found.size);
+    return found;
   }
 
   // Groups that the demuxer has passed.

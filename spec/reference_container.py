@@ -145,6 +145,18 @@ class Config:
     timescale: int = 0
     track_id: int = 0
     defaults: dict = field(default_factory=dict)  # of trex: duration, size, flags
+    audio: "Audio | None" = None
+
+
+@dataclass
+class Audio:
+    """The audio track (clause 2.7)."""
+
+    track_id: int
+    timescale: int
+    media_start: int
+    entry: bytes  # a whole box
+    defaults: dict
 
 
 @dataclass
@@ -155,6 +167,7 @@ class Sample:
     frames: int
     sync: bool
     payload: bytes
+    audio: tuple | None = None  # (media time, [(size, duration)], bytes)
 
 
 def read_container(data):
@@ -173,11 +186,12 @@ def read_container(data):
             require(not pending, f"moof at byte {offset}: the mdat of the one before is missing")
             pending = read_moof(data, box, config)
         elif kind == b"mdat":
-            for start, size, *timing in pending:
-                inside = body <= start and start + size <= end
-                require(inside, f"sample at byte {start}, {size} bytes: outside the next mdat")
+            for start, size, *timing, audio in pending:
+                at = start if audio is None else start - sum(size for size, _ in audio[1])
+                require(body <= at and start + size <= end, f"sample at byte {at}: outside the next mdat")
                 if start + size <= len(data):
-                    samples.append(Sample(*timing, bytes(data[start : start + size])))
+                    audio = audio and (*audio, bytes(data[at:start]))
+                    samples.append(Sample(*timing, bytes(data[start : start + size]), audio))
             pending = []
         first = False
     require(config is not None, "no moov box: not a whole gsv file")
@@ -191,28 +205,59 @@ def read_ftyp(data, body, end):
     require(b"gsv1" in brands[:1] + brands[2:], f"ftyp: brands {brands} (and version), expected gsv1")
 
 
-def read_moov(data, moov):
-    """Clause 2.2: the first track of handler `volv`."""
+def tracks(data, moov, handler):
+    """The tracks of a handler."""
     for trak in list(boxes(data, moov[2], moov[3])):
         hdlr = find_box(data, trak, [b"mdia", b"hdlr"]) if trak[0] == b"trak" else None
-        if hdlr is not None and data[hdlr[2] + 8 : min(hdlr[3], hdlr[2] + 12)] == b"volv":
-            break
-    else:
-        raise BitstreamError("moov: no track with handler volv")
+        if hdlr is not None and data[hdlr[2] + 8 : min(hdlr[3], hdlr[2] + 12)] == handler:
+            yield trak
 
+
+def read_moov(data, moov):
+    """Clause 2.2: the first track of handler `volv`, and the audio track."""
+    trak = next(tracks(data, moov, b"volv"), None)
+    require(trak is not None, "moov: no track with handler volv")
     track_id, timescale = read_timed(data, trak, [b"tkhd"]), read_timed(data, trak, [b"mdia", b"mdhd"])
     require(timescale > 0, "mdhd: timescale is 0")
     config = read_sample_entry(data, trak)
     config.track_id, config.timescale = track_id, timescale
-    config.defaults = {"duration": 0, "size": 0, "flags": 0}
+    config.defaults = read_defaults(data, moov, track_id)
+    config.audio = read_audio_track(data, moov)
+    return config
+
+
+def read_defaults(data, moov, track_id):
+    """Clause 2.2: duration, size and flags in trex."""
     mvex = find_box(data, moov, [b"mvex"])
     for box in boxes(data, mvex[2], mvex[3]) if mvex else ():
         reader = Reader(data, box[2], box[3], "trex")
         if box[0] == b"trex" and (reader.u32(), reader.u32())[1] == track_id:
             reader.u32()  # default_sample_description_index
-            config.defaults = {name: reader.u32() for name in ("duration", "size", "flags")}
-            break
-    return config
+            return {name: reader.u32() for name in ("duration", "size", "flags")}
+    return {"duration": 0, "size": 0, "flags": 0}
+
+
+def read_audio_track(data, moov):
+    """Clause 2.7, moov; None if there is none."""
+    for trak in tracks(data, moov, b"soun"):
+        stsd = find_box(data, trak, [b"mdia", b"minf", b"stbl", b"stsd"])
+        entry = next(boxes(data, stsd[2] + 8, stsd[3]), None) if stsd else None
+        if entry is None or entry[0] not in (b"mp4a", b"Opus"):
+            continue
+        kind, offset, body, end = entry
+        if end - offset > 4096:
+            raise LimitError(f"sample entry at byte {offset}: {end - offset} bytes, at most 4096 are allowed")
+        open_box(data, (kind, offset, body + 28, end), [b"esds" if kind == b"mp4a" else b"dOps"])
+        timescale = read_timed(data, trak, [b"mdia", b"mdhd"])
+        require(timescale > 0, "audio track, mdhd: timescale is 0")
+        track_id, media_start = read_timed(data, trak, [b"tkhd"]), 0
+        if find_box(data, trak, [b"edts", b"elst"]):
+            elst = open_box(data, trak, [b"edts", b"elst"])
+            long, count = elst.u32() >> 24 == 1, elst.u32()
+            media_start = (elst.u64(), elst.u64())[1] if long else (elst.u32(), elst.u32())[1]
+            require(count == 1 and media_start < 2**31, f"elst: {count} edits at {media_start}, expected one edit")
+        return Audio(track_id, timescale, media_start, bytes(data[offset:end]), read_defaults(data, moov, track_id))
+    return None
 
 
 def read_timed(data, trak, path):
@@ -271,40 +316,74 @@ def read_gsvc(r):
     )
 
 
-def read_moof(data, moof, config):
-    """Clause 2.4: [(offset, size, start_frame, frames, sync)] of the gsv track: none or one."""
+def read_traf(data, moof, track_id, defaults):
+    """Clause 2.4: (base, defaults, time, trun) of the traf of a track; None if there is none."""
     for traf in list(boxes(data, moof[2], moof[3])):
         if traf[0] != b"traf":
             continue
         tfhd = open_box(data, traf, [b"tfhd"])
-        flags, track_id = tfhd.u32() & 0xFFFFFF, tfhd.u32()
-        if track_id != config.track_id:
+        flags, found = tfhd.u32() & 0xFFFFFF, tfhd.u32()
+        if found != track_id:
             continue
-        sample = dict(config.defaults)
+        defaults = dict(defaults)
         base = tfhd.u64() if flags & 0x01 else moof[1]
         if flags & 0x02:
             tfhd.u32()  # sample_description_index
         for bit, name in ((0x08, "duration"), (0x10, "size"), (0x20, "flags")):
             if flags & bit:
-                sample[name] = tfhd.u32()
+                defaults[name] = tfhd.u32()
         tfdt = open_box(data, traf, [b"tfdt"])
         time = tfdt.u64() if tfdt.u32() >> 24 == 1 else tfdt.u32()
         truns = sum(box[0] == b"trun" for box in boxes(data, traf[2], traf[3]))
-        trun = open_box(data, traf, [b"trun"])
-        flags, count = trun.u32() & 0xFFFFFF, trun.u32()
-        require(truns == 1 and count == 1, f"moof at byte {moof[1]}: {truns} trun of {count} samples, expected 1 of 1")
-        start = base + (trun.i32() if flags & 0x001 else 0)
-        if flags & 0x004:
-            sample["flags"] = trun.u32()  # first_sample_flags
-        for bit, name in ((0x100, "duration"), (0x200, "size"), (0x400, "flags")):
-            if flags & bit:
-                sample[name] = trun.u32()
-        frames, rest = divmod(sample["duration"], config.frame_duration)
-        require(
-            rest == 0 and frames >= 1,
-            f"moof at byte {moof[1]}: duration {sample['duration']} is not a number of frames",
-        )
-        start_frame, rest = divmod(time, config.frame_duration)
-        require(rest == 0, f"moof at byte {moof[1]}: decode time {time} is not a number of frames")
-        return [(start, sample["size"], start_frame, frames, not sample["flags"] >> 16 & 1)]
-    return []
+        require(truns <= 1, f"moof at byte {moof[1]}: {truns} trun of a track, expected one, of one sample or of sound")
+        return base, defaults, time, open_box(data, traf, [b"trun"])
+    return None
+
+
+def read_moof(data, moof, config):
+    """Clause 2.4: [(offset, size, start_frame, frames, sync, audio)] of the gsv track: none or one."""
+    found = read_traf(data, moof, config.track_id, config.defaults)
+    if found is None:
+        return []
+    base, sample, time, trun = found
+    flags, count = trun.u32() & 0xFFFFFF, trun.u32()
+    require(count == 1, f"moof at byte {moof[1]}: {count} samples, expected 1")
+    start = base + (trun.i32() if flags & 0x001 else 0)
+    if flags & 0x004:
+        sample["flags"] = trun.u32()  # first_sample_flags
+    for bit, name in ((0x100, "duration"), (0x200, "size"), (0x400, "flags")):
+        if flags & bit:
+            sample[name] = trun.u32()
+    frames, rest = divmod(sample["duration"], config.frame_duration)
+    require(
+        rest == 0 and frames >= 1,
+        f"moof at byte {moof[1]}: duration {sample['duration']} is not a number of frames",
+    )
+    start_frame, rest = divmod(time, config.frame_duration)
+    require(rest == 0, f"moof at byte {moof[1]}: decode time {time} is not a number of frames")
+    audio = read_sound(data, moof, config.audio, start) if config.audio else None
+    return [(start, sample["size"], start_frame, frames, not sample["flags"] >> 16 & 1, audio)]
+
+
+def read_sound(data, moof, audio, group):
+    """Clause 2.7: (media time, [(size, duration)]) of the samples in front of a group, None if there are none."""
+    found = read_traf(data, moof, audio.track_id, audio.defaults)
+    if found is None:
+        return None
+    base, defaults, time, trun = found
+    flags, count = trun.u32() & 0xFFFFFF, trun.u32()
+    if count > 65536:
+        raise LimitError(f"traf of the audio track: {count} samples, at most 65536 are allowed")
+    start, samples = base + (trun.i32() if flags & 0x001 else 0), []
+    if flags & 0x004:
+        trun.u32()  # first_sample_flags
+    for _ in range(count):
+        duration = trun.u32() if flags & 0x100 else defaults["duration"]
+        size = trun.u32() if flags & 0x200 else defaults["size"]
+        trun.take(4 * (flags >> 10 & 3).bit_count())  # flags, composition offset
+        require(size > 0 and duration > 0, f"moof at byte {moof[1]}: {size} bytes, {duration} units, at least one byte")
+        samples.append((size, duration))
+    end = start + sum(size for size, _ in samples)
+    fits = not samples or end == group
+    require(fits, f"moof at byte {moof[1]}: sound ends at byte {end}, expected where the group starts")
+    return (time, samples) if samples else None

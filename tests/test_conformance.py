@@ -75,6 +75,8 @@ def test_valid(name):
         assert ours.frames == fragment["frames"]
         for key in ("start_frame", "frames", "sync"):
             assert getattr(sample, key) == fragment[key] == facts[key]
+        sound = fragment.get("audio")  # (offset, time, samples)
+        assert sample.audio == (sound and (*sound[1:], data[sound[0] : fragment["offset"]]))
         frames = sample.frames
         for t in sorted({0, 1, frames // 2, frames - 1} & set(range(frames))):
             expected, frame = reference.evaluate(group, t), ours.frame(t)

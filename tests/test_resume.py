@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from interrupting import gscodec, write_capture
+from sounding import write_tone
 
 from gscodec.decode import open_stream
 from gscodec.fingerprint import inputs, program, sentence
@@ -68,6 +69,19 @@ def test_ctrl_c_leaves_a_file_that_plays(capture, tmp_path):
     np.testing.assert_array_equal(stream.frame(0).means, open_stream(capture / "whole.gsv").frame(0).means)
     assert gscodec("encode", capture, out, *ENCODE) == 0
     same(capture, out)
+
+
+def test_sound_goes_on_too(capture, tmp_path):
+    write_tone(tmp_path / "tone.wav", 0.2)
+    out, whole, options = tmp_path / "a.gsv", tmp_path / "b.gsv", (*ENCODE, "--audio", tmp_path / "tone.wav")
+    for at in (("fragment", 2), ("index", 1)):
+        assert gscodec("encode", capture, out, *options, at=at) == -signal.SIGKILL
+    assert gscodec("encode", capture, out, *options) == 0
+    assert gscodec("encode", capture, whole, *options) == 0
+    assert out.read_bytes() == whole.read_bytes()
+    plain, sounding = open_stream(capture / "whole.gsv"), open_stream(out)
+    assert [sounding.payload(i) for i in range(4)] == [plain.payload(i) for i in range(4)]
+    assert sum("audio" in g for g in sounding.groups) >= 2
 
 
 def test_other_settings_start_anew_beside_old_checkpoints(capture, tmp_path):

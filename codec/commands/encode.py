@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from ..encode.settings import EncodeSettings
     from .sources import TrainOptions
 
+LENGTHS_DIFFER = 0.1  # seconds between the ends of sound and video that nobody notices
+
 
 ENDED = {  # ParametricGroup.ended
     "cut": "it cannot be tracked",
@@ -58,18 +60,21 @@ def encode(
     from_maps: Annotated[
         bool, typer.Option("--from-maps", help="SEQ is a folder of attribute maps, of decode --maps.")
     ] = False,
+    audio: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Sound: AAC and Opus are taken as they are, all else as AAC.")
+    ] = None,
     report: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the report there.")] = None,
 ) -> None:
     """Capture or Gaussian sequence to a stream. A second run resumes; Ctrl-C leaves a playable file."""
     if from_maps:
-        _from_maps(seq, out)
+        _from_maps(seq, out, audio)
         return
     from ..encode.settings import EncodeSettings
     from .sources import TrainOptions
 
     with Bar() as bar:
         settings = EncodeSettings(quality, _bits(bitrate), keep_all, random_access, layers, refine)
-        result = encode_input(seq, out, settings, TrainOptions(preset, frames, gop, motion, ray), bar)
+        result = encode_input(seq, out, settings, TrainOptions(preset, frames, gop, motion, ray), bar, audio)
     if report:
         report.write_text(json.dumps(result.to_json(), indent=1))
     if result.groups == 0:
@@ -95,13 +100,14 @@ def encode(
         raise typer.Exit(130)
 
 
-def _from_maps(folder: Path, out: Path) -> None:
+def _from_maps(folder: Path, out: Path, audio: Path | None) -> None:
+    from ..encode.audio import read_audio
     from ..encode.from_maps import encode_maps
 
     if out.suffix != ".gsv":
         raise UsageError(f"{out}: the output must be named *.gsv")
     out.parent.mkdir(parents=True, exist_ok=True)
-    frames, size = encode_maps(folder, out)
+    frames, size = encode_maps(folder, out, read_audio(audio) if audio else None)
     stdout.print(f"{out}: {frames} frames, {size} bytes")
 
 
@@ -115,12 +121,15 @@ def _bits(rate: str | None) -> float | None:
         raise UsageError(f"--bitrate {rate}: expected bits per second, such as 8M, 500k or 250000") from None
 
 
-def encode_input(source: Path, out: Path, settings: EncodeSettings, options: TrainOptions, bar: Bar) -> EncodeReport:
-    """Encodes a capture or splats at `source` into the file `out`.
+def encode_input(
+    source: Path, out: Path, settings: EncodeSettings, options: TrainOptions, bar: Bar, audio: Path | None = None
+) -> EncodeReport:
+    """Encodes a capture or splats at `source`, and the sound of the file `audio`, into the file `out`.
 
     Raises:
         UsageError, CaptureError: see the message.
     """
+    from ..encode.audio import read_audio
     from ..encode.encode import StreamOutput, encode_groups
     from ..splats import detect_input
     from .sources import capture_source, splat_source
@@ -133,16 +142,19 @@ def encode_input(source: Path, out: Path, settings: EncodeSettings, options: Tra
     kind = detect_input(source)
     if kind == "splats" and options.cluster:
         raise UsageError(f"--ray {options.cluster}: {source} holds splats, which need no training; leave --ray away")
+    sound = read_audio(audio) if audio else None
     out.parent.mkdir(parents=True, exist_ok=True)
     if kind == "splats":
         opened = splat_source(source, settings, options.frames, options.gop, bar)
         on_group = lambda r: bar.update("encode", r.frames, opened.frames)  # noqa: E731
     else:
         opened, on_group = capture_source(source, out, settings, options, bar), None
+    if sound:
+        _compare_lengths(audio, sound.seconds, opened.frames / opened.config["fps"], bar)
     made_by = {"program": program(), "input": inputs(source), "settings": asdict(opened.settings) | opened.made_of}
     report = encode_groups(
         opened.groups,
-        StreamOutput(out, opened.config, made_by),
+        StreamOutput(out, opened.config, made_by, sound),
         opened.settings,
         cameras=opened.cameras,
         refine_by_pictures=opened.refine_by_pictures,
@@ -151,3 +163,11 @@ def encode_input(source: Path, out: Path, settings: EncodeSettings, options: Tra
     if not report.interrupted:
         opened.finish()
     return report
+
+
+def _compare_lengths(path: Path, sound: float, video: float, bar: Bar) -> None:
+    """Says what becomes of sound that is not as long as the video, in seconds."""
+    if sound > video + LENGTHS_DIFFER:
+        bar.say(f"--audio {path}: {sound:.2f} s of sound, cut to the {video:.2f} s of the video")
+    elif sound < video - LENGTHS_DIFFER:
+        bar.say(f"--audio {path}: {sound:.2f} s of sound, the rest of the {video:.2f} s of the video is silent")

@@ -81,6 +81,11 @@ def _of_stream(path: Path, maps: Path | None, as_json: bool) -> None:
             f"{facts['bytes']} bytes, {facts['kb_per_frame']:.2f} kB/frame, {facts['mbit_per_s']:.2f} Mbit/s"
             + ("" if per_gaussian is None else f", {per_gaussian:.3f} bits per Gaussian and frame")
         )
+    if sound := facts["sound"]:
+        stdout.print(
+            f"sound: {sound['codec']}, {sound['rate']} Hz, {sound['channels']} channels, "
+            f"{sound['seconds']:.2f} s, {sound['bytes']} bytes"
+        )
     if rows:
         stdout.print(f"{maps}: from the top " + ", ".join(rows))
     if len(facts["layers"]) > 1:

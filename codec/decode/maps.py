@@ -67,7 +67,8 @@ def write_maps(stream: Stream, folder: Path) -> int:
                     own[f"{k} {name}"] = low
         tiles = [[t["gaussians"] for t in tiles] for tiles in decoded.tiles()]
         groups.append({"sync": g["sync"], "tiles": tiles, "planes": own} | _facts(q))
-    facts = {"format": FORMAT, "config": _plain(stream.config), "groups": groups}
+    config = {k: v for k, v in stream.config.items() if k != "audio"}  # maps have no sound
+    facts = {"format": FORMAT, "config": _plain(config), "groups": groups}
     part = folder / "maps.json.part"
     part.write_text(json.dumps(facts, indent=1))
     os.replace(part, folder / "maps.json")

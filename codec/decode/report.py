@@ -34,6 +34,9 @@ def describe(stream: Stream) -> dict:
             units[name] = units.get(name, 0) + u["bytes"]
             layers[u["layer"]] = layers.get(u["layer"], 0) + u["bytes"]
     total, frames = stream.byte_count, stream.frame_count
+    sound = describe_audio(stream)
+    if sound:
+        units["sound"] = sound["bytes"]
     units["container"] = total - sum(units.values())
     coded = max(sum(g["gaussians"] for g in groups), 1)
     return {
@@ -49,8 +52,26 @@ def describe(stream: Stream) -> dict:
         "level": stream.config["level"],
         "up": stream.config["up"],
         "cameras": [c["name"] for c in stream.config["cameras"]],
+        "sound": sound,
         "complete": stream.complete,
         "units": {n: {"bytes": b, "share": b / total, "bits_per_gaussian": 8 * b / coded} for n, b in units.items()},
         "layers": [{"bytes": layers[k]} for k in sorted(layers)],
         "per_group": groups,
+    }
+
+
+def describe_audio(stream: Stream) -> dict | None:
+    """codec, rate (Hz), channels, seconds and bytes of the sound; None: there is none."""
+    track = stream.config.get("audio")
+    if track is None:
+        return None
+    runs = [g["audio"] for g in stream.groups if "audio" in g]  # (offset, time, samples)
+    entry, samples = track["entry"], [s for _, _, run in runs for s in run]
+    end = max((time + sum(d for _, d in run) for _, time, run in runs), default=track["media_start"])
+    return {
+        "codec": {b"mp4a": "AAC", b"Opus": "Opus"}[entry[4:8]],
+        "rate": int.from_bytes(entry[32:34], "big") or track["timescale"],  # the entry has no room for 96 kHz
+        "channels": int.from_bytes(entry[24:26], "big"),
+        "seconds": max(end - track["media_start"], 0) / track["timescale"],
+        "bytes": sum(size for size, _ in samples),
     }

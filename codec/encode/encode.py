@@ -17,6 +17,7 @@ from ..bitstream.levels import smallest_level
 from ..bitstream.quantization import QUALITY_DEFAULT
 from ..model.camera import Camera
 from ..model.parametric_group import ParametricGroup
+from .audio import AudioTrack
 from .coder import CamerasAt, CodedGroup, CoderState, GroupCoder, RefineByPictures
 from .quality_search import choose_quality
 from .rate_control import code_at_rate
@@ -104,11 +105,13 @@ class StreamOutput:
         path: final path, OUT.gsv.
         config: of `stream_config`.
         fingerprint: whatever must be equal for a second run to go on with the groups of the first one (JSON-able).
+        audio: sound for it.
     """
 
     path: Path
     config: dict
     fingerprint: dict = field(default_factory=dict)
+    audio: AudioTrack | None = None
 
 
 def encode_groups(
@@ -130,7 +133,7 @@ def encode_groups(
 
     Ctrl-C finishes the file with the groups done and returns with `interrupted` set; the next run goes on.
     """
-    writer = StreamWriter(output.path, output.config, output.fingerprint)
+    writer = StreamWriter(output.path, output.config, output.fingerprint, output.audio)
     coder = GroupCoder(settings, float(output.config["fps"]), cameras, refine_by_pictures)
     report = EncodeReport(seconds={"input": 0.0, "code": 0.0})
     try:

@@ -11,13 +11,14 @@ from .. import _native
 from ..bitstream.hilbert_layout import HilbertLayout
 from ..bitstream.quantized_group import QuantizedChannels, QuantizedGroup, QuantizedNodes, QuantizedTrajectories
 from ..errors import UsageError, require
+from .audio import AudioTrack
 from .writer import StreamWriter
 
 FORMAT = "gscodec maps 1"  # that of decode/maps.py
 
 
-def encode_maps(folder: Path, out: Path) -> tuple[int, int]:
-    """Codes the planes in `folder`. Returns frames and bytes.
+def encode_maps(folder: Path, out: Path, audio: AudioTrack | None = None) -> tuple[int, int]:
+    """Codes the planes in `folder`, with sound. Returns frames and bytes.
 
     Raises:
         UsageError: maps.json or an image is missing, is no such file, or does not fit the others.
@@ -36,7 +37,7 @@ def encode_maps(folder: Path, out: Path) -> tuple[int, int]:
     except (OSError, ValueError, KeyError, IndexError, TypeError) as e:
         reason = f"{type(e).__name__} {e}" if isinstance(e, KeyError) else str(e)
         raise UsageError(f"{folder}: no attribute maps as `gscodec decode --maps` writes them: {reason}") from None
-    writer = StreamWriter(out, config, {"maps": str(folder)})
+    writer = StreamWriter(out, config, {"maps": str(folder)}, audio)
     for q, payload, sync in zip(groups, payloads, syncs, strict=True):
         writer.append(payload, q.frames, sync=sync)
     writer.finish()

@@ -15,6 +15,7 @@ import shutil
 import warnings
 from glob import escape
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +23,9 @@ from .. import _native
 from ..atomic_write import part_file, read_arrays, write_arrays
 from ..errors import BitstreamError
 from ..fingerprint import sentence
+
+if TYPE_CHECKING:
+    from .audio import AudioTrack
 
 
 class StreamWriter:
@@ -31,13 +35,17 @@ class StreamWriter:
         out: final path.
         config: of `_native.init_segment` (fps, level, cameras, ...).
         fingerprint: whatever must be equal for two runs to make the same groups (JSON-able).
+        audio: sound, whose samples go in front of the groups in whose frames they begin.
     """
 
-    def __init__(self, out: Path, config: dict, fingerprint: dict):
-        self.out, self.config = Path(out), config
+    def __init__(self, out: Path, config: dict, fingerprint: dict, audio: AudioTrack | None = None):
+        if audio:
+            config, fingerprint = config | {"audio": audio.config}, fingerprint | {"audio": audio.digest}
+        self.out, self.config, self._audio = Path(out), config, audio
         self.part = self.out.with_name(self.out.name + ".part")
         self._made_by = self.out.with_name(self.out.name + ".part.json")
         self.init = _native.init_segment(config)
+        self._fps = _native.demux(self.init)["config"]["fps"]  # exactly
         self.fragments: list[tuple[int, int, bool, list[int]]] = []  # size, frames, sync, bytes up to each layer's end
         fingerprint = json.loads(json.dumps(fingerprint))
         if not self._resume(fingerprint):
@@ -97,7 +105,8 @@ class StreamWriter:
         run that goes on behind it."""
         if state is not None:
             write_arrays(self._state(self.groups + 1), state)
-        data = _native.fragment(payload, self.groups + 1, self.frames, frames, sync, self.config)
+        audio = self._audio and self._audio.between(self.frames, self.frames + frames, self._fps)
+        data = _native.fragment(payload, self.groups + 1, self.frames, frames, sync, self.config, audio)
         self._file.write(data)
         self._file.flush()
         head = len(data) - len(payload)

@@ -1,9 +1,10 @@
-"""Frames of a stream -> images: camera path -> CPU rasterizer -> .mp4 or a folder of .png."""
+"""Frames of a stream -> images: camera path -> CPU rasterizer -> .mp4, with the stream's sound, or a folder of .png."""
 
 from __future__ import annotations
 
 import json
 import os
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -113,20 +114,22 @@ def render_stream(stream, dest: Path, *, camera: str, size: str | None, frames: 
     background = tuple(stream.config["background"])
     cameras = camera_path(stream, camera, size, frames)
     images = (render_image(stream.frame(t), c, background) for t, c in zip(frames, cameras, strict=True))
-    write = _write_movie if movie else _write_images
-    for done in write(images, dest, stream.fps, frames):
+    sound = Path(stream.name) if any("audio" in g for g in stream.groups) else None
+    written = _write_movie(images, dest, stream.fps, frames, sound) if movie else _write_images(images, dest, frames)
+    for done in written:
         bar.update("render", done, len(frames))
     return len(frames)
 
 
-def _write_images(images, folder: Path, fps: float, frames: range) -> Iterator[int]:
+def _write_images(images, folder: Path, frames: range) -> Iterator[int]:
     for done, (t, image) in enumerate(zip(frames, images, strict=True), 1):
         folder.mkdir(parents=True, exist_ok=True)  # not before there is something to put in it
         write_png(folder / f"{t:06d}.png", image)
         yield done
 
 
-def _write_movie(images, path: Path, fps: float, frames: range) -> Iterator[int]:
+def _write_movie(images, path: Path, fps: float, frames: range, sound: Path | None) -> Iterator[int]:
+    """`sound`: the .gsv file whose audio track goes in."""
     ffmpeg = require("imageio_ffmpeg", "writing .mp4 (a folder of .png needs nothing)")
     part = path.with_name(path.stem + ".part.mp4")
     first = next(images)
@@ -142,7 +145,25 @@ def _write_movie(images, path: Path, fps: float, frames: range) -> Iterator[int]
             writer.send(np.ascontiguousarray(image[:h, :w]))
             yield done
         writer.close()
+        if sound:
+            _add_sound(ffmpeg.get_ffmpeg_exe(), part, sound, frames.start / fps, len(frames) / fps)
         os.replace(part, path)
     finally:
         writer.close()
         part.unlink(missing_ok=True)
+
+
+def _add_sound(ffmpeg: str, movie: Path, stream: Path, start: float, seconds: float) -> None:
+    """Adds the sound of a .gsv file, which ffmpeg reads as any MP4, to a movie of its frames from second `start` on."""
+    both = movie.with_name(movie.stem + ".sound.mp4")
+    inputs = ["-i", movie, "-ss", f"{start:.6f}", "-i", stream.resolve()]
+    how = ["-map", "0:v", "-map", "1:a", "-c", "copy", "-t", f"{seconds:.6f}", both]
+    try:
+        done = subprocess.run(
+            [ffmpeg, "-v", "error", "-nostdin", "-y", *inputs, *how], capture_output=True, check=False
+        )
+        if done.returncode:
+            raise UsageError(f"{stream}: ffmpeg cannot add the sound: {done.stderr.decode(errors='replace').strip()}")
+        os.replace(both, movie)
+    finally:
+        both.unlink(missing_ok=True)

@@ -37,14 +37,16 @@ def u32(value):
     return struct.pack(">I", value)
 
 
-def make_file(payloads, *, finish=True, **config):
-    """payloads: [(bytes, frames)], a third item of False: not a sync sample -> bytes of a .gsv file."""
+def make_file(payloads, *, finish=True, sound=(), **config):
+    """payloads: [(bytes, frames)], a third item of False: not a sync sample -> bytes of a .gsv file. `sound`: of each
+    group as `fragment` takes it."""
     config = CONFIG | config
     init = bytes(_native.init_segment(config))
     fragments, start = [], 0
     payloads = [(*p, True)[:3] for p in payloads]
     for number, (payload, frames, sync) in enumerate(payloads, 1):
-        fragments.append(bytes(_native.fragment(payload, number, start, frames, sync, config)))
+        audio = sound[number - 1] if number <= len(sound) else None
+        fragments.append(bytes(_native.fragment(payload, number, start, frames, sync, config, audio)))
         start += frames
     if finish:
         index = [(len(f), n, s, []) for f, (_, n, s) in zip(fragments, payloads, strict=True)]
@@ -54,6 +56,35 @@ def make_file(payloads, *, finish=True, **config):
 
 def groups_file(*groups, **options):
     return make_file([(encode(group), group.frames) for group in groups], **options)
+
+
+def sound_file(kind=b"Opus", decoder=b"dOps", entry=b"", **options):
+    """Two groups of which the first has three samples of what claims to be sound."""
+    head = bytes(6) + b"\0\1" + bytes(8) + b"\0\2\0\x10" + bytes(4) + u32(48000 << 16)  # AudioSampleEntry
+    entry = box(kind, head + box(decoder, bytes(11)) + entry)
+    audio = {"timescale": 48000, "media_start": 312, "entry": entry}
+    sound = [(0, [(4, 960), (1, 960), (6, 480)], b"samplesound")]
+    return groups_file(make_group(30, 2), make_group(20, 1, seed=2), audio=audio, sound=sound, **options)
+
+
+def sound_patched(kind, offset, new, which=1):
+    """`sound_file` with bytes changed at an offset from the body of a box of a type, the last one or number `which`."""
+
+    def build():
+        data, at = sound_file(), -1
+        for _ in range(which + 1):
+            at = data.index(kind, at + 1)
+        return poke(data, at + 4 + offset, new)
+
+    return build
+
+
+def before_mdat():
+    """The first sample of the sound is 20 bytes longer, and starts so many before: in front of the mdat."""
+    data = sound_file()
+    at = data.index(b"trun", data.index(b"trun") + 4) + 4
+    (offset,) = struct.unpack_from(">I", data, at + 8)
+    return poke(poke(data, at + 8, u32(offset - 20)), at + 16, u32(24))
 
 
 def box(kind, body):

@@ -17,6 +17,7 @@ sys.path.insert(0, str(HERE.parent))
 import reference_decoder as reference  # noqa: E402
 from files import (  # noqa: E402
     CAMERA,
+    before_mdat,
     box,
     f32,
     groups_file,
@@ -27,6 +28,8 @@ from files import (  # noqa: E402
     other_mdat_sizes,
     other_track,
     second_moof,
+    sound_file,
+    sound_patched,
     truncated,
     truncated_after_sample,
     truncated_to_end,
@@ -212,6 +215,9 @@ VALID = {  # name: (what it is about, bytes)
         "companding, with layers that leave out low bits and a trajectory on top, and a group predicted from it",
         lambda: predicted_file(COMPANDED, predicted(COMPANDED, FULL, births=0)),
     ),
+    "sound": ("an audio track of Opus, in the first of two groups", sound_file),
+    "sound_aac": ("an audio track of AAC", lambda: sound_file(b"mp4a", b"esds", finish=False)),
+    "sound_unknown": ("an audio track that is neither AAC nor Opus", lambda: sound_file(b"fLaC", b"dfLa")),
     "no_groups": ("a stream without groups yet", lambda: groups_file(finish=False)),
 }
 
@@ -259,6 +265,17 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "config_sh_degree_low": (B, "degree", lambda: groups_file(make_group(40, 2, sh_degree=1), sh_degree=0)),
     "duration_no_frames": (B, "duration", lambda: poke_duration(1001, 1000)),
     "time_no_frames": (B, "time", lambda: poke_time(1001, 500)),
+    "sound_timescale": (B, "timescale", sound_patched(b"mdhd", 12, u32(0))),
+    "sound_no_decoder": (B, "dOps", lambda: sound_file(decoder=b"esds", finish=False)),
+    "sound_entry": (L, "4096", lambda: sound_file(entry=box(b"free", bytes(4096)), finish=False)),
+    "sound_edits": (B, "one edit", sound_patched(b"elst", 4, u32(2), 0)),
+    "sound_edit_empty": (B, "one edit", sound_patched(b"elst", 12, u32(2**32 - 1), 0)),
+    "sound_many_samples": (L, "65536", sound_patched(b"trun", 4, u32(65537))),
+    "sound_samples_missing": (B, "4 more", sound_patched(b"trun", 4, u32(4))),
+    "sound_sample_empty": (B, "at least one byte", sound_patched(b"trun", 16, u32(0))),
+    "sound_elsewhere": (B, "where the group starts", sound_patched(b"trun", 8, u32(4))),
+    "sound_too_long": (B, "where the group starts", sound_patched(b"trun", 16, u32(2**32 - 1))),
+    "sound_outside_mdat": (B, "mdat", before_mdat),
     # Units
     "unit_none": (B, "4 more", lambda: payload_file(lambda p: b"")),
     "unit_crc": (B, "CRC", change_unit(TILE, damage=1)),

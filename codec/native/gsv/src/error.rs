@@ -37,6 +37,7 @@ impl Error {
     }
 
     /// The same error with the offset moved by `base`; `name`: the unit, if the error has none.
+    #[inline(never)]
     pub fn at(self, base: usize, name: &str) -> Error {
         match self {
             Error::Bitstream { offset, unit, expected } => {

@@ -9,6 +9,7 @@ use crate::error::Result;
 use crate::group::Group;
 use crate::header::Header;
 use crate::neighbors;
+use crate::parallel::join;
 use crate::parametric::{AttributeMotion, Frame, FrameMut, Parametric, rgb};
 use crate::trajectories::Trajectories;
 use rayon::prelude::*;
@@ -29,7 +30,7 @@ impl Evaluator {
         let nodes = group.node_positions.iter().map(place).collect();
         let [scales_shift, opacities_shift] = group.correction();
         let channels = |a, shift| values(h, a, group.channels_of(a).unwrap_or(&[]), shift);
-        let (blend, canonical) = rayon::join(
+        let (blend, canonical) = join(
             || Blend::new(&group.positions, &group.node_positions, usize::from(h.nodes.neighbors)),
             || Frame {
                 means: group.positions.par_iter().map(place).collect(),

@@ -1,7 +1,8 @@
 //! Fields of headers. A header is declared once, as a function over `Fields`: with `Reader` it reads and checks, with
 //! `Writer` it writes.
 //!
-//! The writer takes each value from the variable that the reader stores it to.
+//! The writer takes each value from the variable that the reader stores it to. Readers are never inlined: headers take no
+//! time, and each copy would cost bytes of the page.
 
 use crate::error::{Error, Result};
 
@@ -13,6 +14,7 @@ pub trait Fields {
     /// Whether an optional field at the end is there: always when writing.
     fn more(&self) -> bool;
 
+    #[inline(never)]
     fn u8(&mut self, v: &mut u8) -> Result<()> {
         let mut b = [*v];
         self.bytes(&mut b)?;
@@ -20,6 +22,7 @@ pub trait Fields {
         Ok(())
     }
 
+    #[inline(never)]
     fn u16(&mut self, v: &mut u16) -> Result<()> {
         let mut b = v.to_be_bytes();
         self.bytes(&mut b)?;
@@ -27,6 +30,7 @@ pub trait Fields {
         Ok(())
     }
 
+    #[inline(never)]
     fn u32(&mut self, v: &mut u32) -> Result<()> {
         let mut b = v.to_be_bytes();
         self.bytes(&mut b)?;
@@ -34,6 +38,7 @@ pub trait Fields {
         Ok(())
     }
 
+    #[inline(never)]
     fn u64(&mut self, v: &mut u64) -> Result<()> {
         let mut b = v.to_be_bytes();
         self.bytes(&mut b)?;
@@ -42,6 +47,7 @@ pub trait Fields {
     }
 
     /// A finite f32.
+    #[inline(never)]
     fn f32(&mut self, v: &mut f32, what: &str) -> Result<()> {
         let mut b = v.to_be_bytes();
         self.bytes(&mut b)?;
@@ -50,6 +56,7 @@ pub trait Fields {
     }
 
     /// A finite f32 above zero.
+    #[inline(never)]
     fn step(&mut self, v: &mut f32, what: &str) -> Result<()> {
         self.f32(v, what)?;
         let value = *v;
@@ -100,6 +107,7 @@ impl<'a> Reader<'a> {
     }
 
     /// The next `n` bytes, without a copy.
+    #[inline(never)]
     pub fn take(&mut self, n: usize) -> Result<&'a [u8]> {
         match self.data.get(self.position..).and_then(|d| d.get(..n)) {
             Some(d) => {

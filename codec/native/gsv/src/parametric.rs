@@ -6,6 +6,7 @@
 use crate::attributes::Attribute;
 use crate::blend::Blend;
 use crate::dequantize::{IDENTITY, Quat, multiply};
+use crate::parallel::join;
 use crate::rigid_blend::{RigidBlend, from_rotation_vector, pose};
 use crate::trajectories::Trajectories;
 use rayon::prelude::*;
@@ -154,7 +155,7 @@ impl<V: Coefficient> Parametric<'_, V> {
             (Attribute::ShN, &rest.sh_n, out.sh_n),
         ];
         let (means, quats) = (out.means, out.quats);
-        rayon::join(
+        join(
             || self.move_at(basis, means, quats),
             || {
                 still.into_par_iter().for_each(|(attribute, rest, values)| {
@@ -180,7 +181,7 @@ impl<V: Coefficient> Parametric<'_, V> {
     fn move_at(&self, basis: &[f32], means: &mut [[f32; 3]], quats: &mut [Quat]) {
         let own = |i: usize| self.rotations.get(i).copied().unwrap_or(IDENTITY);
         self.carry(basis, (means, quats), |i, q| multiply(q, own(i)));
-        rayon::join(
+        join(
             || self.motion(Attribute::Quats).map(|m| m.rotate(basis, quats)),
             || {
                 self.motion(Attribute::Means)

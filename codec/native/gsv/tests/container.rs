@@ -4,10 +4,12 @@
 mod common;
 
 use common::Random;
+use gsv::container::audio::{AudioRun, AudioTrack};
 use gsv::container::config::{Camera, Config, rate};
 use gsv::container::demux::Demuxer;
 use gsv::container::entry::Entry;
-use gsv::container::write::{Reference, finish, fragment, init_segment};
+use gsv::container::whole;
+use gsv::container::write::{Reference, Sound, finish, fragment, init_segment};
 use proptest::prelude::*;
 
 fn config() -> Config {
@@ -30,6 +32,7 @@ fn config() -> Config {
         sh_degree: 3,
         sh_frame: 1,
         cameras: vec![camera.clone(), camera],
+        audio: None,
     }
 }
 
@@ -44,7 +47,7 @@ fn file() -> (Vec<u8>, Vec<Entry>) {
     ];
     let (mut fragments, mut index, mut start) = (Vec::new(), Vec::new(), 0);
     for ((payload, frames, sync), number) in groups.iter().zip(1..) {
-        let f = fragment(payload, number, start, *frames, *sync, &config).unwrap();
+        let f = fragment(payload, number, start, *frames, *sync, &config, None).unwrap();
         index.push(Reference {
             size: f.len() as u64,
             frames: *frames,
@@ -65,6 +68,7 @@ fn file() -> (Vec<u8>, Vec<Entry>) {
             start_frame: start,
             frames: *frames,
             sync: *sync,
+            audio: None,
         });
         start += u64::from(*frames);
     }
@@ -115,8 +119,8 @@ fn a_cut_file_keeps_its_whole_groups() {
         let d = parsed(&[&bytes[..n]]);
         let whole: Vec<Entry> = entries
             .iter()
-            .copied()
             .filter(|e| (e.offset + e.size) as usize <= n)
+            .cloned()
             .collect();
         assert_eq!(d.groups(), whole, "{n}");
         assert!(!d.complete());
@@ -127,7 +131,7 @@ fn a_cut_file_keeps_its_whole_groups() {
 fn a_growing_file_has_no_index() {
     let config = config();
     let init = init_segment(&config).unwrap();
-    let f = fragment(b"group", 1, 40, 20, true, &config).unwrap();
+    let f = fragment(b"group", 1, 40, 20, true, &config, None).unwrap();
     let d = parsed(&[&init, &f]);
     assert_eq!(d.groups().len(), 1);
     assert_eq!(d.groups()[0].start_frame, 40);
@@ -145,7 +149,7 @@ fn unknown_boxes_are_skipped() {
         .iter()
         .map(|e| Entry {
             offset: e.offset + 32,
-            ..*e
+            ..e.clone()
         })
         .collect();
     assert_eq!(d.groups(), moved);
@@ -215,7 +219,7 @@ fn frame_rates() {
 fn a_sample_needs_its_mdat() {
     let config = config();
     let init = init_segment(&config).unwrap();
-    let sound = fragment(&[7; 50], 1, 0, 20, true, &config).unwrap();
+    let sound = fragment(&[7; 50], 1, 0, 20, true, &config, None).unwrap();
     let mut other = sound.clone();
     let mdat = other.len() - 54;
     other[mdat..mdat + 4].copy_from_slice(b"what");
@@ -223,7 +227,7 @@ fn a_sample_needs_its_mdat() {
     assert!(d.groups().is_empty() && d.pending().is_some());
     let message = d.push(&sound).unwrap_err().to_string();
     assert!(message.contains("mdat"), "{message}");
-    let empty = fragment(&[], 1, 0, 20, true, &config).unwrap();
+    let empty = fragment(&[], 1, 0, 20, true, &config, None).unwrap();
     assert!(parsed(&[&init, &empty[..empty.len() - 8]]).groups().is_empty());
     assert_eq!(parsed(&[&init, &empty]).groups().len(), 1);
 }
@@ -261,4 +265,82 @@ fn layers_can_be_found() {
     }
     let plain = finish(&init, &config, &groups[1..2]).unwrap();
     assert!(!plain.windows(4).any(|w| w == b"ssix"));
+}
+
+const ENTRY: &[u8] =
+    b"\0\0\0\x30Opus\0\0\0\0\0\0\0\x01\0\0\0\0\0\0\0\0\0\x02\0\x10\0\0\0\0\xbb\x80\0\0\0\0\0\x0cdOps\0\x02\x01\x38";
+
+/// Two groups of which the first has sound, and the sound.
+fn sounding() -> (Vec<u8>, AudioRun) {
+    let track = AudioTrack {
+        timescale: 48_000,
+        media_start: 312,
+        entry: ENTRY.to_vec(),
+    };
+    let config = Config {
+        audio: Some(track),
+        ..config()
+    };
+    let samples = [(3, 960), (5, 960)];
+    let sound = Sound {
+        time: 960,
+        samples: &samples,
+        data: b"abcdefgh",
+    };
+    let init = init_segment(&config).unwrap();
+    let first = fragment(&[1; 40], 1, 0, 20, true, &config, Some(sound)).unwrap();
+    let second = fragment(&[2; 10], 2, 20, 1, true, &config, None).unwrap();
+    let run = AudioRun {
+        offset: (init.len() + first.len() - 48) as u64,
+        time: 960,
+        samples: samples.to_vec(),
+    };
+    assert!(
+        fragment(
+            &[],
+            1,
+            0,
+            1,
+            true,
+            &config,
+            Some(Sound {
+                data: b"short",
+                ..sound
+            })
+        )
+        .is_err()
+    );
+    ([init, first, second].concat(), run)
+}
+
+/// Spec 2.7, however the bytes come; and without sound it is the same file but for the samples.
+#[test]
+fn sound_lies_in_front_of_its_group() {
+    let (bytes, run) = sounding();
+    for d in [parsed(&[&bytes]), parsed(&bytes.chunks(1).collect::<Vec<_>>())] {
+        assert_eq!(d.config().unwrap().audio.as_ref().unwrap().entry, ENTRY);
+        assert_eq!(d.groups()[0].audio.as_ref(), Some(&run));
+        assert_eq!(d.groups()[0].offset, run.offset + 8);
+        assert_eq!(d.groups()[1].audio, None);
+    }
+    let (track, runs) = whole::read_audio(&bytes).unwrap();
+    assert_eq!((track.media_start, runs), (312, vec![run]));
+}
+
+/// No byte of the headers makes a panic, or a sample outside of the file.
+#[test]
+fn damaged_sound_is_named() {
+    let (bytes, run) = sounding();
+    for at in 0..run.offset as usize {
+        for flip in [1, 0x80, 0xff] {
+            let mut bad = bytes.clone();
+            bad[at] ^= flip;
+            let mut d = Demuxer::default();
+            if d.push(&bad).is_ok() {
+                for run in d.groups().iter().filter_map(|g| g.audio.as_ref()) {
+                    assert!(run.offset + run.size() <= bytes.len() as u64);
+                }
+            }
+        }
+    }
 }

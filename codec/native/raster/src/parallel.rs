@@ -21,10 +21,20 @@ pub fn parallel_for<W: Send>(
     let middle = range.start + (range.len() / 2).next_multiple_of(grain);
     let (left, right) = cut(work, &range, middle);
     let (first, last) = (range.start..middle, middle..range.end);
-    rayon::join(
+    join(
         || parallel_for(first, grain, left, cut, run),
         || parallel_for(last, grain, right, cut, run),
     );
+}
+
+/// Both at the same time; in wasm, where there is one core, one after the other, which takes less code.
+fn join(a: impl FnOnce() + Send, b: impl FnOnce() + Send) {
+    if cfg!(target_arch = "wasm32") {
+        a();
+        b();
+    } else {
+        rayon::join(a, b);
+    }
 }
 
 #[cfg(test)]

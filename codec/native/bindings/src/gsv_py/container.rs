@@ -1,10 +1,11 @@
 //! Config dicts <-> the container: init segment, fragments, index, demuxer.
 
 use super::values::{bytes_of, invalid, item, optional, raise, value};
+use gsv::container::audio::AudioTrack;
 use gsv::container::config::{COLOR_SPACES, Camera, Config, NEAR, SH_FRAMES, UP_AXES, rate};
 use gsv::container::demux::Demuxer;
 use gsv::container::whole;
-use gsv::container::write::{self, Reference};
+use gsv::container::write::{self, Reference, Sound};
 use gsv::levels::Level;
 use numpy::{IntoPyArray, PyArrayMethods};
 use pyo3::exceptions::PyValueError;
@@ -36,6 +37,7 @@ fn config_from(py: Python, d: &Bound<PyDict>) -> PyResult<Config> {
         sh_degree: value(d, "sh_degree")?,
         sh_frame: choice("sh_frame", &SH_FRAMES)?,
         cameras: Vec::new(),
+        audio: optional(d, "audio")?.map(|a| audio_from(&a.extract()?)).transpose()?,
     };
     Level::get(config.level).map_err(|e| PyValueError::new_err(e.to_string()))?;
     if let Some(cameras) = optional(d, "cameras")? {
@@ -44,6 +46,22 @@ fn config_from(py: Python, d: &Bound<PyDict>) -> PyResult<Config> {
         }
     }
     Ok(config)
+}
+
+fn audio_from(d: &Bound<PyDict>) -> PyResult<AudioTrack> {
+    Ok(AudioTrack {
+        timescale: value(d, "timescale")?,
+        media_start: value(d, "media_start")?,
+        entry: value(d, "entry")?,
+    })
+}
+
+fn audio_into<'py>(py: Python<'py>, a: &AudioTrack) -> PyResult<Bound<'py, PyDict>> {
+    let d = PyDict::new(py);
+    d.set_item("timescale", a.timescale)?;
+    d.set_item("media_start", a.media_start)?;
+    d.set_item("entry", PyBytes::new(py, &a.entry))?;
+    Ok(d)
 }
 
 fn camera_from(d: &Bound<PyDict>) -> PyResult<Camera> {
@@ -103,6 +121,9 @@ fn config_into<'py>(py: Python<'py>, c: &Config) -> PyResult<Bound<'py, PyDict>>
         cameras.append(one)?;
     }
     d.set_item("cameras", cameras)?;
+    if let Some(audio) = &c.audio {
+        d.set_item("audio", audio_into(py, audio)?)?;
+    }
     Ok(d)
 }
 
@@ -113,8 +134,11 @@ pub fn init_segment<'py>(py: Python<'py>, config: &Bound<'py, PyDict>) -> PyResu
     Ok(PyBytes::new(py, &out))
 }
 
-/// moof and mdat of one group; sequence numbers count from 1, frames from 0.
+/// moof and mdat of one group; sequence numbers count from 1, frames from 0. `audio`: time, (size, duration) of each sample,
+/// and their bytes.
 #[pyfunction]
+#[pyo3(signature = (payload, sequence_number, start_frame, frames, sync, config, audio = None))]
+#[allow(clippy::too_many_arguments, clippy::type_complexity)]
 pub fn fragment<'py>(
     py: Python<'py>,
     payload: &Bound<'py, PyAny>,
@@ -123,8 +147,14 @@ pub fn fragment<'py>(
     frames: u32,
     sync: bool,
     config: &Bound<'py, PyDict>,
+    audio: Option<(u64, Vec<(u32, u32)>, Vec<u8>)>,
 ) -> PyResult<Bound<'py, PyBytes>> {
     let config = config_from(py, config)?;
+    let sound = audio.as_ref().map(|(time, samples, data)| Sound {
+        time: *time,
+        samples,
+        data,
+    });
     let out = write::fragment(
         bytes_of(payload)?.as_slice()?,
         sequence_number,
@@ -132,6 +162,7 @@ pub fn fragment<'py>(
         frames,
         sync,
         &config,
+        sound,
     )
     .map_err(|e| raise(py, e))?;
     Ok(PyBytes::new(py, &out))
@@ -185,11 +216,32 @@ pub fn demux<'py>(py: Python<'py>, buffer: &Bound<'py, PyAny>, strict: bool) -> 
         one.set_item("start_frame", g.start_frame)?;
         one.set_item("frames", g.frames)?;
         one.set_item("sync", g.sync)?;
+        if let Some(run) = &g.audio {
+            one.set_item("audio", (run.offset, run.time, run.samples.clone()))?;
+        }
         groups.append(one)?;
     }
     d.set_item("groups", groups)?;
     d.set_item("complete", demuxer.complete())?;
     let damage: Vec<(usize, String)> = damage.into_iter().map(|(i, e)| (i, e.to_string())).collect();
     d.set_item("damage", damage)?;
+    Ok(d)
+}
+
+/// The audio track of a fragmented MP4 of sound alone: timescale, media_start, entry, and samples as (offset, size, duration).
+#[pyfunction]
+pub fn read_audio<'py>(py: Python<'py>, buffer: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyDict>> {
+    let data = bytes_of(buffer)?;
+    let (track, runs) = whole::read_audio(data.as_slice()?).map_err(|e| raise(py, e))?;
+    let mut samples = Vec::new();
+    for run in runs {
+        let mut at = run.offset;
+        for (size, duration) in run.samples {
+            samples.push((at, size, duration));
+            at += u64::from(size);
+        }
+    }
+    let d = audio_into(py, &track)?;
+    d.set_item("samples", samples)?;
     Ok(d)
 }

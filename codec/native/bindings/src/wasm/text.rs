@@ -1,5 +1,6 @@
 //! Answers to the host as JSON.
 
+use gsv::container::audio::{AudioRun, AudioTrack};
 use gsv::container::config::{COLOR_SPACES, Camera, Config, SH_FRAMES, UP_AXES};
 use gsv::container::demux::Demuxer;
 use gsv::container::entry::Entry;
@@ -31,7 +32,7 @@ pub fn header(h: &Header, gaussians: usize) -> String {
 fn config(c: &Config) -> String {
     let name = |names: &[&str], i: u8| string(names.get(usize::from(i)).copied().unwrap_or_default());
     format!(
-        r#"{{"fps":[{},{}],"level":{},"metres_per_unit":{},"up":{},"color_space":{},"background":{},"sh_degree":{},"sh_frame":{},"cameras":{}}}"#,
+        r#"{{"fps":[{},{}],"level":{},"metres_per_unit":{},"up":{},"color_space":{},"background":{},"sh_degree":{},"sh_frame":{},"cameras":{},"audio":{}}}"#,
         c.timescale,
         c.frame_duration,
         c.level,
@@ -42,7 +43,21 @@ fn config(c: &Config) -> String {
         c.sh_degree,
         name(&SH_FRAMES, c.sh_frame),
         list(c.cameras.iter(), camera),
+        c.audio.as_ref().map_or("null".into(), audio),
     )
+}
+
+fn audio(a: &AudioTrack) -> String {
+    let entry = list(a.entry.iter(), u8::to_string);
+    format!(
+        r#"{{"timescale":{},"media_start":{},"entry":{entry}}}"#,
+        a.timescale, a.media_start
+    )
+}
+
+fn run(r: &AudioRun) -> String {
+    let samples = list(r.samples.iter(), |(size, duration)| format!("[{size},{duration}]"));
+    format!(r#"{{"offset":{},"time":{},"samples":{samples}}}"#, r.offset, r.time)
 }
 
 fn camera(c: &Camera) -> String {
@@ -59,8 +74,13 @@ fn camera(c: &Camera) -> String {
 
 fn entry(e: &Entry) -> String {
     format!(
-        r#"{{"offset":{},"size":{},"start_frame":{},"frames":{},"sync":{}}}"#,
-        e.offset, e.size, e.start_frame, e.frames, e.sync
+        r#"{{"offset":{},"size":{},"start_frame":{},"frames":{},"sync":{},"audio":{}}}"#,
+        e.offset,
+        e.size,
+        e.start_frame,
+        e.frames,
+        e.sync,
+        e.audio.as_ref().map_or("null".into(), run)
     )
 }
 

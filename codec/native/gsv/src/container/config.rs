@@ -1,5 +1,6 @@
 //! gsvC (spec 2.3) and the frame rate: the configuration of the whole file.
 
+use super::audio::AudioTrack;
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader, Writer};
 
@@ -52,6 +53,8 @@ pub struct Config {
     pub sh_degree: u8,
     pub sh_frame: u8,
     pub cameras: Vec<Camera>,
+    /// Not in gsvC: a track of its own (spec 2.7).
+    pub audio: Option<AudioTrack>,
 }
 
 impl Config {

@@ -123,7 +123,7 @@ impl Demuxer {
     /// Takes group `i` from the index: `offset` and `size` of its fragment, since those of its sample are unknown.
     pub fn replace_by_index(&mut self, i: usize) {
         self.forget(i);
-        self.groups.extend(self.index.get(i).copied());
+        self.groups.extend(self.index.get(i).cloned());
     }
 
     /// Drops the groups from the i-th on.
@@ -233,11 +233,12 @@ impl Demuxer {
         Ok(())
     }
 
-    /// Spec 2.4: checks that the sample of a moof lies in the next mdat.
+    /// Spec 2.4: checks that the sample of a moof, and the sound in front of it, lie in the next mdat.
     fn sample_within(&self, body: u64) -> std::result::Result<(), &'static str> {
         let Some(g) = &self.pending else { return Ok(()) };
         let end = g.offset.checked_add(g.size);
-        let inside = g.offset >= self.position && end.is_some_and(|e| e <= self.position.saturating_add(body));
+        let start = g.audio.as_ref().map_or(g.offset, |run| run.offset);
+        let inside = start >= self.position && end.is_some_and(|e| e <= self.position.saturating_add(body));
         if inside {
             Ok(())
         } else {
@@ -281,6 +282,7 @@ impl Demuxer {
                 start_frame: time / frame,
                 frames: duration / track.config.frame_duration,
                 sync,
+                audio: None,
             });
             offset = offset.saturating_add(u64::from(size));
             time += u64::from(duration);

@@ -1,7 +1,9 @@
 //! The place of a group in the file, as given by its fragment or by an index.
 
+use super::audio::AudioRun;
+
 /// The place and the time of a group.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Entry {
     /// Of the first byte of its sample, from the start of the file.
     pub offset: u64,
@@ -9,6 +11,8 @@ pub struct Entry {
     pub start_frame: u64,
     pub frames: u32,
     pub sync: bool,
+    /// The sound in front of its sample; none if the place is from an index.
+    pub audio: Option<AudioRun>,
 }
 
 /// A box type for messages: "moov box".

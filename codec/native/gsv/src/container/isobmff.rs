@@ -1,6 +1,7 @@
-//! Parsers of the header boxes ftyp, moov, moof, sidx and ssix (spec 2.1 to 2.6). Only the fields that a reader needs are
-//! parsed; unknown boxes are skipped.
+//! Parsers of the header boxes ftyp, moov, moof, sidx and ssix (spec 2.1 to 2.7). Only the fields that a reader needs are
+//! parsed; unknown boxes are skipped. `inline(never)`: as in `fields`.
 
+use super::audio::{AudioRun, AudioTrack, ENTRY_MAX, SAMPLES_MAX};
 use super::config::Config;
 use super::entry::{Entry, name};
 use super::write::BRAND;
@@ -11,6 +12,14 @@ use crate::fields::{Fields, Reader};
 pub struct Track {
     id: u32,
     pub config: Config,
+    defaults: Defaults,
+    audio: Option<Audio>,
+}
+
+/// The audio track, as moov describes it.
+pub struct Audio {
+    id: u32,
+    pub description: AudioTrack,
     defaults: Defaults,
 }
 
@@ -23,14 +32,15 @@ struct Defaults {
 }
 
 /// A box inside a header box; `offset`: of its body.
-struct Inner<'a> {
-    kind: [u8; 4],
-    offset: usize,
-    body: &'a [u8],
+pub struct Inner<'a> {
+    pub kind: [u8; 4],
+    pub offset: usize,
+    pub body: &'a [u8],
 }
 
 /// The boxes that fill `data`.
-fn boxes(data: &[u8]) -> Result<Vec<Inner<'_>>> {
+#[inline(never)]
+pub fn boxes(data: &[u8]) -> Result<Vec<Inner<'_>>> {
     let mut r = Reader::new(data);
     let mut out = Vec::new();
     while r.rest() > 0 {
@@ -49,6 +59,7 @@ fn boxes(data: &[u8]) -> Result<Vec<Inner<'_>>> {
 }
 
 /// The body of the box at `path` and its offset; at each step the first box of that type.
+#[inline(never)]
 fn find<'a>(data: &'a [u8], path: &[&[u8; 4]]) -> Result<(&'a [u8], usize)> {
     let (mut data, mut base) = (data, 0);
     for kind in path {
@@ -80,20 +91,104 @@ pub fn ftyp(body: &[u8]) -> Result<()> {
     }
 }
 
-/// Parses the body of moov: the first track with handler volv.
+/// Parses the body of moov: the first track with handler volv, and the audio track.
 pub fn moov(body: &[u8]) -> Result<Track> {
-    for b in boxes(body)?.into_iter().filter(|b| &b.kind == b"trak") {
-        let (hdlr, _) = find(b.body, &[b"mdia", b"hdlr"]).map_err(|e| e.at(b.offset, ""))?;
-        if hdlr.get(8..12) == Some(b"volv") {
-            let (id, config) = track(b.body).map_err(|e| e.at(b.offset, "gsv track"))?;
-            return Ok(Track {
+    let Some(b) = tracks(body, b"volv")?.into_iter().next() else {
+        return Err(Error::bitstream(0, "", "a track with handler volv, found none"));
+    };
+    let (id, mut config) = track(b.body).map_err(|e| e.at(b.offset, "gsv track"))?;
+    let audio = audio_track(body)?;
+    config.audio = audio.as_ref().map(|a| a.description.clone());
+    Ok(Track {
+        id,
+        config,
+        defaults: extends(body, id)?,
+        audio,
+    })
+}
+
+/// The tracks of a handler.
+fn tracks<'a>(moov: &'a [u8], handler: &[u8; 4]) -> Result<Vec<Inner<'a>>> {
+    let is = |b: &Inner| find(b.body, &[b"mdia", b"hdlr"]).is_ok_and(|(hdlr, _)| hdlr.get(8..12) == Some(handler));
+    Ok(boxes(moov)?
+        .into_iter()
+        .filter(|b| &b.kind == b"trak" && is(b))
+        .collect())
+}
+
+/// Spec 2.7: the first track with handler soun whose sample entry is mp4a or Opus.
+pub fn audio_track(moov: &[u8]) -> Result<Option<Audio>> {
+    for b in tracks(moov, b"soun")? {
+        if let Some((id, description)) = audio(b.body).map_err(|e| e.at(b.offset, "audio track"))? {
+            let defaults = extends(moov, id)?;
+            return Ok(Some(Audio {
                 id,
-                config,
-                defaults: extends(body, id)?,
-            });
+                description,
+                defaults,
+            }));
         }
     }
-    Err(Error::bitstream(0, "", "a track with handler volv, found none"))
+    Ok(None)
+}
+
+/// track_ID and description of a track of sound; None if its sample entry is another one.
+fn audio(body: &[u8]) -> Result<Option<(u32, AudioTrack)>> {
+    let Ok((stsd, base)) = find(body, &[b"mdia", b"minf", b"stbl", b"stsd"]) else {
+        return Ok(None);
+    };
+    let entries = stsd.get(8..).unwrap_or(&[]);
+    let entry = boxes(entries).map_err(|e| e.at(base + 8, ""))?.into_iter().next();
+    let decoder = entry.as_ref().and_then(|e| match &e.kind {
+        b"mp4a" => Some((e, b"esds")),
+        b"Opus" => Some((e, b"dOps")),
+        _ => None,
+    });
+    let Some((entry, decoder)) = decoder else {
+        return Ok(None);
+    };
+    let base = base + 8 + entry.offset;
+    if entry.body.len() + 8 > ENTRY_MAX {
+        return Err(Error::limit(
+            name(&entry.kind),
+            format!("{} bytes, at most {ENTRY_MAX} are allowed", entry.body.len() + 8),
+        ));
+    }
+    find(entry.body.get(28..).unwrap_or(&[]), &[decoder]).map_err(|e| e.at(base + 28, ""))?;
+    let timescale = after_times(body, &[b"mdia", b"mdhd"])?;
+    if timescale == 0 {
+        return Err(Error::bitstream(base, "", "a timescale > 0"));
+    }
+    let media_start = match find(body, &[b"edts", b"elst"]) {
+        Ok((elst, base)) => edit(&mut Reader::new(elst)).map_err(|e| e.at(base, "elst box"))?,
+        Err(_) => 0,
+    };
+    let entry = entries[entry.offset - 8..entry.offset + entry.body.len()].to_vec();
+    let id = after_times(body, &[b"tkhd"])?;
+    Ok(Some((
+        id,
+        AudioTrack {
+            timescale,
+            media_start,
+            entry,
+        },
+    )))
+}
+
+/// elst: media_time of the only edit.
+fn edit(r: &mut Reader) -> Result<u32> {
+    let (mut head, mut count, mut high, mut time) = (0, 0, 0, 0);
+    r.u32(&mut head)?;
+    r.u32(&mut count)?;
+    let long = head >> 24 == 1;
+    r.take(if long { 8 } else { 4 })?; // segment_duration
+    if long {
+        r.u32(&mut high)?;
+    }
+    r.u32(&mut time)?;
+    r.must(count == 1 && high == 0 && time < 1 << 31, || {
+        format!("one edit with a media time of 0 to 2^31 - 1, found {count}")
+    })?;
+    Ok(time)
 }
 
 /// track_ID and config.
@@ -119,6 +214,7 @@ fn track(body: &[u8]) -> Result<(u32, Config)> {
 }
 
 /// The u32 behind the two time stamps at the start of tkhd and mdhd.
+#[inline(never)]
 fn after_times(body: &[u8], path: &[&[u8; 4]]) -> Result<u32> {
     let (body, base) = find(body, path)?;
     let mut r = Reader::new(body);
@@ -134,6 +230,7 @@ fn after_times(body: &[u8], path: &[&[u8; 4]]) -> Result<u32> {
 }
 
 /// The sample defaults in trex.
+#[inline(never)]
 fn extends(moov: &[u8], id: u32) -> Result<Defaults> {
     let Ok((mvex, base)) = find(moov, &[b"mvex"]) else {
         return Ok(Defaults::default());
@@ -203,25 +300,95 @@ pub fn ssix(body: &[u8]) -> Option<Vec<Vec<u64>>> {
     (rest.is_empty() && words.next().is_none()).then_some(all)
 }
 
-/// Spec 2.4: the group of a moof; None if it has none of the track. `start`: offset of the moof box.
+/// Spec 2.4: the group of a moof, with its sound; None if it has none of the track. `start`: offset of the moof box.
 pub fn moof(body: &[u8], track: &Track, start: u64) -> Result<Option<Entry>> {
     for b in boxes(body)?.into_iter().filter(|b| &b.kind == b"traf") {
-        if let Some(group) = traf(b.body, track, start).map_err(|e| e.at(b.offset, "traf box"))? {
+        let group = traf(b.body, track, start).map_err(|e| e.at(b.offset, "traf box"))?;
+        if let Some(mut group) = group {
+            if let Some(audio) = &track.audio {
+                group.audio = audio_moof(body, audio, start)?;
+            }
+            let end = |run: &AudioRun| run.offset.checked_add(run.size());
+            if group.audio.as_ref().is_some_and(|run| end(run) != Some(group.offset)) {
+                return Err(Error::bitstream(
+                    b.offset,
+                    "traf box",
+                    "the sound to end where the group starts",
+                ));
+            }
             return Ok(Some(group));
         }
     }
     Ok(None)
 }
 
-/// The group of a traf; None if it belongs to another track.
-fn traf(body: &[u8], track: &Track, start: u64) -> Result<Option<Entry>> {
-    let (tfhd, base) = find(body, &[b"tfhd"])?;
-    let mut r = Reader::new(tfhd);
-    let Some((data, defaults)) = header(&mut r, track, start).map_err(|e| e.at(base, ""))? else {
+/// Spec 2.7: the samples of the audio track in a moof; None if it has none.
+pub fn audio_moof(body: &[u8], audio: &Audio, start: u64) -> Result<Option<AudioRun>> {
+    for b in boxes(body)?.into_iter().filter(|b| &b.kind == b"traf") {
+        let run = audio_traf(b.body, audio, start).map_err(|e| e.at(b.offset, "traf box of the audio track"))?;
+        if run.is_some() {
+            return Ok(run);
+        }
+    }
+    Ok(None)
+}
+
+/// The samples of a traf; None if it belongs to another track, or has none.
+fn audio_traf(body: &[u8], audio: &Audio, start: u64) -> Result<Option<AudioRun>> {
+    let Some((data, defaults)) = header(body, audio.id, audio.defaults, start)? else {
         return Ok(None);
     };
-    let (tfdt, base) = find(body, &[b"tfdt"])?;
-    let time = decode_time(&mut Reader::new(tfdt)).map_err(|e| e.at(base, ""))?;
+    let time = decode_time(body)?;
+    let (trun, base) = find(body, &[b"trun"])?;
+    let (offset, samples) = audio_run(&mut Reader::new(trun), defaults).map_err(|e| e.at(base, ""))?;
+    let Some(offset) = data.checked_add_signed(i64::from(offset)) else {
+        return Err(Error::bitstream(base, "", "a data offset within the file"));
+    };
+    let run = AudioRun { offset, time, samples };
+    Ok((!run.samples.is_empty()).then_some(run))
+}
+
+/// trun: data offset, and size and duration of each sample.
+fn audio_run(r: &mut Reader, d: Defaults) -> Result<(i32, Vec<(u32, u32)>)> {
+    let (mut flags, mut count, mut offset) = (0, 0, 0);
+    r.u32(&mut flags)?;
+    r.u32(&mut count)?;
+    if count as usize > SAMPLES_MAX {
+        return Err(Error::limit(
+            "traf box of the audio track",
+            format!("{count} samples, at most {SAMPLES_MAX} are allowed"),
+        ));
+    }
+    if flags & 0x01 != 0 {
+        r.u32(&mut offset)?;
+    }
+    if flags & 0x04 != 0 {
+        r.take(4)?; // flags of the first sample
+    }
+    let mut samples = Vec::new();
+    for _ in 0..count {
+        let (mut size, mut duration) = (d.size, d.duration);
+        if flags & 0x100 != 0 {
+            r.u32(&mut duration)?;
+        }
+        if flags & 0x200 != 0 {
+            r.u32(&mut size)?;
+        }
+        r.take(4 * (flags >> 10 & 3).count_ones() as usize)?; // flags, composition offset
+        r.must(size > 0 && duration > 0, || {
+            "samples of at least one byte and one unit of time".into()
+        })?;
+        samples.push((size, duration));
+    }
+    Ok((offset as i32, samples))
+}
+
+/// The group of a traf; None if it belongs to another track.
+fn traf(body: &[u8], track: &Track, start: u64) -> Result<Option<Entry>> {
+    let Some((data, defaults)) = header(body, track.id, track.defaults, start)? else {
+        return Ok(None);
+    };
+    let time = decode_time(body)?;
     let (trun, base) = find(body, &[b"trun"])?;
     let (offset, sample) = run(&mut Reader::new(trun), defaults).map_err(|e| e.at(base, ""))?;
     let fail = |expected: &str| Err(Error::bitstream(base, "", expected));
@@ -239,37 +406,51 @@ fn traf(body: &[u8], track: &Track, start: u64) -> Result<Option<Entry>> {
         start_frame,
         frames,
         sync: sample.flags >> 16 & 1 == 0,
+        audio: None,
     }))
 }
 
 /// tfhd: base of the data offsets and sample defaults; None for another track.
-fn header(r: &mut Reader, track: &Track, start: u64) -> Result<Option<(u64, Defaults)>> {
-    let (mut flags, mut id, mut base, mut d) = (0, 0, start, track.defaults);
-    r.u32(&mut flags)?;
-    r.u32(&mut id)?;
-    if flags & 0x01 != 0 {
-        r.u64(&mut base)?;
-    }
-    if flags & 0x02 != 0 {
-        r.take(4)?; // sample description index
-    }
-    for (bit, field) in [(0x08, &mut d.duration), (0x10, &mut d.size), (0x20, &mut d.flags)] {
-        if flags & bit != 0 {
-            r.u32(field)?;
+#[inline(never)]
+fn header(traf: &[u8], track: u32, mut d: Defaults, mut data: u64) -> Result<Option<(u64, Defaults)>> {
+    let (tfhd, base) = find(traf, &[b"tfhd"])?;
+    let mut r = Reader::new(tfhd);
+    let (mut flags, mut id) = (0, 0);
+    let mut read = || {
+        r.u32(&mut flags)?;
+        r.u32(&mut id)?;
+        if flags & 0x01 != 0 {
+            r.u64(&mut data)?;
         }
-    }
-    Ok((id == track.id).then_some((base, d)))
+        if flags & 0x02 != 0 {
+            r.take(4)?; // sample description index
+        }
+        for (bit, field) in [(0x08, &mut d.duration), (0x10, &mut d.size), (0x20, &mut d.flags)] {
+            if flags & bit != 0 {
+                r.u32(field)?;
+            }
+        }
+        Ok(())
+    };
+    read().map_err(|e: Error| e.at(base, ""))?;
+    Ok((id == track).then_some((data, d)))
 }
 
-fn decode_time(r: &mut Reader) -> Result<u64> {
+/// tfdt: time of the first sample.
+#[inline(never)]
+fn decode_time(traf: &[u8]) -> Result<u64> {
+    let (tfdt, base) = find(traf, &[b"tfdt"])?;
+    let mut r = Reader::new(tfdt);
     let (mut head, mut short, mut long) = (0, 0, 0);
-    r.u32(&mut head)?;
-    if head >> 24 == 1 {
-        r.u64(&mut long)?;
-        return Ok(long);
-    }
-    r.u32(&mut short)?;
-    Ok(u64::from(short))
+    let mut read = || {
+        r.u32(&mut head)?;
+        if head >> 24 == 1 {
+            return r.u64(&mut long);
+        }
+        r.u32(&mut short)
+    };
+    read().map_err(|e| e.at(base, ""))?;
+    Ok(long.max(u64::from(short)))
 }
 
 /// trun: data offset and the only sample.

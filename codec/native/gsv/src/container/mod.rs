@@ -1,8 +1,9 @@
 //! The container (spec 2): fragmented MP4 with one fragment per group.
 //!
-//! `config` is the gsvC box, `write` writes boxes, `isobmff` parses header boxes, `demux` finds the groups in a stream of
-//! bytes, `whole` reads a file in memory and recovers from damage.
+//! `config` is the gsvC box, `audio` the audio track, `write` writes boxes, `isobmff` parses header boxes, `demux` finds the
+//! groups in a stream of bytes, `whole` reads a file in memory and recovers from damage.
 
+pub mod audio;
 pub mod config;
 pub mod demux;
 pub mod entry;

@@ -3,8 +3,10 @@
 //! Damaged boxes of a fragment end the walk from box to box. With an index (spec 2.5) that agrees with the groups so far,
 //! the walk continues at the next fragment.
 
+use super::audio::{AudioRun, AudioTrack};
 use super::demux::Demuxer;
 use super::entry::Entry;
+use super::isobmff;
 use crate::error::{Error, Result};
 
 /// Most groups taken from the index; it bounds the number of walks.
@@ -60,7 +62,7 @@ fn missing(demuxer: &Demuxer, size: usize) -> Option<(usize, Entry)> {
         .position(differ)
         .unwrap_or(groups.len());
     let entry = demuxer.index().get(next)?;
-    (entry.offset.saturating_add(entry.size) <= size as u64).then_some((next, *entry))
+    (entry.offset.saturating_add(entry.size) <= size as u64).then(|| (next, entry.clone()))
 }
 
 fn walk(demuxer: &mut Demuxer, data: &[u8], mut at: usize) -> Result<()> {
@@ -77,4 +79,24 @@ fn walk(demuxer: &mut Demuxer, data: &[u8], mut at: usize) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// A fragmented MP4 of sound alone, as a multiplexer leaves it -> its first track of mp4a or Opus, and its samples.
+///
+/// # Errors
+/// There is no such track; its boxes break a rule of spec 2.7.
+pub fn read_audio(data: &[u8]) -> Result<(AudioTrack, Vec<AudioRun>)> {
+    let (mut track, mut runs) = (None, Vec::new());
+    for b in isobmff::boxes(data)? {
+        let at = |e: Error| e.at(b.offset, "audio file");
+        match (&b.kind, &track) {
+            (b"moov", None) => track = isobmff::audio_track(b.body).map_err(at)?,
+            (b"moof", Some(t)) => runs.extend(isobmff::audio_moof(b.body, t, b.offset as u64 - 8).map_err(at)?),
+            _ => {}
+        }
+    }
+    let Some(track) = track else {
+        return Err(Error::bitstream(0, "audio file", "an audio track of AAC or Opus"));
+    };
+    Ok((track.description, runs))
 }

@@ -1,9 +1,11 @@
 //! Writer of the container (spec 2): init segment, fragments, sidx and ssix.
 
+use super::audio::{AudioTrack, SAMPLES_MAX};
 use super::config::Config;
 use crate::error::{Error, Result};
 
 pub const TRACK_ID: u32 = 1;
+const AUDIO_ID: u32 = 2;
 pub const BRAND: &[u8; 4] = b"gsv1";
 const FLAGS_SYNC: u32 = 0x0200_0000; // sample_depends_on = 2: on no other
 const FLAGS_OTHER: u32 = 0x0101_0000; // depends on others, is not a sync sample
@@ -20,6 +22,16 @@ pub struct Reference {
     pub sync: bool,
     /// Bytes of the fragment up to the end of each layer; empty if unknown.
     pub layers: Vec<u64>,
+}
+
+/// The sound in front of a group.
+#[derive(Debug, Clone, Copy)]
+pub struct Sound<'a> {
+    /// Media time of the first sample.
+    pub time: u64,
+    /// Size and duration of each.
+    pub samples: &'a [(u32, u32)],
+    pub data: &'a [u8],
 }
 
 /// A box around `parts`.
@@ -47,57 +59,79 @@ fn words(v: &[u32]) -> Vec<u8> {
 /// ftyp and moov, which start every file.
 pub fn init_segment(config: &Config) -> Result<Vec<u8>> {
     let mut out = boxed(b"ftyp", &[BRAND, &[0; 4], BRAND, b"iso6", b"cmfc"]);
+    let tracks = if config.audio.is_some() { AUDIO_ID } else { TRACK_ID };
     let mvhd = [
         words(&[0, 0, config.timescale, 0, 1 << 16]),
         vec![1, 0],
         vec![0; 10],
         words(&UNITY),
         vec![0; 24],
-        words(&[TRACK_ID + 1]),
+        words(&[tracks + 1]),
     ];
     let mvhd = full(b"mvhd", 0, 0, &[&mvhd.concat()]);
-    let trex = full(b"trex", 0, 0, &[&words(&[TRACK_ID, 1, 0, 0, 0])]);
-    out.extend(boxed(b"moov", &[&mvhd, &track(config)?, &boxed(b"mvex", &[&trex])]));
+    let trex: Vec<u8> = (1..=tracks)
+        .flat_map(|id| full(b"trex", 0, 0, &[&words(&[id, 1, 0, 0, 0])]))
+        .collect();
+    let audio = config.audio.as_ref().map_or(Vec::new(), audio_track);
+    out.extend(boxed(
+        b"moov",
+        &[&mvhd, &track(config)?, &audio, &boxed(b"mvex", &[&trex])],
+    ));
     Ok(out)
 }
 
 fn track(config: &Config) -> Result<Vec<u8>> {
-    let tkhd = [words(&[0, 0, TRACK_ID, 0, 0]), vec![0; 16], words(&UNITY), vec![0; 8]].concat();
-    let tkhd = full(b"tkhd", 0, 3, &[&tkhd]); // enabled, in the movie
-    let mdhd = full(
-        b"mdhd",
-        0,
-        0,
-        &[&words(&[0, 0, config.timescale, 0]), &[0x55, 0xC4, 0, 0]],
-    ); // language "und"
-    let hdlr = full(b"hdlr", 0, 0, &[&[0; 4], b"volv", &[0; 12], b"gsv\0"]);
-    let dref = full(b"dref", 0, 0, &[&words(&[1]), &full(b"url ", 0, 1, &[])]);
     let mut name = [0u8; 32];
     name[..4].copy_from_slice(&[3, b'g', b's', b'v']);
     let entry = boxed(
         BRAND,
         &[&[0, 0, 0, 0, 0, 0, 0, 1], &name, &boxed(b"gsvC", &[&config.write()?])],
     );
+    let head = [tkhd(TRACK_ID, 0)];
+    let media = full(b"vvhd", 0, 0, &[]);
+    Ok(trak(&head, config.timescale, (b"volv", b"gsv\0"), &media, &entry))
+}
+
+/// Spec 2.7.
+fn audio_track(audio: &AudioTrack) -> Vec<u8> {
+    let elst = full(b"elst", 0, 0, &[&words(&[1, 0, audio.media_start, 1 << 16])]);
+    let head = [tkhd(AUDIO_ID, 1 << 8), boxed(b"edts", &[&elst])];
+    let media = full(b"smhd", 0, 0, &[&[0; 4]]);
+    trak(&head, audio.timescale, (b"soun", b"sound\0"), &media, &audio.entry)
+}
+
+/// tkhd of a track that is enabled and in the movie; `volume`: 8.8 fixed point.
+fn tkhd(id: u32, volume: u16) -> Vec<u8> {
+    let volume = volume.to_be_bytes();
+    let body = [
+        words(&[0, 0, id, 0, 0]),
+        vec![0; 12],
+        volume.to_vec(),
+        vec![0; 2],
+        words(&UNITY),
+        vec![0; 8],
+    ];
+    full(b"tkhd", 0, 3, &[&body.concat()])
+}
+
+/// A track whose samples are in fragments. `head`: its boxes in front of mdia, `media`: its media header.
+fn trak(head: &[Vec<u8>], timescale: u32, (handler, name): (&[u8; 4], &[u8]), media: &[u8], entry: &[u8]) -> Vec<u8> {
+    let mdhd = full(b"mdhd", 0, 0, &[&words(&[0, 0, timescale, 0]), &[0x55, 0xC4, 0, 0]]); // language "und"
+    let hdlr = full(b"hdlr", 0, 0, &[&[0; 4], handler, &[0; 12], name]);
+    let dref = full(b"dref", 0, 0, &[&words(&[1]), &full(b"url ", 0, 1, &[])]);
     let stbl = [
-        full(b"stsd", 0, 0, &[&words(&[1]), &entry]),
+        full(b"stsd", 0, 0, &[&words(&[1]), entry]),
         full(b"stts", 0, 0, &[&words(&[0])]),
         full(b"stsc", 0, 0, &[&words(&[0])]),
         full(b"stsz", 0, 0, &[&words(&[0, 0])]),
         full(b"stco", 0, 0, &[&words(&[0])]),
     ];
-    let minf = [
-        full(b"vvhd", 0, 0, &[]),
-        boxed(b"dinf", &[&dref]),
-        boxed(b"stbl", &[&stbl.concat()]),
-    ]
-    .concat();
-    Ok(boxed(
-        b"trak",
-        &[&tkhd, &boxed(b"mdia", &[&mdhd, &hdlr, &boxed(b"minf", &[&minf])])],
-    ))
+    let minf = [media, &boxed(b"dinf", &[&dref]), &boxed(b"stbl", &[&stbl.concat()])].concat();
+    let mdia = boxed(b"mdia", &[&mdhd, &hdlr, &boxed(b"minf", &[&minf])]);
+    boxed(b"trak", &[&head.concat(), &mdia])
 }
 
-/// moof and mdat of one group. `sequence_number` counts from 1, `start_frame` from 0.
+/// moof and mdat of one group. `sequence_number` counts from 1, `start_frame` from 0; `sound` goes in front of the payload.
 pub fn fragment(
     payload: &[u8],
     sequence_number: u32,
@@ -105,30 +139,61 @@ pub fn fragment(
     frames: u32,
     sync: bool,
     config: &Config,
+    sound: Option<Sound>,
 ) -> Result<Vec<u8>> {
     let times = start_frame
         .checked_mul(u64::from(config.frame_duration))
         .zip(frames.checked_mul(config.frame_duration));
-    let size = u32::try_from(payload.len()).ok().filter(|s| *s <= u32::MAX - 8);
+    let data = sound.map_or(&[][..], |s| s.data);
+    let size = u32::try_from(payload.len() + data.len())
+        .ok()
+        .filter(|s| *s <= u32::MAX - 8);
     let (Some((start, duration)), Some(size), true) = (times, size, frames > 0) else {
         return Err(Error::Input(format!(
             "a fragment of {frames} frames and {} bytes does not fit its fields",
-            payload.len()
+            payload.len() + data.len()
         )));
     };
+    if let Some(s) = sound {
+        check(&s)?;
+    }
     let flags = if sync { FLAGS_SYNC } else { FLAGS_OTHER };
     let moof = |offset: u32| {
-        let tfhd = full(b"tfhd", 0, 0x02_0000, &[&words(&[TRACK_ID])]);
-        let tfdt = full(b"tfdt", 1, 0, &[&start.to_be_bytes()]);
-        let trun = full(b"trun", 0, 0x00_0701, &[&words(&[1, offset, duration, size, flags])]);
-        let mfhd = full(b"mfhd", 0, 0, &[&words(&[sequence_number])]);
-        boxed(b"moof", &[&mfhd, &boxed(b"traf", &[&tfhd, &tfdt, &trun])])
+        let own = [1, offset + data.len() as u32, duration, payload.len() as u32, flags];
+        let mut parts = full(b"mfhd", 0, 0, &[&words(&[sequence_number])]);
+        parts.extend(traf(TRACK_ID, start, 0x00_0701, &words(&own)));
+        if let Some(s) = sound {
+            let each = s.samples.iter().flat_map(|(size, duration)| [*duration, *size]);
+            let run: Vec<u32> = [s.samples.len() as u32, offset].into_iter().chain(each).collect();
+            parts.extend(traf(AUDIO_ID, s.time, 0x00_0301, &words(&run)));
+        }
+        boxed(b"moof", &[&parts])
     };
     let mut out = moof(moof(0).len() as u32 + 8);
     out.extend(words(&[size + 8]));
     out.extend(b"mdat");
+    out.extend_from_slice(data);
     out.extend_from_slice(payload);
     Ok(out)
+}
+
+fn traf(id: u32, time: u64, flags: u32, run: &[u8]) -> Vec<u8> {
+    let tfhd = full(b"tfhd", 0, 0x02_0000, &[&words(&[id])]);
+    let tfdt = full(b"tfdt", 1, 0, &[&time.to_be_bytes()]);
+    let trun = full(b"trun", 0, flags, &[run]);
+    boxed(b"traf", &[&tfhd, &tfdt, &trun])
+}
+
+fn check(sound: &Sound) -> Result<()> {
+    let sizes: u64 = sound.samples.iter().map(|(size, _)| u64::from(*size)).sum();
+    if sound.samples.len() <= SAMPLES_MAX && sizes == sound.data.len() as u64 {
+        return Ok(());
+    }
+    Err(Error::Input(format!(
+        "expected at most {SAMPLES_MAX} samples of sound for a group, of {} bytes in all, got {} of {sizes} bytes",
+        sound.data.len(),
+        sound.samples.len()
+    )))
 }
 
 /// What precedes the fragments in a finished file: the init segment, a sidx (spec 2.5), and where a group has more than one
