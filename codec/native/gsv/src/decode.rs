@@ -19,7 +19,7 @@ use crate::lifetimes;
 use crate::morton;
 use crate::neighbors::{self, Near};
 use crate::parallel;
-use crate::positions;
+use crate::positions::{self, SplitModel};
 use crate::range_coder::Decoder;
 use crate::tile::{self, Models, Stream, StreamModel};
 use crate::trajectories::{self, Kind, Stop, Trajectories, TrajectoryModel};
@@ -333,7 +333,7 @@ impl GroupDecoder<'_> {
 
     /// Decodes points without their lowest `shift` bits.
     fn points(&self, source: &Source, model: &mut StreamModel, count: u32, shift: u32) -> Result<Vec<[u32; 3]>> {
-        let StreamModel::Counters(model) = model else {
+        let StreamModel::Positions(model) = model else {
             return Ok(Vec::new());
         };
         let bits = u32::from(self.header.grid_bits) - shift;
@@ -380,7 +380,7 @@ impl GroupDecoder<'_> {
         let Some(own) = source(UnitType::NodePositions) else {
             return Ok(Default::default());
         };
-        let positions = self.points(&own, &mut StreamModel::Counters(positions::model()), h.count, 0)?;
+        let positions = self.points(&own, &mut StreamModel::Positions(SplitModel::default()), h.count, 0)?;
         let Some(motion) = source(UnitType::NodeTrajectories) else {
             return Ok((positions, Trajectories::default()));
         };
@@ -412,7 +412,7 @@ impl GroupDecoder<'_> {
                 values.iter_mut().for_each(|v| *v <<= shift);
                 (Part::Channels(i, values), read && fit)
             }
-            (Stream::Lifetimes, StreamModel::Counters(model)) => {
+            (Stream::Lifetimes, StreamModel::Lifetimes(model)) => {
                 let mut l = vec![[0; 2]; near.len()];
                 let sound = lifetimes::code(&mut c, model, h.frames, near, &mut l);
                 (Part::Lifetimes(l), sound)

@@ -12,7 +12,7 @@ use crate::group::Group;
 use crate::lifetimes;
 use crate::morton;
 use crate::neighbors;
-use crate::positions;
+use crate::positions::{self, SplitModel};
 use crate::range_coder::Encoder;
 use crate::tile::{self, Models, Stream, StreamModel};
 use crate::trajectories::{self, Kind, Trajectories, TrajectoryModel};
@@ -134,7 +134,7 @@ impl GroupEncoder<'_> {
         let (g, h) = (self.group, &self.group.header);
         let mut e = Encoder::default();
         match (stream, model) {
-            (Stream::Positions, StreamModel::Counters(model)) => {
+            (Stream::Positions, StreamModel::Positions(model)) => {
                 return points(
                     model,
                     &g.positions[range],
@@ -154,7 +154,7 @@ impl GroupEncoder<'_> {
                 let most = usize::from(h.trajectories[i].coefficients);
                 let _ = trajectories::code(&mut e, model, most, near, &own, u64::MAX); // an encoder never stops
             }
-            (Stream::Lifetimes, StreamModel::Counters(model)) => {
+            (Stream::Lifetimes, StreamModel::Lifetimes(model)) => {
                 let mut own = g.lifetimes.as_ref().map_or(Vec::new(), |l| l[range].to_vec());
                 lifetimes::code(&mut e, model, h.frames, near, &mut own);
             }
@@ -183,7 +183,7 @@ impl GroupEncoder<'_> {
             return Vec::new();
         }
         let near = neighbors::nearest(&g.node_positions);
-        let places = points(&mut positions::model(), &g.node_positions, u32::from(h.grid_bits), 0);
+        let places = points(&mut SplitModel::default(), &g.node_positions, u32::from(h.grid_bits), 0);
         let mut e = Encoder::default();
         let (k, mut model) = (usize::from(h.nodes.coefficients), TrajectoryModel::new(Kind::Node));
         let own: &Trajectories = &g.node_trajectories;
@@ -196,7 +196,7 @@ impl GroupEncoder<'_> {
 }
 
 /// `points` without their lowest `shift` bits.
-fn points(model: &mut crate::model::Model, points: &[[u32; 3]], bits: u32, shift: u32) -> Vec<u8> {
+fn points(model: &mut SplitModel, points: &[[u32; 3]], bits: u32, shift: u32) -> Vec<u8> {
     let codes: Vec<u64> = points.iter().map(|p| morton::encode(p.map(|v| v >> shift))).collect();
     positions::encode(model, &codes, bits - shift)
 }

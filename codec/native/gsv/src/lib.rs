@@ -7,6 +7,7 @@
 mod assemble;
 pub mod attributes;
 pub mod blend;
+mod blocks;
 pub mod channels;
 pub mod companding;
 pub mod conformance;

@@ -66,80 +66,105 @@ fn age(n: u32) -> u32 {
     }
 }
 
-/// A counter: probability of 1 (22 bits), age (2 bits), number of bins seen (8 bits). Tables store it xor `NEW`, so that a
-/// new table is all zeros and its untouched pages take no memory.
+/// A counter: probability of 1 (22 bits), age (2 bits), number of bins seen (8 bits).
 #[derive(Clone, Copy)]
-struct Counter(u32);
-
-const NEW: u32 = 1 << 31;
+pub struct Counter(u32);
 
 impl Counter {
+    pub const NEW: Counter = Counter(1 << 31);
+
     #[inline]
-    fn updated(self, bin: bool, steps: &Steps) -> u32 {
+    fn updated(self, bin: bool, steps: &Steps) -> Counter {
         let p = i64::from(self.0 >> 10);
         let (rate, low) = steps[(self.0 & 255) as usize];
         let target = if bin { (1 << 22) - 1 } else { 0 };
         let p = p + (((target - p) * i64::from(rate)) >> 16);
-        ((p as u32) << 10 | low) ^ NEW
+        Counter((p as u32) << 10 | low)
     }
 
     #[inline]
     fn age(self) -> usize {
         (self.0 >> 8 & 3) as usize
     }
+
+    /// Prepares a counter for the other tiles of a layer: what it has learned from the first one counts less.
+    pub fn settle(&mut self) {
+        let n = (self.0 & 255).min(AGE_SETTLED);
+        self.0 = self.0 >> 10 << 10 | age(n) << 8 | n;
+    }
 }
 
-/// Counters and mixing weights for the syntax elements of one kind.
-#[derive(Clone)]
-pub struct Model {
-    a: Vec<u32>,
-    b: Vec<u32>,
-    weights: Vec<[i32; 2]>, // less WEIGHT_NEW
+/// A weight set: the weights of two counters, by the ages of both.
+pub type Weights = [[i32; 2]; 16];
+pub const WEIGHTS_NEW: Weights = [[WEIGHT_NEW; 2]; 16];
+
+/// Mixes counters; the tables are those of spec 6.3 and 6.2.
+#[derive(Clone, Copy)]
+pub struct Mixer {
     stretch: &'static [i16; 4096],
     squash: &'static [u16; 2 * STRETCH_MAX as usize + 1],
     steps: &'static Steps,
 }
 
-impl Model {
-    /// A model with `a` and `b` contexts and `sets` weight sets.
-    pub fn new(a: usize, b: usize, sets: usize) -> Self {
-        Model {
-            a: vec![0; a],
-            b: vec![0; b],
-            weights: vec![[0; 2]; sets * 16],
+impl Mixer {
+    pub fn new() -> Mixer {
+        Mixer {
             stretch: &STRETCH,
             squash: &SQUASH,
             steps: &STEPS,
         }
     }
 
-    /// Prepares the model for the other tiles of a layer: what it has learned from the first one counts less.
-    pub fn settle(&mut self) {
-        for v in self.a.iter_mut().chain(&mut self.b) {
-            let n = (*v & 255).min(AGE_SETTLED);
-            *v = *v >> 10 << 10 | age(n) << 8 | n;
-        }
-    }
-
-    /// Codes one bin in contexts `a` and `b`, mixed with weight set `w` (spec 6.4).
-    ///
-    /// Contexts are computed from decoded counts, never from raw input, so they are in range by construction.
+    /// Codes one bin with two counters and a weight set (spec 6.4).
     #[inline]
-    pub fn bin<C: Bins>(&mut self, c: &mut C, bin: bool, a: usize, b: usize, w: usize) -> bool {
-        let (slot_a, slot_b) = (&mut self.a[a], &mut self.b[b]);
-        let (ca, cb) = (Counter(*slot_a ^ NEW), Counter(*slot_b ^ NEW));
-        let sa = i32::from(self.stretch[(ca.0 >> 20) as usize]);
-        let sb = i32::from(self.stretch[(cb.0 >> 20) as usize]);
-        let slot = &mut self.weights[16 * w + 4 * ca.age() + cb.age()];
-        let weight = slot.map(|v| v + WEIGHT_NEW);
+    pub fn bin<C: Bins>(&self, c: &mut C, bin: bool, a: &mut Counter, b: &mut Counter, set: &mut Weights) -> bool {
+        let sa = i32::from(self.stretch[(a.0 >> 20) as usize]);
+        let sb = i32::from(self.stretch[(b.0 >> 20) as usize]);
+        let weight = &mut set[4 * a.age() + b.age()];
         let x = ((weight[0] * sa + weight[1] * sb) >> 16).clamp(-STRETCH_MAX, STRETCH_MAX);
         let p = i32::from(self.squash[(x + STRETCH_MAX) as usize]);
         let bin = c.bin(bin, p as u32);
         let err = if bin { 65536 - p } else { -p };
-        let learned = |w: i32, s: i32| (w + ((s * err + 16384) >> 15)).clamp(-WEIGHT_MAX, WEIGHT_MAX) - WEIGHT_NEW;
-        *slot = [learned(weight[0], sa), learned(weight[1], sb)];
-        *slot_a = ca.updated(bin, self.steps);
-        *slot_b = cb.updated(bin, self.steps);
+        for (w, s) in weight.iter_mut().zip([sa, sb]) {
+            *w = (*w + ((s * err + 16384) >> 15)).clamp(-WEIGHT_MAX, WEIGHT_MAX);
+        }
+        *a = a.updated(bin, self.steps);
+        *b = b.updated(bin, self.steps);
         bin
+    }
+}
+
+/// Counters and weight sets for the syntax elements of one kind, where there are few contexts.
+#[derive(Clone)]
+pub struct Model {
+    a: Vec<Counter>,
+    b: Vec<Counter>,
+    weights: Vec<Weights>,
+    mixer: Mixer,
+}
+
+impl Model {
+    /// A model with `a` and `b` contexts and `sets` weight sets.
+    pub fn new(a: usize, b: usize, sets: usize) -> Self {
+        Model {
+            a: vec![Counter::NEW; a],
+            b: vec![Counter::NEW; b],
+            weights: vec![WEIGHTS_NEW; sets],
+            mixer: Mixer::new(),
+        }
+    }
+
+    /// As of `Counter`.
+    pub fn settle(&mut self) {
+        self.a.iter_mut().chain(&mut self.b).for_each(Counter::settle);
+    }
+
+    /// Codes one bin in contexts `a` and `b`, mixed with weight set `w`.
+    ///
+    /// Contexts are computed from decoded counts, never from raw input, so they are in range by construction.
+    #[inline]
+    pub fn bin<C: Bins>(&mut self, c: &mut C, bin: bool, a: usize, b: usize, w: usize) -> bool {
+        self.mixer
+            .bin(c, bin, &mut self.a[a], &mut self.b[b], &mut self.weights[w])
     }
 }

@@ -7,23 +7,22 @@
 mod octree;
 mod split;
 
-use crate::model::Model;
 use crate::range_coder::{Bins, Decoder, Encoder};
 use octree::{Children, Node, link};
-pub use split::model;
+pub use split::SplitModel;
 use split::{Seen, Split, SplitCoder, seen};
 
 const LONELY: usize = 2; // most face neighbours of a point that leaves the tree
 
 /// Encodes points of `bits` bits per axis, given as sorted Morton codes.
-pub fn encode(model: &mut Model, points: &[u64], bits: u32) -> Vec<u8> {
+pub fn encode(model: &mut SplitModel, points: &[u64], bits: u32) -> Vec<u8> {
     let mut c = Encoder::default();
     code(&mut c, model, points, points.len() as u32, bits);
     c.finish()
 }
 
 /// Decodes `count` points; returns their sorted Morton codes, or what was expected of the payload.
-pub fn decode(model: &mut Model, payload: &[u8], count: u32, bits: u32) -> Result<Vec<u64>, &'static str> {
+pub fn decode(model: &mut SplitModel, payload: &[u8], count: u32, bits: u32) -> Result<Vec<u64>, &'static str> {
     let mut c = Decoder::new(payload);
     let points = code(&mut c, model, &[], count, bits);
     c.finish().map(|()| points)
@@ -31,7 +30,7 @@ pub fn decode(model: &mut Model, payload: &[u8], count: u32, bits: u32) -> Resul
 
 /// Codes `count` points of `bits` bits per axis as one tree. `points`: their sorted Morton codes, in the decoder empty.
 /// Returns the codes.
-fn code<C: Bins>(c: &mut C, model: &mut Model, points: &[u64], count: u32, bits: u32) -> Vec<u64> {
+fn code<C: Bins>(c: &mut C, model: &mut SplitModel, points: &[u64], count: u32, bits: u32) -> Vec<u64> {
     let mut out = Vec::with_capacity(count as usize);
     let mut coder = SplitCoder { c, model };
     let mut level = if count > 0 {

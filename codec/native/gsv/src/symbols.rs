@@ -3,6 +3,7 @@
 //! Each context has a distribution that adapts to its symbols; the mean of three, with weights that adapt too, is coded. One
 //! symbol replaces about eight bins; the 16-bit lanes vectorize on every processor.
 
+use crate::blocks::Blocks;
 use crate::range_coder::{Bins, Ends, SYMBOLS};
 use std::sync::LazyLock;
 
@@ -59,14 +60,14 @@ fn high(a: u16, b: u16) -> u16 {
 /// The distributions of one kind of context, and how many symbols each has seen.
 #[derive(Clone)]
 struct Table {
-    distributions: Vec<Distribution>,
+    distributions: Blocks<Distribution>,
     seen: Vec<u8>,
 }
 
 impl Table {
     fn new(contexts: usize) -> Table {
         Table {
-            distributions: vec![NEW; contexts],
+            distributions: Blocks::new(contexts, &NEW),
             seen: vec![0; contexts],
         }
     }
@@ -105,8 +106,10 @@ impl SymbolModel {
 
     /// Prepares the model for the other tiles of a layer: what it has learned from the first one counts less.
     pub fn settle(&mut self) {
-        let seen = self.tables.iter_mut().flat_map(|t| &mut t.seen);
-        seen.for_each(|n| *n = (*n).min(SEEN_SETTLED));
+        for t in &mut self.tables {
+            t.distributions.settle(|_| ());
+            t.seen.iter_mut().for_each(|n| *n = (*n).min(SEEN_SETTLED));
+        }
     }
 
     /// Codes one symbol in three contexts, mixed with weight set `w`.
@@ -122,9 +125,9 @@ impl SymbolModel {
         let [wa, wb] = weights.map(|v| v >> RATE_BITS);
         let wd = 65536 - wa - wb;
         let (a, b, d) = (
-            &mut a.distributions[ia],
-            &mut b.distributions[ib],
-            &mut d.distributions[id],
+            a.distributions.get(ia),
+            b.distributions.get(ib),
+            d.distributions.get(id),
         );
         let mut ends = [0; SYMBOLS];
         for (i, end) in ends.iter_mut().enumerate() {

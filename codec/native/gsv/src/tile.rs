@@ -9,7 +9,7 @@ use crate::fields::{Fields, Reader};
 use crate::header::Header;
 use crate::lifetimes;
 use crate::model::Model;
-use crate::positions;
+use crate::positions::SplitModel;
 use crate::trajectories::{Kind, TrajectoryModel};
 
 /// The content of one stream; trajectories and channels by their place in the header.
@@ -121,7 +121,7 @@ fn varint(r: &mut Reader) -> Option<u32> {
 /// The models of the streams of a layer; None: new ones.
 #[derive(Clone, Default)]
 pub struct Models {
-    positions: Option<Model>,
+    positions: Option<SplitModel>,
     channels: Vec<Option<ChannelModel>>,
     trajectories: Vec<Option<TrajectoryModel>>,
     lifetimes: Option<Model>,
@@ -130,7 +130,8 @@ pub struct Models {
 /// The model of one stream.
 pub enum StreamModel {
     None,
-    Counters(Model),
+    Positions(SplitModel),
+    Lifetimes(Model),
     Channels(ChannelModel),
     Trajectories(TrajectoryModel),
 }
@@ -140,8 +141,8 @@ impl Models {
     pub fn of(&self, stream: Stream, h: &Header) -> StreamModel {
         match stream {
             Stream::Deaths => StreamModel::None,
-            Stream::Positions => StreamModel::Counters(self.positions.clone().unwrap_or_else(positions::model)),
-            Stream::Lifetimes => StreamModel::Counters(self.lifetimes.clone().unwrap_or_else(lifetimes::model)),
+            Stream::Positions => StreamModel::Positions(self.positions.clone().unwrap_or_default()),
+            Stream::Lifetimes => StreamModel::Lifetimes(self.lifetimes.clone().unwrap_or_else(lifetimes::model)),
             Stream::Channels(i, a) => {
                 let known = self.channels.get(i).cloned().flatten();
                 StreamModel::Channels(known.unwrap_or_else(|| ChannelModel::new(a, a.channels(h.sh_degree))))
@@ -156,11 +157,11 @@ impl Models {
     /// Keeps what a stream has learned, if it is the first of its kind.
     pub fn learn(&mut self, stream: Stream, model: StreamModel) {
         match (stream, model) {
-            (Stream::Positions, StreamModel::Counters(mut m)) if self.positions.is_none() => {
+            (_, StreamModel::Positions(mut m)) if self.positions.is_none() => {
                 m.settle();
                 self.positions = Some(m);
             }
-            (Stream::Lifetimes, StreamModel::Counters(mut m)) if self.lifetimes.is_none() => {
+            (_, StreamModel::Lifetimes(mut m)) if self.lifetimes.is_none() => {
                 m.settle();
                 self.lifetimes = Some(m);
             }

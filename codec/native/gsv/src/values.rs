@@ -4,7 +4,8 @@
 //! A value is coded relative to 0 while the mean of the neighbours is small, so that the contexts learn how reliable the
 //! mean is (most channels are noise around a mean of their own); where the mean is large, relative to the mean.
 
-use crate::model::Model;
+use crate::blocks::Blocks;
+use crate::model::{Counter, Mixer, WEIGHTS_NEW, Weights};
 use crate::neighbors::NEAR;
 use crate::range_coder::Bins;
 
@@ -24,7 +25,10 @@ pub const NEAR_WEIGHT: [i32; NEAR] = [4, 3, 2, 2];
 /// Adaptive model of the values of trajectories.
 #[derive(Clone)]
 pub struct ValueModel {
-    model: Model,
+    a: Blocks<[Counter; SLOTS]>,
+    b: Blocks<[Counter; SLOTS]>,
+    weights: Blocks<[Weights; SLOTS]>, // of each class
+    mixer: Mixer,
     /// A value that the spec forbids was read.
     pub broken: bool,
 }
@@ -110,12 +114,17 @@ impl Expected {
 impl ValueModel {
     /// As of `Model`.
     pub fn settle(&mut self) {
-        self.model.settle();
+        self.a.settle(|block| block.iter_mut().for_each(Counter::settle));
+        self.b.settle(|block| block.iter_mut().for_each(Counter::settle));
+        self.weights.settle(|_| ());
     }
 
     pub fn new(classes: usize) -> Self {
         ValueModel {
-            model: Model::new(classes * 230 * SLOTS, classes * 675 * SLOTS, classes * SLOTS),
+            a: Blocks::new(classes * 230, &[Counter::NEW; SLOTS]),
+            b: Blocks::new(classes * 675, &[Counter::NEW; SLOTS]),
+            weights: Blocks::new(classes, &[WEIGHTS_NEW; SLOTS]),
+            mixer: Mixer::new(),
             broken: false,
         }
     }
@@ -128,7 +137,7 @@ impl ValueModel {
         let [p1, p2] = prev.map(|v| (v.clamp(-7, 7) + 7) as usize);
         let b = ((class * 15 + p1) * 15 + p2) * 3 + e.sign();
         let centre = e.centre;
-        let v = self.residual(c, x - centre, [a * SLOTS, b * SLOTS, class * SLOTS]);
+        let v = self.residual(c, x - centre, [a, b, class]);
         let value = centre + v;
         if value.abs() > MAX_VALUE {
             self.broken = true;
@@ -139,7 +148,11 @@ impl ValueModel {
 
     #[inline]
     fn residual<C: Bins>(&mut self, c: &mut C, v: i32, [a, b, w]: [usize; 3]) -> i32 {
-        let mut bin = |c: &mut C, j: usize, bin: bool| self.model.bin(c, bin, a + j, b + j, w + j);
+        let (a, b, w, mixer) = (self.a.get(a), self.b.get(b), self.weights.get(w), self.mixer);
+        let mut bin = |c: &mut C, j: usize, bin: bool| {
+            let j = j % SLOTS; // in range as it is, which the compiler does not see
+            mixer.bin(c, bin, &mut a[j], &mut b[j], &mut w[j])
+        };
         if !bin(c, 0, v != 0) {
             return 0;
         }

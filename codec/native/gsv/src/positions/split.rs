@@ -2,7 +2,8 @@
 //! the points that its face neighbours have next to it (spec 8).
 
 use super::octree::Node;
-use crate::model::Model;
+use crate::blocks::Blocks;
+use crate::model::{Counter, Mixer, WEIGHTS_NEW, Weights};
 use crate::range_coder::Bins;
 
 const BUCKETS: usize = 16; // of the number of points to split
@@ -17,14 +18,49 @@ pub fn seen(k: usize, count: u32) -> Seen {
     u64::from(count.min(255)) << (8 * k)
 }
 
-/// A new model of splits.
-pub fn model() -> Model {
-    Model::new(BUCKETS * TREE * EVIDENCE, BUCKETS * TREE * 3 * 7 * 8, BUCKETS * TREE)
+const PLACES: usize = 3 * 7 * 8; // contexts made of axis, occupied face neighbours and depth
+
+/// What is learned of one bin of a split.
+#[derive(Clone)]
+struct SplitBin {
+    a: [Counter; EVIDENCE],
+    b: [Counter; PLACES],
+    weights: Weights,
+}
+
+/// Adaptive model of splits.
+#[derive(Clone)]
+pub struct SplitModel {
+    bins: Blocks<SplitBin>,
+    mixer: Mixer,
+}
+
+const NEW: SplitBin = SplitBin {
+    a: [Counter::NEW; EVIDENCE],
+    b: [Counter::NEW; PLACES],
+    weights: WEIGHTS_NEW,
+};
+
+impl Default for SplitModel {
+    fn default() -> Self {
+        SplitModel {
+            bins: Blocks::new(BUCKETS * TREE, &NEW),
+            mixer: Mixer::new(),
+        }
+    }
+}
+
+impl SplitModel {
+    /// As of `Counter`.
+    pub fn settle(&mut self) {
+        self.bins
+            .settle(|bin| bin.a.iter_mut().chain(&mut bin.b).for_each(Counter::settle));
+    }
 }
 
 pub struct SplitCoder<'a, C> {
     pub c: &'a mut C,
-    pub model: &'a mut Model,
+    pub model: &'a mut SplitModel,
 }
 
 /// The inputs of the contexts of the seven splits of a node.
@@ -140,9 +176,10 @@ impl Split {
         while lo < hi {
             let mid = (lo + hi) >> 1;
             let high = if tree < TREE {
-                let t = bucket * TREE + tree;
-                let b = ((t * 3 + axis) * 7 + self.occupied) * 8 + self.depth;
-                coder.model.bin(coder.c, want > mid, t * EVIDENCE + c, b, t)
+                let SplitBin { a, b, weights } = coder.model.bins.get(bucket * TREE + tree);
+                let place = (axis * 7 + self.occupied) * 8 + self.depth;
+                let mixer = coder.model.mixer;
+                mixer.bin(coder.c, want > mid, &mut a[c], &mut b[place], weights)
             } else {
                 coder.c.bits(u64::from(want > mid), 1) != 0
             };
