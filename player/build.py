@@ -27,8 +27,8 @@ SPARK, SPARK_HASH = PLAYER / "spark.js", PLAYER / "spark.sha256"
 def source_hash() -> str:
     """SHA-256 over the sources of native.wasm.gz."""
     files = [NATIVE / "Cargo.toml", NATIVE / "Cargo.lock", NATIVE / "bindings" / "src" / "lib.rs"]
-    files += [NATIVE / crate / "Cargo.toml" for crate in ("gsv", "raster", "bindings")]
-    for folder in ("gsv/src", "raster/src", "bindings/src/wasm"):
+    files += [NATIVE / crate / "Cargo.toml" for crate in ("gsv", "raster", "bindings", "cores")]
+    for folder in ("gsv/src", "raster/src", "cores/src", "bindings/src/wasm"):
         files += (NATIVE / folder).rglob("*.rs")
     files.append(NATIVE / "bindings" / "src" / "wasm.rs")
     digest = hashlib.sha256()

@@ -1,17 +1,21 @@
 // The groups of a stream: which are fetched, decoded and kept, and by which worker.
 //
-//   source --payload--> group worker (decode, evaluate, project) --Gaussians of a band--> raster worker --pixels--> canvas
-//                                                                \--visible Gaussians--> GPU, on a canvas above
-//                                                                \--an answer--> `ask`, for scenes of other programs
+//   source --payload--> group workers (decode, evaluate, project) --Gaussians of a band--> raster worker --pixels--> canvas
+//                                                                 \--visible Gaussians--> GPU, on a canvas above
+//                                                                 \--an answer--> `ask`, for scenes of other programs
+//
+// A group of many tiles is shared by the workers of a set: each decodes and keeps its tiles alone, and nothing is copied.
 
 import { AdaptiveSource } from "./abr.js";
 import { ALL, AUTO, Native, load } from "./native.js";
 import { LayerChoice } from "./layers.js";
 import { Renderer } from "./renderer.js";
 import { Source } from "./source.js";
+import { joined, order, share, sharing } from "./tiles.js";
 
 const AHEAD = 10; // seconds of payloads to fetch ahead
-const GROUP_WORKERS = 2;
+const SETS = 2; // of group workers
+const SHARES_MAX = 4; // workers of a set; the others start when a group has tiles for them
 const RASTER_WORKERS_MAX = 8;
 
 // A script from another origin cannot be a worker, but a worker may import it. Bundlers know a worker by these words, and
@@ -26,13 +30,14 @@ function start(script = "./worker.js") {
 }
 
 export class Engine extends EventTarget {
-  groups = new Map(); // group -> {state: fetching | decoding | ready | failed, worker, header, layers, abort}
+  groups = new Map(); // group -> {state: fetching | decoding | ready, set, pieces, left, header, layers, abort}
+  // set: workers that hold it; pieces: how many of them do; left: how many of these still decode; order: see tiles.js
   failed = new Map(); // group -> message
   layers = AUTO; // number of layers of each group to fetch and draw
   choice = new LayerChoice();
   #chosen = new Map(); // sync group -> number of layers, of it and of the groups predicted from it
   stats = { decode: 0, project: 0, blend: 0, gaussians: 0, link: 0 };
-  #workers = [];
+  #sets = Array.from({ length: SETS }, () => []); // of group workers
   #rasters = [];
   #asked = new Map(); // id -> {resolve, reject} of a request
   #requests = 0;
@@ -47,8 +52,11 @@ export class Engine extends EventTarget {
     const cores = navigator.hardwareConcurrency || 2;
     const count = canvas ? Math.min(Math.max(cores - 1, 2), RASTER_WORKERS_MAX) : 0;
     this.#rasters = Array.from({ length: count }, () => start());
-    this.#workers = Array.from({ length: GROUP_WORKERS }, () => start());
-    this.renderer = new Renderer(canvas, { rasters: count, stats: this.stats, say: (type, detail) => this.#say(type, detail) });
+    this.shares = Math.min(cores, SHARES_MAX);
+    this.#sets.forEach((set) => set.push(start()));
+    const divide = (load) => this.source.native.divide(load, count);
+    const say = (type, detail) => this.#say(type, detail);
+    this.renderer = new Renderer(canvas, { rasters: count, stats: this.stats, divide, say });
   }
 
   #say(type, detail) {
@@ -63,29 +71,34 @@ export class Engine extends EventTarget {
   }
 
   #connect(module) {
-    const ports = this.#rasters.map(() => []);
-    this.#workers.forEach((worker) => {
-      const own = this.#rasters.map((_, i) => {
-        const { port1, port2 } = new MessageChannel();
-        ports[i].push(port2);
-        return port1;
-      });
-      worker.onmessage = ({ data }) => this.#onGroup(worker, data);
-      worker.onerror = (e) => this.#dead(e);
-      worker.postMessage({ role: "group", module, ports: own }, own);
-    });
-    this.#rasters.forEach((worker, i) => {
+    this.#module = module;
+    this.#rasters.forEach((worker) => {
       worker.onmessage = ({ data }) => this.renderer.onRaster(worker, data);
       worker.onerror = (e) => this.#dead(e);
-      worker.postMessage({ role: "raster", module, ports: ports[i] }, ports[i]);
+      worker.postMessage({ role: "raster", module });
     });
+    for (const [worker] of this.#sets) this.#join(worker);
+  }
+
+  #module = null;
+
+  // Connects a group worker with the raster workers.
+  #join(worker) {
+    const own = this.#rasters.map((raster) => {
+      const { port1, port2 } = new MessageChannel();
+      raster.postMessage({ port: port2 }, [port2]);
+      return port1;
+    });
+    worker.onmessage = ({ data }) => this.#onGroup(worker, data);
+    worker.onerror = (e) => this.#dead(e);
+    worker.postMessage({ role: "group", module: this.#module, ports: own }, own);
   }
 
   close() {
     this.closed = true;
     this.source.close();
     for (const g of this.groups.values()) g.abort?.abort();
-    for (const w of [...this.#workers, ...this.#rasters]) w.terminate();
+    for (const w of [...this.#sets.flat(), ...this.#rasters]) w.terminate();
     for (const { reject } of this.#asked.values()) reject(new Error("the stream was closed"));
     this.renderer.close();
   }
@@ -105,20 +118,29 @@ export class Engine extends EventTarget {
 
   // Requests the image of frame t, whose group is decoded.
   draw(t, view) {
-    const { header } = this.groups.get(this.groupOf(t));
-    this.#post(t, { ...this.renderer.begin({ t, view, gaussians: header.gaussians }, this.source.config.background), view });
+    const { header, pieces } = this.groups.get(this.groupOf(t));
+    const how = this.renderer.begin({ t, view, gaussians: header.gaussians, pieces }, this.source.config.background);
+    this.#post(t, (piece) => ({ ...how, view, piece, pieces }));
   }
 
-  // Resolves with the answer of the worker that has the group of frame t, which is decoded.
-  ask(t, message) {
-    const id = `ask ${++this.#requests}`;
-    this.#post(t, { ...message, id });
-    return new Promise((resolve, reject) => this.#asked.set(id, { resolve, reject }));
+  // Resolves with the answer of the workers that have the group of frame t, which is decoded.
+  async ask(t, message) {
+    const { order } = this.groups.get(this.groupOf(t));
+    const answers = [];
+    this.#post(t, () => {
+      const id = `ask ${++this.#requests}`;
+      answers.push(new Promise((resolve, reject) => this.#asked.set(id, { resolve, reject })));
+      return { ...message, id };
+    });
+    return joined(await Promise.all(answers), order);
   }
 
+  // Sends message(piece) to each worker that has tiles of the group of frame t.
   #post(t, message) {
     const group = this.groupOf(t);
-    this.groups.get(group).worker.postMessage({ ...message, group, t: t - this.source.groups[group].start_frame });
+    const { set, pieces } = this.groups.get(group);
+    const local = t - this.source.groups[group].start_frame;
+    set.slice(0, pieces).forEach((worker, piece) => worker.postMessage({ ...message(piece), group, t: local }));
   }
 
   get fps() {
@@ -150,14 +172,11 @@ export class Engine extends EventTarget {
     const next = this.#after(i, loop);
     if (next !== null) decoded.push(next);
     for (const [k, g] of this.groups) {
-      if (decoded.includes(k) || g.state === "decoding") continue;
-      g.abort?.abort(new DOMException("not needed any more", "AbortError"));
-      g.worker?.postMessage({ type: "release", group: k });
-      this.groups.delete(k);
+      if (!decoded.includes(k)) this.#release(k, g);
     }
     const busy = [...this.groups.values()].filter((g) => g.state !== "ready").length;
     if (!this.groups.has(i)) {
-      if (busy < GROUP_WORKERS) this.#decode(i); // else later: fast seeking must not queue up decoders
+      if (busy < SETS) this.#decode(i); // else later: fast seeking must not queue up decoders
     } else if (this.ready(i) && next !== null && !this.groups.has(next)) this.#decode(next);
     else if (next !== null && this.ready(next)) this.#prefetch(next, loop);
   }
@@ -166,12 +185,20 @@ export class Engine extends EventTarget {
   show(layers) {
     if (layers === this.layers) return;
     this.layers = layers;
-    for (const [k, g] of this.groups) {
-      if (g.state === "decoding") continue;
-      g.abort?.abort(new DOMException("not needed any more", "AbortError"));
-      g.worker?.postMessage({ type: "release", group: k });
-      this.groups.delete(k);
-    }
+    this.forget();
+  }
+
+  // Gives up all groups that are not being decoded.
+  forget() {
+    for (const [k, g] of this.groups) this.#release(k, g);
+  }
+
+  // Gives a group up, unless it is being decoded.
+  #release(k, g) {
+    if (g.state === "decoding") return;
+    g.abort?.abort(new DOMException("not needed any more", "AbortError"));
+    g.set?.forEach((worker) => worker.postMessage({ type: "release", group: k }));
+    this.groups.delete(k);
   }
 
   // Number of layers of group i. It is chosen anew at sync groups, since the others depend on the layers of theirs.
@@ -209,15 +236,31 @@ export class Engine extends EventTarget {
       const payload = await this.source.payload(i, abort.signal, layers);
       const reference = await this.#reference(i, payload, abort.signal, layers);
       if (this.groups.get(i) !== entry) return;
-      // the idle worker, else the one that holds fewer groups
-      const held = (w) => [...this.groups.values()].reduce((n, g) => n + (g.worker !== w ? 0 : g.state === "ready" ? 1 : 9), 0);
-      entry.worker = this.#workers.reduce((a, b) => (held(b) < held(a) ? b : a));
+      // the idle set, else the one that holds fewer groups
+      const held = (set) => [...this.groups.values()].reduce((n, g) => n + (g.set !== set ? 0 : g.state === "ready" ? 1 : 9), 0);
+      entry.set = this.#sets.reduce((a, b) => (held(b) < held(a) ? b : a));
       entry.state = "decoding";
-      const level = this.source.level(i);
-      entry.worker.postMessage({ type: "decode", group: i, payload, level, layers, reference, bounds: !this.bounds });
+      this.#share(i, entry, payload, reference);
     } catch (e) {
       if (this.groups.get(i) !== entry || abort.signal.aborted) return;
       this.#fail(i, e.message);
+    }
+  }
+
+  // Gives the tiles of group i to the workers of its set.
+  #share(i, entry, payload, reference) {
+    const { native } = this.source;
+    const { set, layers } = entry;
+    const index = native.index(payload, reference?.payload);
+    const n = (entry.pieces = entry.left = sharing(index, layers, this.shares));
+    entry.order = order(index, layers, n);
+    const before = reference && n > 1 ? native.index(reference.payload) : null;
+    const [level, bounds] = [this.source.level(i), !this.bounds];
+    for (let k = 0; k < n; k++) {
+      if (!set[k]) this.#join((set[k] = start()));
+      const wanted = n > 1 ? share(index, k, n) : null;
+      const own = before ? { ...reference, key: `${reference.key}, ${k} of ${n}`, wanted: share(before, k, n) } : reference;
+      set[k].postMessage({ type: "decode", group: i, payload, level, layers, reference: own, wanted, bounds });
     }
   }
 
@@ -248,7 +291,9 @@ export class Engine extends EventTarget {
   }
 
   #fail(i, message) {
-    this.groups.delete(i);
+    if (this.failed.has(i)) return; // another worker has told already
+    const entry = this.groups.get(i);
+    if (entry) this.#release(i, { ...entry, state: "failed" });
     this.failed.set(i, message);
     const g = this.source.groups[i];
     const frames = `${g.start_frame}–${g.start_frame + g.frames - 1}`;
@@ -259,6 +304,21 @@ export class Engine extends EventTarget {
     this.#say("fatal", e.message || "a worker could not be started");
   }
 
+  // A worker has decoded its tiles of a group.
+  #onDecoded(entry, m) {
+    const { header, group } = m;
+    entry.ms = Math.max(entry.ms ?? 0, m.ms);
+    (entry.means ??= []).push(header.means);
+    entry.header = { ...header, gaussians: header.gaussians + (entry.header?.gaussians ?? 0), means: undefined };
+    if (--entry.left) return;
+    this.stats.decode = entry.ms / header.frames;
+    this.source.decoded?.(group, this.stats.decode);
+    this.bounds ??= this.source.native.bounds(...entry.means);
+    entry.means = null;
+    entry.state = "ready";
+    this.#say("decoded", { group, header: entry.header });
+  }
+
   #onGroup(worker, m) {
     const asked = this.#asked.get(m.id);
     this.#asked.delete(m.id);
@@ -266,17 +326,11 @@ export class Engine extends EventTarget {
     asked?.reject(new Error(m.message));
     const entry = this.groups.get(m.group);
     if (m.type === "decoded") {
-      this.stats.decode = m.ms / m.header.frames;
-      this.source.decoded?.(m.group, this.stats.decode);
-      this.bounds ??= m.header.bounds;
-      if (!entry) return worker.postMessage({ type: "release", group: m.group });
-      entry.state = "ready";
-      entry.header = m.header;
-      this.#say("decoded", m);
+      if (!entry?.left) return worker.postMessage({ type: "release", group: m.group });
+      this.#onDecoded(entry, m);
     } else if (m.type === "projected") {
-      this.stats.project = m.ms;
+      this.renderer.onProjected(m);
     } else if (m.type === "packed") {
-      this.stats.project = m.ms;
       this.renderer.onPacked(m);
     } else if (m.type === "failed") {
       if (m.id !== undefined) this.renderer.drop(m.id);

@@ -4,7 +4,7 @@
 // A module whose only function uses i8x16.splat: does this browser have simd128?
 const SIMD = [0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 10, 10, 1, 8, 0, 65, 0, 253, 15, 253, 98, 11];
 
-const HEADER = 1 << 14; // bytes that hold the header of a group
+const HEADER_MAX = 1 << 22; // bytes of the header of a group: more than 65,535 units and tiles, the most there are, take
 export const NONE = 255; // no slot
 export const ALL = 255; // layers
 export const AUTO = 0; // as many layers as link and device sustain
@@ -71,19 +71,32 @@ export class Native {
 
   // Groups
 
-  // `reference`: the slot of the reference of a predicted group; `layers`: number to decode.
-  decode(slot, payload, level, reference = NONE, layers = ALL) {
+  // reference: the slot of the reference of a predicted group; layers: number to decode; wanted: flags of the tiles to decode,
+  // all if null; keepLeading: whether the tiles that they start from stay when they are not wanted.
+  decode(slot, payload, level, reference = NONE, layers = ALL, wanted = null, keepLeading = true) {
     this.put(payload);
-    this.check(this.x.decode(slot, level, reference, layers));
+    if (wanted) this.bytes(this.x.wanted(wanted.length), wanted.length).set(wanted);
+    this.check(this.x.decode(slot, level, reference, layers, keepLeading));
     return JSON.parse(this.text());
   }
 
   // How many groups back a payload refers; 0: it is independent.
   reference(payload) {
-    this.put(payload.subarray(0, HEADER));
+    this.put(head(payload));
     const back = this.x.reference();
     this.check(back >= 0);
     return back;
+  }
+
+  // The tiles and units of a payload, see text.rs; before: the payload of its reference, if it is predicted.
+  index(payload, before = null) {
+    const [own, other] = [head(payload), before ? head(before) : new Uint8Array(0)];
+    const both = new Uint8Array(other.length + own.length);
+    both.set(other);
+    both.set(own, other.length);
+    this.put(both);
+    this.check(this.x.index(other.length));
+    return JSON.parse(this.text());
   }
 
   frame(slot, t) {
@@ -100,23 +113,40 @@ export class Native {
     return new Float32Array(this.output().buffer);
   }
 
-  bounds() {
+  // The box of most means (a Float32Array of each who has some): from the 1st to the 99th percentile.
+  bounds(...means) {
+    this.#floats(...means);
     this.x.bounds();
     return Array.from(this.floats());
   }
 
+  #floats(...arrays) {
+    const all = new Float32Array(arrays.reduce((n, a) => n + a.length, 0));
+    arrays.reduce((at, a) => (all.set(a, at), at + a.length), 0);
+    this.put(new Uint8Array(all.buffer));
+  }
+
   // Image
 
-  // view: 19 floats, see wasm.rs. Calls take(band) for each band; `splats` is a view into the memory of the instance.
-  project(view, count, take) {
-    this.put(new Uint8Array(view.buffer, view.byteOffset, view.byteLength));
+  // view: 19 floats, see wasm.rs; ends: of bands for which others project, too, see `divide`. Calls take(band) for each band;
+  // `splats` is a view into the memory of the instance. Returns the number of bands, and the load of each row of tiles.
+  project(view, count, take, ends = []) {
+    this.#floats(view, ends);
     const bands = this.x.project(count);
     if (!bands) throw new Error(this.text());
+    const load = this.floats();
     for (let i = 0; i < bands; i++) {
       const size = this.x.band_splats(i) * this.x.splat_size();
       take({ i, bands, first: this.x.band_first(i), rows: this.x.band_rows(i), splats: this.bytes(this.x.band(i), size) });
     }
-    return bands;
+    return { bands, load };
+  }
+
+  // The rows of tiles where at most `count` bands of about the same load end.
+  divide(load, count) {
+    this.#floats(load);
+    this.x.divide(count);
+    return Array.from(this.floats());
   }
 
   // The visible Gaussians, or all, for Spark (see pack.rs), relative to an origin: a view into the memory of the instance.
@@ -126,10 +156,20 @@ export class Native {
     return this.bytes(this.x.output(), this.x.output_length());
   }
 
-  // Returns [rows, width, 4], a view into the memory of the instance.
-  draw(splats, width, rows, background) {
-    this.bytes(this.x.splats(splats.length / this.x.splat_size()), splats.length).set(splats);
+  // Draws the Gaussians of a band, an array of each who has projected some. Returns [rows, width, 4], a view into the memory of
+  // the instance.
+  draw(pieces, width, rows, background) {
+    const size = pieces.reduce((n, piece) => n + piece.length, 0);
+    const to = this.bytes(this.x.splats(size / this.x.splat_size()), size);
+    pieces.reduce((at, piece) => (to.set(piece, at), at + piece.length), 0);
     this.check(this.x.draw(width, rows, ...background));
     return this.bytes(this.x.pixels(), width * rows * 4);
   }
+}
+
+// The header of a group with the eight bytes before it, of which the first four tell its size.
+function head(payload) {
+  const size = payload.length < 8 ? 0 : new DataView(payload.buffer, payload.byteOffset).getUint32(0);
+  if (size > HEADER_MAX) throw new Error(`the header of a group has ${size} bytes, expected at most ${HEADER_MAX}`);
+  return payload.subarray(0, 8 + size);
 }

@@ -3,18 +3,22 @@
 import { Gpu, gpuName } from "./gpu.js";
 
 const IN_FLIGHT = 2; // images in progress: one is projected while the one before is blended
+const TILE = 16; // rows of a tile of the rasterizer
 
 export class Renderer {
-  #images = new Map(); // id -> {t, view, gpu, parts, blend, gaussians}
+  #images = new Map(); // id -> {t, view, gpu, pieces, packed, parts, blend, gaussians}
+  #projected = new Map(); // id -> {left, load, ms} of images that several workers project
+  #load = new Float32Array(0); // of each row of tiles of the last image that several have projected
   #next = 1;
   #shown = 0;
   gpu = null;
   #how = "cpu";
   #closed = false;
 
-  // rasters: number of raster workers; stats: gets blend and gaussians; say(type, detail): events picture, nogpu, fatal
-  constructor(canvas, { rasters, stats, say }) {
-    Object.assign(this, { canvas, rasters, stats, say });
+  // rasters: number of raster workers; stats: gets project, blend and gaussians; divide(load): ends of bands of about the same
+  // load; say(type, detail): events picture, nogpu, fatal
+  constructor(canvas, { rasters, stats, divide, say }) {
+    Object.assign(this, { canvas, rasters, stats, divide, say });
     this.context = canvas?.getContext("2d", { alpha: false });
   }
 
@@ -63,12 +67,32 @@ export class Renderer {
     return this.#images.size < IN_FLIGHT;
   }
 
-  // Registers an image {t, view, gaussians}; what the group worker must be asked for.
+  // Registers an image {t, view, gaussians, pieces}, which as many group workers project; what they must be asked for.
   begin(image, background) {
     const id = this.#next++;
     const gpu = this.gpu;
-    this.#images.set(id, { ...image, gpu, parts: [], blend: 0 });
-    return gpu ? { type: "pack", origin: gpu.origin, all: gpu.head !== null, id } : { type: "draw", background, id };
+    this.#images.set(id, { ...image, gpu, packed: [], parts: [], blend: 0 });
+    this.#projected.set(id, { left: image.pieces, load: null, ms: 0 });
+    if (gpu) return { type: "pack", origin: gpu.origin, all: gpu.head !== null, id };
+    return { type: "draw", background, id, ends: image.pieces > 1 ? this.#ends(image.view[1]) : [] };
+  }
+
+  // Workers that project parts of an image must agree on its bands: by the load of the image before.
+  #ends(height) {
+    const rows = Math.ceil(height / TILE);
+    return this.divide(this.#load.length === rows ? this.#load : new Float32Array(rows).fill(1));
+  }
+
+  // A group worker has projected its part of an image.
+  onProjected({ id, load, ms }) {
+    const sum = this.#projected.get(id);
+    if (!sum) return;
+    sum.ms = Math.max(sum.ms, ms);
+    sum.load = sum.load ? sum.load.map((v, i) => v + load[i]) : load;
+    if (--sum.left) return;
+    for (const k of this.#projected.keys()) if (k <= id) this.#projected.delete(k);
+    this.stats.project = sum.ms;
+    this.#load = sum.load;
   }
 
   // The group worker has failed to draw an image.
@@ -76,13 +100,18 @@ export class Renderer {
     this.#images.delete(id);
   }
 
-  // The group worker has packed the Gaussians of an image for the GPU.
-  async onPacked({ id, buffer }) {
+  // A group worker has packed its Gaussians of an image for the GPU.
+  async onPacked({ id, piece, buffer, ms }) {
+    this.onProjected({ id, load: new Float32Array(0), ms });
     const image = this.#images.get(id);
     if (!image) return; // the renderer was switched meanwhile
+    image.packed[piece] = new Uint8Array(buffer);
+    if (Object.keys(image.packed).length < image.pieces) return;
+    const packed = new Uint8Array(image.packed.reduce((n, p) => n + p.length, 0));
+    image.packed.reduce((at, p) => (packed.set(p, at), at + p.length), 0);
     const start = performance.now();
     try {
-      await image.gpu.draw(image.view, new Uint32Array(buffer));
+      await image.gpu.draw(image.view, new Uint32Array(packed.buffer));
     } catch (e) {
       if (this.gpu === image.gpu) this.#loseGpu(e?.message ?? "it stopped");
       return;

@@ -1,19 +1,24 @@
 // A worker of the player, in one of two roles.
 //
-// group:  decodes and keeps groups; frame t + view -> projected Gaussians of each band of rows, to the worker of the band, or
-//         the visible ones packed for the GPU, or the attributes of all, to the page.
-// raster: projected Gaussians of a band -> its pixels, to the page.
+// group:  decodes and keeps groups, or its tiles of them; frame t + view -> projected Gaussians of each band of rows, to the
+//         worker of the band, or the visible ones packed for the GPU, or the attributes of all, to the page.
+// raster: projected Gaussians of a band, a piece from each group worker that has tiles of the group -> its pixels, to the page.
 //
-// Two group workers alternate: one shows its group while the other decodes the next, so decoded groups are never copied. Each
-// keeps the last reference, since more predicted groups will follow.
+// Two sets of group workers alternate: one shows its group while the other decodes the next, so decoded groups are never copied.
+// Each worker keeps its tiles of the last reference, since more predicted groups will follow.
 
 import { NONE, Native } from "./native.js";
+
+const LOST = 8; // images after one of which pieces are missing, since a group worker has failed
 
 const roles = { group: groupWorker, raster: rasterWorker };
 
 self.onmessage = async ({ data }) => {
+  const early = []; // what comes before the instance is there
+  self.onmessage = (e) => early.push(e);
   const native = await Native.create(data.module);
   roles[data.role](native, data);
+  for (const e of early) self.onmessage(e);
 };
 
 function groupWorker(native, { ports }) {
@@ -31,28 +36,27 @@ function groupWorker(native, { ports }) {
   }
 
   // The slot of a reference, decoded if it is not the last one.
-  function keep({ key, payload }, level, layers) {
+  function keep({ key, payload, wanted }, level, layers) {
     if (kept.key !== key) {
       if (kept.slot !== NONE) native.x.release(kept.slot);
       kept = { slot: NONE };
       const slot = spareSlot();
-      native.decode(slot, payload, level, NONE, layers);
+      native.decode(slot, payload, level, NONE, layers, wanted);
       kept = { key, slot };
     }
     return kept.slot;
   }
 
-  function decode({ group, payload, level, bounds, layers, reference }) {
+  function decode({ group, payload, level, bounds, layers, reference, wanted }) {
     const start = performance.now();
     const from = reference ? keep(reference, level, layers) : NONE;
     const slot = spareSlot();
-    const header = native.decode(slot, payload, level, from, layers);
+    const header = native.decode(slot, payload, level, from, layers, wanted, false);
     slots.set(group, slot);
     shown = "";
     if (bounds) {
-      native.frame(slot, 0);
-      header.bounds = native.bounds();
-      shown = `${group} 0`;
+      evaluate(group, 0);
+      header.means = native.attribute(0);
     }
     return { type: "decoded", group, header, ms: performance.now() - start };
   }
@@ -63,23 +67,24 @@ function groupWorker(native, { ports }) {
     shown = `${group} ${t}`;
   }
 
-  function draw({ id, group, t, view, background }) {
+  function draw({ id, group, t, view, background, ends, piece, pieces }) {
     const start = performance.now();
     evaluate(group, t);
-    const bands = native.project(view, ports.length, ({ i, bands, first, rows, splats }) => {
+    const { bands, load } = native.project(view, ports.length, ({ i, bands, first, rows, splats }) => {
       let buffer = spare[i].pop();
       if (!buffer || buffer.byteLength < splats.length) buffer = new ArrayBuffer(Math.ceil(splats.length * 1.2));
       new Uint8Array(buffer, 0, splats.length).set(splats);
-      ports[i].postMessage({ id, bands, first, rows, width: view[0], length: splats.length, background, buffer }, [buffer]);
-    });
-    return { type: "projected", id, bands, ms: performance.now() - start };
+      const own = { piece, pieces, length: splats.length, buffer };
+      ports[i].postMessage({ id, bands, first, rows, width: view[0], background, own }, [buffer]);
+    }, ends);
+    return { type: "projected", id, bands, load, ms: performance.now() - start };
   }
 
-  function pack({ id, group, t, view, origin, all }) {
+  function pack({ id, group, t, view, origin, all, piece }) {
     const start = performance.now();
     evaluate(group, t);
     const { buffer } = native.pack(view, origin, all).slice();
-    self.postMessage({ type: "packed", id, buffer, ms: performance.now() - start }, [buffer]);
+    self.postMessage({ type: "packed", id, piece, buffer, ms: performance.now() - start }, [buffer]);
   }
 
   function attributes({ id, group, t }) {
@@ -107,25 +112,38 @@ function groupWorker(native, { ports }) {
   };
 }
 
-function rasterWorker(native, { ports }) {
+function rasterWorker(native) {
   const spare = [];
-  const draw = (port, { id, bands, first, rows, width, length, background, buffer }) => {
+  const waiting = new Map(); // id -> pieces of an image that have arrived, with their ports
+  const draw = ({ id, bands, first, rows, width, background }, pieces) => {
     const start = performance.now();
-    const drawn = native.draw(new Uint8Array(buffer, 0, length), width, rows, background);
-    port.postMessage(buffer, [buffer]);
+    const drawn = native.draw(pieces.map(({ own }) => new Uint8Array(own.buffer, 0, own.length)), width, rows, background);
+    for (const { port, own } of pieces) port.postMessage(own.buffer, [own.buffer]);
     let pixels = spare.pop();
     if (pixels?.byteLength !== drawn.length) pixels = new ArrayBuffer(drawn.length);
     new Uint8Array(pixels).set(drawn);
     self.postMessage({ type: "band", id, bands, first, rows, width, pixels, ms: performance.now() - start }, [pixels]);
   };
-  for (const port of ports) {
+  const take = (port, data) => {
+    const { id, own } = data;
+    const all = waiting.get(id) ?? [];
+    all.push({ port, own });
+    waiting.set(id, all);
+    if (all.length < own.pieces) return;
+    for (const k of waiting.keys()) if (k === id || k < id - LOST) waiting.delete(k);
+    draw(data, all.sort((a, b) => a.own.piece - b.own.piece));
+  };
+  const listen = (port) => {
     port.onmessage = ({ data }) => {
       try {
-        draw(port, data);
+        take(port, data);
       } catch (e) {
         self.postMessage({ type: "failed", id: data.id, message: e.message, fatal: true });
       }
     };
-  }
-  self.onmessage = ({ data }) => spare.length < 3 && spare.push(data);
+  };
+  self.onmessage = ({ data }) => {
+    if (data.port) listen(data.port); // of a group worker
+    else if (spare.length < 3) spare.push(data);
+  };
 }

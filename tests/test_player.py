@@ -314,7 +314,7 @@ def test_simd_draws_what_scalar_draws(browser, server):
         for (let level = 0; native.x.use_level(level); level++) {
             let splats;
             native.project(view, 1, (band) => (splats = band.splats.slice()));
-            pictures.push(base64(native.draw(splats, 200, 150, [0.1, 0.2, 0.3])));
+            pictures.push(base64(native.draw([splats], 200, 150, [0.1, 0.2, 0.3])));
         }
         return pictures;
     """

@@ -30,6 +30,15 @@ pub extern "C" fn input(length: usize) -> *mut u8 {
     })
 }
 
+/// Allocates room for flags of `count` tiles: which of them the next `decode` decodes, layer by layer. Without flags it is all.
+#[unsafe(no_mangle)]
+pub extern "C" fn wanted(count: usize) -> *mut u8 {
+    with(|p| {
+        p.wanted = vec![0; count];
+        p.wanted.as_mut_ptr()
+    })
+}
+
 #[unsafe(no_mangle)]
 pub extern "C" fn output() -> *const u8 {
     with(|p| p.output.as_ptr())
@@ -75,10 +84,18 @@ pub extern "C" fn describe(first: usize) {
 }
 
 /// Input: the payload of a group, or its start up to the end of the first `layers` layers. The group goes to `slot`; the
-/// reference of a predicted group is in the slot `reference`. Output: its header as JSON.
+/// reference of a predicted group is in the slot `reference`. `keep_leading`: tiles that were not wanted, but decoded for their
+/// models, stay. Output: its header as JSON.
 #[unsafe(no_mangle)]
-pub extern "C" fn decode(slot: usize, level: u8, reference: usize, layers: usize) -> bool {
-    with(|p| p.decode(slot, level, reference, layers))
+pub extern "C" fn decode(slot: usize, level: u8, reference: usize, layers: usize, keep_leading: bool) -> bool {
+    with(|p| p.decode(slot, level, reference, layers, keep_leading))
+}
+
+/// Input: the header of a group with the eight bytes before it; that of its reference in the first `first` bytes, if it is
+/// predicted. Output: its tiles and the places of its units as JSON.
+#[unsafe(no_mangle)]
+pub extern "C" fn index(first: usize) -> bool {
+    with(|p| p.index(first))
 }
 
 /// Input: the payload of a group, or its start. Returns how many groups back it refers; 0: independent; -1: damaged.
@@ -98,7 +115,7 @@ pub extern "C" fn frame(slot: usize, t: u16) -> bool {
     with(|p| p.frame(slot, t))
 }
 
-/// Output: the box from the 1st to the 99th percentile of the means of the evaluated frame, 6 f32.
+/// Input: means as f32. Output: their box from the 1st to the 99th percentile, 6 f32.
 #[unsafe(no_mangle)]
 pub extern "C" fn bounds() {
     with(Player::bounds);
@@ -110,11 +127,19 @@ pub extern "C" fn attribute(which: usize) {
     with(|p| p.attribute(which));
 }
 
-/// Projects the evaluated frame. Input: 19 f32: width, height, fx, fy, cx, cy, 12 of world-to-camera, near plane. Returns the number of
-/// bands, at most `bands`, or 0.
+/// Projects the evaluated frame. Input: 19 f32: width, height, fx, fy, cx, cy, 12 of world-to-camera, near plane; then the ends of
+/// the bands as `divide` gives them, or nothing. Returns the number of bands, at most `bands`, or 0. Output: the load of each row of
+/// tiles.
 #[unsafe(no_mangle)]
 pub extern "C" fn project(bands: usize) -> usize {
     with(|p| p.project(bands))
+}
+
+/// Input: the load of each row of tiles, f32, added up over all who project parts of an image. Output: the ends of at most
+/// `bands` bands of about the same load, f32.
+#[unsafe(no_mangle)]
+pub extern "C" fn divide(bands: usize) {
+    with(|p| p.divide(bands));
 }
 
 #[unsafe(no_mangle)]

@@ -38,6 +38,9 @@ pub struct Decoding<'a> {
     /// Of each layer, which tiles are wanted; the bytes of others may be anything, but those from which others start are
     /// decoded anyway. None: all.
     pub tiles: Option<&'a [Vec<bool>]>,
+    /// Whether tiles that were decoded for their models only are part of the group (spec 3.4). Where they are not, as in a share
+    /// of a group whose other tiles somebody else holds, they are not decoded either in layers of which nothing is wanted.
+    pub keep_leading: bool,
 }
 
 impl<'a> Decoding<'a> {
@@ -48,13 +51,22 @@ impl<'a> Decoding<'a> {
             reference: None,
             layers: ALL_LAYERS,
             tiles: None,
+            keep_leading: true,
         }
+    }
+
+    fn asks(&self, layer: usize, tile: usize) -> bool {
+        let asked = |all: &[Vec<bool>]| all.get(layer).and_then(|own| own.get(tile)).copied().unwrap_or(false);
+        self.tiles.is_none_or(asked)
     }
 
     fn wants(&self, header: &Header, layer: u8, tile: u16) -> bool {
         let (k, t) = (usize::from(layer), usize::from(tile));
-        let asked = |all: &[Vec<bool>]| all.get(k).and_then(|own| own.get(t)).copied().unwrap_or(false);
-        self.tiles.is_none_or(asked) || header.leading_tiles(k).contains(&Some(t))
+        let any = || {
+            let own = self.tiles.and_then(|all| all.get(k));
+            self.keep_leading || own.is_none_or(|own| own.contains(&true))
+        };
+        self.asks(k, t) || (header.leading_tiles(k).contains(&Some(t)) && any())
     }
 }
 
@@ -126,7 +138,7 @@ fn decode(header: Header, units: &[Unit], how: &Decoding) -> Result<(Group, Vec<
         reference: how.reference.filter(|_| header.reference > 0),
         header: &header,
         sound,
-        level: how.level,
+        how,
         symbols: AtomicU64::new(known),
     };
     let known_layers = decoder.reference.map_or(header.layers.len(), |r| r.layers.len()); // a prefix refers to a prefix
@@ -160,7 +172,7 @@ struct GroupDecoder<'a> {
     header: &'a Header,
     reference: Option<&'a Group>,
     sound: Sound<'a>,
-    level: &'a Level,
+    how: &'a Decoding<'a>,
     symbols: AtomicU64, // taken so far
 }
 
@@ -219,7 +231,8 @@ impl GroupDecoder<'_> {
                     .into_iter()
                     .for_each(|(stream, model)| models.learn(stream, model));
             }
-            tiles[t] = tile;
+            let kept = self.how.keep_leading || self.how.asks(k, t);
+            tiles[t] = if kept { tile } else { self.blank(k, t) };
         }
         let others: Vec<usize> = (0..count).filter(|t| !leading.contains(&Some(*t))).collect();
         let decoded = parallel::map(&others, |t| self.tile(k, *t, &models));
@@ -232,15 +245,7 @@ impl GroupDecoder<'_> {
     /// Tile `t` of layer `k`; `models`: what its streams start from.
     fn tile(&self, k: usize, t: usize, models: &Models) -> Result<Learned> {
         let h = self.header;
-        let mut tile = Tile {
-            survivors: (t < h.survivor_tiles(k)).then(Vec::new),
-            trajectories: h
-                .trajectories
-                .iter()
-                .map(|t| Trajectories::new(t.attribute.channels(h.sh_degree)))
-                .collect(),
-            ..Tile::default()
-        };
+        let mut tile = self.blank(k, t);
         let candidates = tile.survivors.as_ref().and(self.reference).map(|r| r.tile_range(k, t));
         let Some(unit) = self
             .sound
@@ -301,6 +306,19 @@ impl GroupDecoder<'_> {
             tile.rotations = self.rotations(&tile.channels, &near);
         }
         Ok((tile, learned))
+    }
+
+    /// Tile `t` of layer `k` without Gaussians.
+    fn blank(&self, k: usize, t: usize) -> Tile {
+        let h = self.header;
+        let heads = h.trajectories.iter();
+        Tile {
+            survivors: (t < h.survivor_tiles(k)).then(Vec::new),
+            trajectories: heads
+                .map(|t| Trajectories::new(t.attribute.channels(h.sh_degree)))
+                .collect(),
+            ..Tile::default()
+        }
     }
 
     /// False if tile `t` of layer `k` holds survivors of a tile that the reference lacks.
@@ -435,19 +453,22 @@ impl GroupDecoder<'_> {
 
     /// Symbols left for a stream. Several streams may see the same number; `count` is what enforces the cap.
     fn budget(&self) -> u64 {
-        self.level.symbols.saturating_sub(self.symbols.load(Ordering::Relaxed))
+        self.how
+            .level
+            .symbols
+            .saturating_sub(self.symbols.load(Ordering::Relaxed))
     }
 
     /// Adds the symbols of decoded trajectories to the total and checks the cap. False: broken.
     fn count(&self, t: std::result::Result<Trajectories, Stop>, label: &str) -> Result<(Trajectories, bool)> {
         let symbols = match &t {
             Ok(t) => t.symbols() as u64,
-            Err(Stop::Symbols) => self.level.symbols + 1,
+            Err(Stop::Symbols) => self.how.level.symbols + 1,
             Err(Stop::Broken) => return Ok((Trajectories::default(), false)),
         };
         let before = self.symbols.fetch_add(symbols, Ordering::Relaxed);
         let sum = before.saturating_add(symbols);
-        self.level.cap(label, "symbols", sum, self.level.symbols)?;
+        self.how.level.cap(label, "symbols", sum, self.how.level.symbols)?;
         Ok((t.unwrap_or_default(), true))
     }
 

@@ -171,6 +171,52 @@ fn tiles_come_alone() {
     }
 }
 
+/// Shares of a group, and of one that is predicted from the same share, make up the whole: each tile is in one of them.
+#[test]
+fn shares_make_up_the_whole() {
+    let g = group(&tiled());
+    let later = predicted(&g, &tiled());
+    let payload = encode_group(&g, None).unwrap();
+    let second = encode_group(&later, Some(&g)).unwrap();
+    let whole = decode_group(&payload, &Decoding::at(&LEVELS[0])).unwrap();
+    let all = decode_group(&second, &with(&whole)).unwrap();
+    for n in 2..5 {
+        let mut found = vec![0; 2];
+        for share in 0..n {
+            let wanted = |g: &Group| -> Vec<Vec<bool>> {
+                let own = |k: usize| (0..g.tiles[k].len()).map(move |t| (k + t) % n == share);
+                (0..g.tiles.len()).map(|k| own(k).collect()).collect()
+            };
+            let (first, next) = (wanted(&whole), wanted(&all));
+            let mut how = Decoding {
+                tiles: Some(&first),
+                ..Decoding::at(&LEVELS[0])
+            };
+            let reference = decode_group(&payload, &how).unwrap();
+            how.keep_leading = false;
+            let shown = decode_group(&payload, &how).unwrap();
+            (how.tiles, how.reference) = (Some(&next[..]), Some(&reference));
+            let then = decode_group(&second, &how).unwrap();
+            for (i, (part, all, wanted)) in [(shown, &whole, &first), (then, &all, &next)].into_iter().enumerate() {
+                found[i] += part.positions.len();
+                for (k, t) in wanted
+                    .iter()
+                    .enumerate()
+                    .flat_map(|(k, own)| (0..own.len()).map(move |t| (k, t)))
+                {
+                    let (mine, theirs) = (part.tile_range(k, t), all.tile_range(k, t));
+                    assert_eq!(mine.len(), if wanted[k][t] { theirs.len() } else { 0 });
+                    if !mine.is_empty() {
+                        assert_eq!(part.positions[mine.clone()], all.positions[theirs.clone()]);
+                        assert_eq!(part.rotations[mine], all.rotations[theirs]);
+                    }
+                }
+            }
+        }
+        assert_eq!(found, [whole.positions.len(), all.positions.len()]);
+    }
+}
+
 #[test]
 fn all_points_in_one_place() {
     let mut g = group(&Shape {

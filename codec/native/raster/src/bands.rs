@@ -23,29 +23,43 @@ const TILE_COST: f32 = 8.0;
 
 impl Bands {
     /// At most `count` bands of about the same number of Gaussian-tile pairs.
-    pub fn split(&mut self, projected: &[Projected], [width, height]: [usize; 2], count: usize) -> &[Band] {
-        self.measure(projected, width, height);
-        let (tiles, count) = (self.load.len(), count.clamp(1, self.load.len().max(1)));
-        let total: f32 = self.load.iter().sum();
-        self.bands.resize_with(count, Band::default);
-        let (mut row, mut sum) = (0, 0.0);
-        for (i, band) in self.bands.iter_mut().enumerate() {
-            let (first, left) = (row, count - 1 - i);
-            let goal = total * (i + 1) as f32 / count as f32;
-            // one row of tiles at least; a row more where that is nearer to the equal share
-            while row < tiles - left && (row == first || left == 0 || sum + 0.5 * self.load[row] < goal) {
-                sum += self.load[row];
-                row += 1;
-            }
-            band.first = first * TILE;
-            band.rows = (row * TILE).min(height) - band.first;
-            band.take(projected);
-        }
+    pub fn split(&mut self, projected: &[Projected], size: [usize; 2], count: usize) -> &[Band] {
+        self.measure(projected, size);
+        let ends = ends(&self.load, count);
+        self.cut(projected, size, &ends);
         &self.bands
     }
 
+    /// Bands whose rows of tiles end at `ends`, as `ends()` gives them: those of an image of which others draw other Gaussians.
+    pub fn split_at(&mut self, projected: &[Projected], size: [usize; 2], ends: &[usize]) -> &[Band] {
+        self.measure(projected, size);
+        let rows = self.load.len();
+        let mut fit: Vec<usize> = ends.iter().map(|end| (*end).clamp(1, rows.max(1))).collect();
+        fit.push(rows);
+        fit.sort_unstable();
+        fit.dedup();
+        self.cut(projected, size, &fit);
+        &self.bands
+    }
+
+    /// Gaussian-tile pairs of each row of tiles of the last image.
+    pub fn load(&self) -> &[f32] {
+        &self.load
+    }
+
+    fn cut(&mut self, projected: &[Projected], [_, height]: [usize; 2], ends: &[usize]) {
+        self.bands.resize_with(ends.len(), Band::default);
+        let mut first = 0;
+        for (band, end) in self.bands.iter_mut().zip(ends) {
+            band.first = first * TILE;
+            band.rows = (end * TILE).min(height) - band.first;
+            band.take(projected);
+            first = *end;
+        }
+    }
+
     /// Gaussian-tile pairs of each row of tiles, by the boxes of the ellipses.
-    fn measure(&mut self, projected: &[Projected], width: usize, height: usize) {
+    fn measure(&mut self, projected: &[Projected], [width, height]: [usize; 2]) {
         let (columns, rows) = (width.div_ceil(TILE), height.div_ceil(TILE));
         self.load.clear();
         self.load.resize(rows, TILE_COST * columns as f32);
@@ -56,6 +70,25 @@ impl Bands {
             }
         }
     }
+}
+
+/// The rows of tiles at which at most `count` bands of about the same load end; `load` of each row of tiles.
+pub fn ends(load: &[f32], count: usize) -> Vec<usize> {
+    let (tiles, count) = (load.len(), count.clamp(1, load.len().max(1)));
+    let total: f32 = load.iter().sum();
+    let (mut row, mut sum) = (0, 0.0);
+    (1..=count)
+        .map(|i| {
+            let (first, left) = (row, count - i);
+            let goal = total * i as f32 / count as f32;
+            // one row of tiles at least; a row more where that is nearer to the equal share
+            while row < tiles - left && (row == first || left == 0 || sum + 0.5 * load[row] < goal) {
+                sum += load[row];
+                row += 1;
+            }
+            row
+        })
+        .collect()
 }
 
 impl Band {
@@ -159,6 +192,45 @@ mod tests {
             }
             assert_eq!(row, 141);
         }
+    }
+
+    /// Bands of parts of the Gaussians, cut where the sum of their loads says, hold what those of all hold.
+    #[test]
+    fn bands_of_parts() {
+        let all = scene(3000);
+        let view = view(150, 141);
+        let projected = |range: std::ops::Range<usize>| {
+            let part = |i: usize, c: usize| &all[i][range.start * c..range.end * c];
+            let splats = Splats {
+                means: part(0, 3),
+                quats: part(1, 4),
+                log_scales: part(2, 3),
+                logit_opacities: part(3, 1),
+                sh0: part(4, 3),
+                sh_n: &[],
+                sh_k: 0,
+            };
+            let mut project = Rasterizer::new(SimdLevel::best(), 0);
+            project.project(&splats, &view).unwrap().to_vec()
+        };
+        let parts = [projected(0..1000), projected(1000..3000)];
+        let mut bands = [Bands::default(), Bands::default(), Bands::default()];
+        let whole = bands[2].split(&projected(0..3000), [150, 141], 3);
+        let whole: Vec<[usize; 3]> = whole.iter().map(|b| [b.first, b.rows, b.splats.len()]).collect();
+        let mut load = vec![0.0; 141usize.div_ceil(TILE)];
+        for (bands, part) in bands.iter_mut().zip(&parts) {
+            bands.split(part, [150, 141], 1);
+            load.iter_mut().zip(bands.load()).for_each(|(sum, v)| *sum += v);
+        }
+        let at = ends(&load, 3);
+        let mut sum: Vec<[usize; 3]> = vec![[0; 3]; 3];
+        for (bands, part) in bands.iter_mut().zip(&parts) {
+            for (sum, b) in sum.iter_mut().zip(bands.split_at(part, [150, 141], &at)) {
+                *sum = [b.first, b.rows, sum[2] + b.splats.len()];
+            }
+        }
+        assert_eq!(sum, whole);
+        assert_eq!(bands[0].split_at(&[], [150, 20], &[9, 1, 7]).len(), 2); // ends beyond the image
     }
 
     #[test]

@@ -43,7 +43,7 @@ mod tile_rect;
 pub mod trajectory;
 
 pub use adam::Adam;
-pub use bands::{Band, Bands};
+pub use bands::{Band, Bands, ends as band_ends};
 pub use error::RasterError;
 pub use framebuffer::Surface;
 pub use hashgrid::HashGrid;

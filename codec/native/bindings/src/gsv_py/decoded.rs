@@ -48,6 +48,7 @@ impl DecodedGroup {
                 reference,
                 layers: layers.max(1),
                 tiles: tiles.as_deref(),
+                keep_leading: true,
             };
             let (group, damage) = if strict {
                 (decode_group(&bytes, &how)?, Vec::new())

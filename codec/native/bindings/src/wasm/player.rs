@@ -3,21 +3,27 @@
 use super::{pack, text};
 use gsv::attributes::sh_coefficients;
 use gsv::container::demux::Demuxer;
-use gsv::decode::{Decoding, decode_group, reference_of};
+use gsv::decode::{Decoding, decode_group, read_header, reference_of};
+use gsv::error::Error;
 use gsv::evaluate::Evaluator;
-use gsv::levels::Level;
+use gsv::group::Group;
+use gsv::header::Header;
+use gsv::levels::{LEVELS, Level};
 use gsv::parametric::Frame;
-use raster::{Background, Band, Bands, Projected, Rasterizer, Region, SimdLevel, Splats, Surface, View};
+use gsv::unit;
+use raster::{Background, Band, Bands, Projected, Rasterizer, Region, SimdLevel, Splats, Surface, View, band_ends};
 use std::fmt::Display;
 
 /// Most pixels of an image, 4096 x 4096: a failed allocation would end the instance.
 const MAX_PIXELS: usize = 1 << 24;
-/// Slots for decoded groups.
-const SLOTS: usize = 8;
+/// Slots for decoded groups and parts of them.
+const SLOTS: usize = 32;
 
 pub struct Player {
     pub demuxer: Demuxer,
     pub input: Vec<u8>,
+    /// Which tiles `decode` decodes, one byte each, layer by layer; empty: all.
+    pub wanted: Vec<u8>,
     pub output: Vec<u8>,
     groups: [Option<Evaluator>; SLOTS],
     frame: Frame,
@@ -33,6 +39,7 @@ impl Default for Player {
         Player {
             demuxer: Demuxer::default(),
             input: Vec::new(),
+            wanted: Vec::new(),
             output: Vec::new(),
             groups: Default::default(),
             frame: Frame::default(),
@@ -63,10 +70,12 @@ impl Player {
         self.output = text::describe(&self.demuxer, first).into_bytes();
     }
 
-    /// Decodes the input to `slot`. The reference of a predicted group is in the slot `reference`.
-    pub fn decode(&mut self, slot: usize, level: u8, reference: usize, layers: usize) -> bool {
+    /// Decodes the input to `slot`. The reference of a predicted group is in the slot `reference`. `keep_leading`: as of
+    /// `Decoding`.
+    pub fn decode(&mut self, slot: usize, level: u8, reference: usize, layers: usize, keep_leading: bool) -> bool {
+        let wanted = std::mem::take(&mut self.wanted);
         let decoded = Level::get(level).and_then(|caps| {
-            let how = Decoding {
+            let mut how = Decoding {
                 level: &caps,
                 reference: self
                     .groups
@@ -75,7 +84,13 @@ impl Player {
                     .map(Evaluator::group),
                 layers,
                 tiles: None,
+                keep_leading,
             };
+            if wanted.is_empty() {
+                return decode_group(&self.input, &how);
+            }
+            let tiles = by_layer(&wanted, &read_header(&self.input, &how)?);
+            how.tiles = Some(&tiles);
             decode_group(&self.input, &how)
         });
         self.input = Vec::new();
@@ -99,6 +114,17 @@ impl Player {
         let back = result.as_ref().map_or(-1, |back| i32::from(*back));
         self.done(result);
         back
+    }
+
+    /// Describes the units of a group. Input: the header of its reference in the first `first` bytes, if it is predicted, then
+    /// its own.
+    pub fn index(&mut self, first: usize) -> bool {
+        let (before, own) = self.input.split_at(first.min(self.input.len()));
+        match describe_units(before, own) {
+            Ok(text) => self.output = text.into_bytes(),
+            Err(e) => return self.done(Err::<(), _>(e)),
+        }
+        true
     }
 
     pub fn release(&mut self, slot: usize) {
@@ -128,9 +154,10 @@ impl Player {
     }
 
     pub fn bounds(&mut self) {
+        let means = numbers(&self.input);
         let mut out = [0.0f32; 6];
         for axis in 0..3 {
-            let mut values: Vec<f32> = self.frame.means.iter().map(|m| m[axis]).collect();
+            let mut values: Vec<f32> = means.iter().skip(axis).step_by(3).copied().collect();
             if values.is_empty() {
                 values.extend([0.0, 1.0]);
             }
@@ -156,18 +183,31 @@ impl Player {
     }
 
     pub fn project(&mut self, bands: usize) -> usize {
-        let (f, view) = (&self.frame, view(&self.input));
+        let (f, input) = (&self.frame, numbers(&self.input));
+        let view = view(&input);
+        let given: Vec<usize> = input.iter().skip(VIEW).map(|v| *v as usize).collect();
+        let size = [view.width, view.height];
         let drawn = self.raster.project(&splats(f, self.sh_k), &view);
-        let drawn = drawn.map(|projected| self.bands.split(projected, [view.width, view.height], bands).len());
+        let drawn = drawn.map(|projected| match given.is_empty() {
+            true => self.bands.split(projected, size, bands).len(),
+            false => self.bands.split_at(projected, size, &given).len(),
+        });
         let count = *drawn.as_ref().unwrap_or(&0);
+        self.output = floats(self.bands.load());
         self.done(drawn);
         count
+    }
+
+    /// Input: the load of each row of tiles. Output: the ends of `count` bands.
+    pub fn divide(&mut self, count: usize) {
+        let ends = band_ends(&numbers(&self.input), count);
+        self.output = floats(&ends.iter().map(|end| *end as f32).collect::<Vec<_>>());
     }
 
     pub fn pack(&mut self, origin: [f32; 3], all: bool) -> bool {
         let f = &self.frame;
         self.output.clear();
-        let drawn = self.raster.project(&splats(f, self.sh_k), &view(&self.input));
+        let drawn = self.raster.project(&splats(f, self.sh_k), &view(&numbers(&self.input)));
         let packed = drawn.map(|projected| pack::pack(f, projected, origin, all, &mut self.output));
         self.done(packed)
     }
@@ -201,6 +241,23 @@ impl Player {
     }
 }
 
+/// `text::index` of a header; `before`: that of its reference, or nothing.
+fn describe_units(before: &[u8], own: &[u8]) -> Result<String, Error> {
+    let mut how = Decoding::at(&LEVELS[LEVELS.len() - 1]);
+    let mut reference = Group::default();
+    if !before.is_empty() {
+        reference.header = read_header(before, &how)?;
+        how.reference = Some(&reference);
+    }
+    let first = unit::first(own)?;
+    let (_, directory) = Header::open(first.payload)?;
+    Ok(text::index(
+        &read_header(own, &how)?,
+        &directory,
+        first.offset + first.size,
+    ))
+}
+
 fn splats(f: &Frame, sh_k: usize) -> Splats<'_> {
     Splats {
         means: f.means.as_flattened(),
@@ -217,12 +274,29 @@ fn floats(values: &[f32]) -> Vec<u8> {
     values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }
 
-/// A view from 19 f32; missing ones are 0, which the rasterizer refuses.
-fn view(bytes: &[u8]) -> View {
-    let mut v = [0.0f32; 19];
-    for (v, b) in v.iter_mut().zip(bytes.as_chunks::<4>().0) {
-        *v = f32::from_le_bytes(*b);
-    }
+fn numbers(bytes: &[u8]) -> Vec<f32> {
+    bytes
+        .as_chunks::<4>()
+        .0
+        .iter()
+        .map(|b| f32::from_le_bytes(*b))
+        .collect()
+}
+
+/// Flags of tiles, layer by layer; missing ones are false.
+fn by_layer(wanted: &[u8], h: &Header) -> Vec<Vec<bool>> {
+    let mut flags = wanted.iter().map(|v| *v != 0);
+    let layer = |tiles: &Vec<_>| tiles.iter().map(|_| flags.next().unwrap_or(false)).collect();
+    h.tiles.iter().map(layer).collect()
+}
+
+/// Numbers of a view.
+const VIEW: usize = 19;
+
+/// A view from its first numbers; missing ones are 0, which the rasterizer refuses.
+fn view(numbers: &[f32]) -> View {
+    let mut v = [0.0f32; VIEW];
+    v.iter_mut().zip(numbers).for_each(|(v, number)| *v = *number);
     let (width, height) = (v[0] as usize, v[1] as usize);
     let m = |i: usize, j: usize| v[6 + 4 * i + j];
     View {

@@ -5,6 +5,8 @@ use gsv::container::config::{COLOR_SPACES, Camera, Config, SH_FRAMES, UP_AXES};
 use gsv::container::demux::Demuxer;
 use gsv::container::entry::Entry;
 use gsv::header::Header;
+use gsv::tile_bounds;
+use gsv::unit::{self, UnitType};
 use std::fmt::Write;
 
 /// {config, groups, pending, index, layers, complete}; config is null before moov, pending is null except after a moof.
@@ -26,6 +28,45 @@ pub fn header(h: &Header, gaussians: usize) -> String {
         h.frames,
         h.sh_degree,
         h.layers.len()
+    )
+}
+
+/// {header, size, tiles, others}: bytes of the header with the eight before it, and of the payload; of each tile of each layer
+/// [gaussians, leading, offset, size, low x, y, z, high x, y, z], its box in world units, null where it is unbounded; of each
+/// other unit [layer, offset, size]. Offsets are from the start of the payload.
+pub fn index(h: &Header, directory: &[unit::Entry], start: usize) -> String {
+    let mut places: Vec<Vec<[usize; 2]>> = h.tiles.iter().map(|t| vec![[0; 2]; t.len()]).collect();
+    let (mut others, mut at) = (Vec::new(), start);
+    for e in directory {
+        let own = places.get_mut(usize::from(e.layer));
+        let own = own.and_then(|tiles| tiles.get_mut(usize::from(e.index)));
+        match own.filter(|_| e.number == UnitType::Tile as u8) {
+            Some(place) => *place = [at, e.size as usize],
+            None => others.push(format!("[{},{at},{}]", e.layer, e.size)),
+        }
+        at = at.saturating_add(e.size as usize);
+    }
+    let layer = |(k, places): (usize, &Vec<[usize; 2]>)| {
+        let leading = h.leading_tiles(k);
+        let tile = |(t, [at, size]): (usize, &[usize; 2])| {
+            let count = h.tiles[k][t].count;
+            let corners = tile_bounds::of(h, k, t).unwrap_or_default();
+            let number = |v: &f32| if v.is_finite() { v.to_string() } else { "null".into() };
+            let corners = corners.as_flattened().iter().map(number).collect::<Vec<_>>().join(",");
+            format!(
+                "[{count},{},{at},{size},{corners}]",
+                u8::from(leading.contains(&Some(t)))
+            )
+        };
+        format!(
+            "[{}]",
+            places.iter().enumerate().map(tile).collect::<Vec<_>>().join(",")
+        )
+    };
+    let tiles = places.iter().enumerate().map(layer).collect::<Vec<_>>().join(",");
+    format!(
+        r#"{{"header":{start},"size":{at},"tiles":[{tiles}],"others":[{}]}}"#,
+        others.join(",")
     )
 }
 

@@ -1,0 +1,104 @@
+"""Decoding in the page by one worker and by all cores' workers, in headless Chromium.
+
+usage: python -m bench.player_decode FOLDER [statue_all] [statue] [demo]       writes bench/results/player_decode.json
+
+Streams are those of bench.player, made where they are missing. The page decodes the first group again and again, alone
+and shared in turn, from bytes that it has. A time is from the request to when every worker has its tiles ready to be
+drawn: it includes what they do twice, messages, and the wait for the slowest one. Then frames are drawn: a time is that
+of the slowest worker that projects. Medians, which other work on the machine moves; the ratios are of one run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+from gscodec.decode import open_stream
+from gscodec.player.server import Server
+
+from .browser import Browsers
+from .machine import RESULTS, update_entries
+from .player import PLAYER, SIZE, STATUES, streams
+
+RUNS, DRAWN = 15, 20
+RESULT = RESULTS / "player_decode.json"
+
+# decodes group 0 with 1 worker and with `all`, in turn; draws frames of it each time. {decode, project: {workers: [ms]}}
+TIMES = """async ([runs, drawn]) => {
+    const player = document.querySelector("gsv-player");
+    player.pause();
+    await player.show(0);
+    const { engine } = player;
+    const view = player.camera.view(512, 512);
+    player.engine = null; // its clock asks for nothing any more
+    const event = (type) => new Promise((done) => engine.addEventListener(type, (e) => done(e.detail), { once: true }));
+    while ([...engine.groups.values()].some((g) => g.state !== "ready")) await event("decoded");
+    const all = engine.shares;
+    const times = { decode: {}, project: {}, pieces: {} };
+    for (let run = 0; run < runs; run++) {
+        for (const shares of [1, all]) {
+            engine.shares = shares;
+            engine.forget();
+            const start = performance.now();
+            const ready = event("decoded");
+            engine.want(0, false);
+            await ready;
+            (times.decode[shares] ??= []).push(performance.now() - start);
+            times.pieces[shares] = engine.groups.get(0).pieces;
+            for (let i = 0; i < drawn; i++) {
+                const seen = event("picture");
+                engine.draw(i % engine.source.groups[0].frames, view);
+                await seen;
+                await new Promise((done) => setTimeout(done)); // the last message about it
+                (times.project[shares] ??= []).push(engine.stats.project);
+            }
+        }
+    }
+    return { all, ...times };
+}"""
+
+
+def measure(browsers: Browsers, path: Path) -> dict:
+    """The figures of one stream."""
+    stream = open_stream(path)
+    server = Server(path)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    browser = browsers.start("--disable-gpu")
+    browser.goto(f"{server.url}?size={SIZE}&autoplay=off")
+    browser.wait(f"{PLAYER}.camera && {PLAYER}.stats.gaussians > 0")
+    found = browser.page.evaluate(TIMES, [RUNS, DRAWN])
+    server.shutdown()
+    all_, frames = str(found["all"]), stream.groups[0]["frames"]
+    entry = {"frames": frames, "gaussians": stream.group(0).count, "tiles": sum(map(len, stream.group(0).tiles()))}
+    entry["workers"] = found["pieces"][all_]
+    for what, per in (("decode", frames), ("project", 1)):
+        one, shared = (statistics.median(found[what][n]) for n in ("1", all_))
+        entry |= {f"{what}_ms_alone": round(one / per, 2), f"{what}_ms_shared": round(shared / per, 2)}
+        entry[f"{what}_ratio"] = round(one / shared, 2)
+    return entry
+
+
+def entries(folder: Path, names: list[str]) -> Iterator[dict]:
+    """Measures the streams `names`, milliseconds per frame."""
+    with Browsers() as browsers:
+        for name, path in streams(folder, names).items():
+            yield {"stream": name, **measure(browsers, path)}
+
+
+def main() -> None:
+    """Measures the streams named on the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="where the streams are made and kept")
+    names = ["demo", *STATUES]
+    parser.add_argument("streams", nargs="*", metavar="STREAM", choices=names, default=["statue_all"])
+    a = parser.parse_args()
+    for entry in update_entries(RESULT, entries(a.folder, a.streams), key=lambda e: e["stream"]):
+        print(json.dumps(entry), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""The player's page and groups of many tiles: shared by workers, and with headers of any length."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playing import FPS, LENGTH, PLAYER, canvas, load, psnr, sequence, show
+from quantized_groups import surface_group
+from synthetic import encode_sequence
+from test_player import run_wasm
+
+from gscodec import _native
+from gscodec.decode import open_stream
+from gscodec.encode.encode import stream_config
+from gscodec.encode.settings import EncodeSettings
+from gscodec.encode.writer import StreamWriter
+from gscodec.render.image import render_image
+
+LEVEL, SIDE = 4, 4  # log2 of the side of a tile
+
+
+@pytest.fixture(scope="module")
+def tiled(tmp_path_factory) -> Path:
+    """Five groups of two layers in tiles of 256 Gaussians, of which all but the first and the fourth are predicted."""
+    folder = tmp_path_factory.mktemp("tiles")
+    s, same = sequence(4000), np.arange(4000, dtype=np.int32)
+    s = s.with_groups([replace(g, parents=same if k else None) for k, g in enumerate(s.groups)])
+    config = stream_config(fps=FPS, sh_degree=0, gaussians=4000, frames=LENGTH)
+    settings = EncodeSettings(quality=80, layers=2, random_access=3 * LENGTH)
+    encode_sequence(s, folder / "whole.gsv", config, settings)
+    stream, writer, reference = open_stream(folder / "whole.gsv"), StreamWriter(folder / "tiled.gsv", config, {}), None
+    for i, g in enumerate(stream.groups):
+        q = replace(stream.group(i).quantized(), tile_side_log2=SIDE)
+        reference = None if g["sync"] else reference
+        payload = _native.encode_group(q, reference)[0]
+        writer.append(payload, g["frames"], sync=g["sync"])
+        if g["sync"]:
+            reference = _native.DecodedGroup(payload, LEVEL)
+    writer.finish()
+    return folder / "tiled.gsv"
+
+
+@pytest.mark.parametrize("workers", [1, 2, 3])
+def test_workers_share_a_group(browser, server, other, tiled, workers):
+    """The picture is that of the whole group, predicted or not, however many workers hold its tiles."""
+    url, _ = other(tiled.read_bytes())
+    load(browser, server.url, src=url, size="160x120", autoplay="off", loop="off")
+    browser.eval(f"{PLAYER}.engine.shares = {workers}, {PLAYER}.engine.forget()")
+    stream = open_stream(tiled)
+    for t in (4 * LENGTH + 1, LENGTH + 2, 0):  # predicted, predicted, independent
+        camera = show(browser, t)
+        want = render_image(stream.frame(t), camera, tuple(stream.config["background"]))
+        assert psnr(canvas(browser), want) >= 35, t
+        assert browser.eval(f"{PLAYER}.engine.groups.get({t // LENGTH}).pieces") == workers
+        assert browser.eval(f"{PLAYER}.stats.gaussians") == len(stream.frame(t))
+    assert browser.errors == []
+
+
+def test_a_group_of_thousands_of_tiles(browser, server, other, tmp_path):
+    """The header of a group may be as long as its tiles need; a length that no group has is refused."""
+    group = replace(surface_group(300_000), tile_side_log2=SIDE)
+    writer = StreamWriter(tmp_path / "a.gsv", stream_config(fps=25, sh_degree=0, gaussians=300_000, frames=1), {})
+    writer.append(_native.encode_group(group)[0], 1)
+    writer.finish()
+    url, _ = other((tmp_path / "a.gsv").read_bytes())
+    browser.goto(server.url + "?src=none.gsv")
+    body = """
+        const index = native.index(payload(groups[0]));
+        const back = native.reference(payload(groups[0]));
+        const shown = native.decode(0, payload(groups[0]), config.level).gaussians;
+        const long = payload(groups[0]);
+        long[0] = 1;
+        let message = "";
+        try { native.reference(long); } catch (e) { message = e.message; }
+        return [index.tiles[0].length, index.header, index.size === groups[0].size, back, shown, message];
+    """
+    tiles, header, whole, back, shown, message = run_wasm(browser, url, body)
+    assert (tiles, whole, back, shown) == (1172, True, 0, 300_000)
+    assert header > 1 << 14
+    assert "expected at most 4194304" in message
