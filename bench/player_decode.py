@@ -27,7 +27,7 @@ from .player import PLAYER, SIZE, STATUES, streams
 RUNS, DRAWN = 15, 20
 RESULT = RESULTS / "player_decode.json"
 
-# decodes group 0 with 1 worker and with `all`, in turn; draws frames of it each time. {decode, project: {workers: [ms]}}
+# decodes group 0 with 1 worker and with `all`, in turn, and draws frames. {decode, project: {workers: [ms]}}
 TIMES = """async ([runs, drawn]) => {
     const player = document.querySelector("gsv-player");
     player.pause();
