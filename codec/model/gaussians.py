@@ -16,7 +16,7 @@ from ..errors import CaptureError
 
 SH_C0 = 0.28209479177387814  # Y_00; colour = 0.5 + SH_C0 * sh0 (3D Gaussian Splatting, Kerbl et al. 2023)
 SH_COUNTS = {0: 0, 3: 1, 8: 2, 15: 3}  # K of shN -> SH degree
-GOP = 20  # frames of a group at most, unless told otherwise
+GOP = 30  # frames of a group at most, unless told otherwise: a second
 
 
 @dataclass(frozen=True)
