@@ -45,7 +45,7 @@ def tiled(tmp_path_factory) -> Path:
 def test_workers_share_a_group(browser, server, other, tiled, workers):
     """The picture is that of the whole group, predicted or not, however many workers hold its tiles."""
     url, _ = other(tiled.read_bytes())
-    load(browser, server.url, src=url, size="160x120", autoplay="off", loop="off")
+    load(browser, server.url, src=url, size="160x120", autoplay="off", loop="off", layers="all")
     browser.eval(f"{PLAYER}.engine.shares = {workers}, {PLAYER}.engine.forget()")
     stream = open_stream(tiled)
     for t in (4 * LENGTH + 1, LENGTH + 2, 0):  # predicted, predicted, independent
