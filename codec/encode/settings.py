@@ -140,6 +140,7 @@ class QualitySearchSettings:
 
     Attributes:
         start: first try; lowest, highest: bounds. tries: at most.
+        finest: very fine steps, with which coding is said to cost nothing.
         tolerance: of the excess of the squared error, as a log ratio. excess_min: below it, it is noise.
         frame_pictures: pictures a frame by which a try is refined.
         judged: pictures by which it is judged, at least one a frame. seed: of their order.
@@ -148,6 +149,7 @@ class QualitySearchSettings:
     start: float = 56.0
     lowest: float = 30.0
     highest: float = 90.0
+    finest: float = 74.0
     tries: int = 4
     tolerance: float = 0.15
     excess_min: float = 0.005

@@ -5,8 +5,9 @@ node and frame.
 The loss is that of the image and a rate term (V3's residual-entropy loss, made differentiable): the entropy of the
 coefficients under noise-relaxed quantization at the step sizes of the stream, with a learned Laplace scale for each
 attribute and temporal frequency. It pulls coefficients to zero that lower the image loss by less than they cost.
-Canonical attributes have noise in place of their quantization and a rate term of their own (entropy_model.py). While
-one view is rendered, the step along the one before is taken: a gradient is one step old.
+Canonical attributes have noise in place of their quantization and a rate term of their own (entropy_model.py). A step
+has the gradients of some views of one frame. While they are rendered, the step before is taken: a gradient is one step
+old.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from .views import Views, start_photometric_loss
 
 
 class _Finetuner:
-    """State of one run; `step` is one view of one frame."""
+    """State of one run; `step` is some views of one frame."""
 
     def __init__(self, group: GroupModel, views: Views, frames: range, settings: TrainSettings, radius: float):
         self.group, self.views, self.frames, self.settings = group, views, frames, settings
@@ -44,7 +45,7 @@ class _Finetuner:
         canonical["means"] = f.canonical_means_rate * radius
         self.canonical_rates = canonical if group.known < len(group.key) else {}
         self.node_rates = {"turn": f.node_rotation_rate, "shift": f.node_translation_rate * radius}
-        self.loss = 0.0  # running mean
+        self.loss = 0.0  # of a step, running mean
         self.steps = 0
         self._draw_canonical()
         self.statistics = Statistics(len(group.key), settings.keyframe.mse_min)
@@ -52,27 +53,26 @@ class _Finetuner:
         self.bits = sum(self._step_coefficients(0, None, 0.0, 0.0))
 
     def step(self, t: int, decay: float) -> float:
-        """Starts a view of frame `t`, whose step has all learning rates times `decay`, and meanwhile takes the step
-        along the view before; returns the mean image loss of late."""
+        """Starts some views of frame `t`, whose step has all learning rates times `decay`, and meanwhile takes the step
+        along those before; returns the mean loss of a view of late."""
         frame, backend = self.group.frame(t, self.views.backend, self.noise), self.views.backend
-        pending = start_photometric_loss(
-            frame.params, self.views.draw(self.frames[t]), self.settings, self.rng, backend
-        )
+        targets = [self.views.draw(self.frames[t]) for _ in range(self.settings.finetune.views)]
+        pending = start_photometric_loss(frame.params, targets, self.settings, self.rng, backend)
         self.finish()
         self.started = t, frame, pending, decay
-        return self.loss
+        return self.loss / self.settings.finetune.views
 
     def finish(self) -> None:
-        """Takes the step along the view that was started last."""
+        """Takes the step along the views that were started last."""
         if self.started is None:
             return
         t, frame, pending, decay = self.started
         self.started = None
         f, group, result = self.settings.finetune, self.group, pending()
         self.loss += (result.loss - self.loss) * (f.loss_smoothing if self.loss else 1.0)
-        self.statistics.add(result)
+        self.statistics.add(result, f.views)
         k = self.settings.keyframe
-        result.grads["shN"].add_(group.key.params["shN"], alpha=k.harmonics_weight / len(group.key))
+        result.grads["shN"].add_(group.key.params["shN"], alpha=f.views * k.harmonics_weight / len(group.key))
         residuals, canonical, by_rotations = group.gradients(frame, result.grads)
         self._step_nodes(t, frame, result.grads["means"], by_rotations, decay)
         if self.settings.rate_lambda and self.rng.integers(f.rate_every) == 0:
@@ -168,7 +168,7 @@ class _Finetuner:
         rigidity of the graph."""
         if not self.node_rates["turn"] and self.group.field is None:
             return
-        rigidity = self.settings.rigidity * self.group.graph.rigidity(frame.pose)
+        rigidity = self.settings.finetune.views * self.settings.rigidity * self.group.graph.rigidity(frame.pose)
         heads, seeds = [frame.means, frame.rotations, rigidity], [by_means, by_rotations, torch.ones(())]
         torch.autograd.backward(heads, seeds)
         values = {f"turn {t}": self.group.turns[t], f"shift {t}": self.group.shifts[t]}
@@ -200,17 +200,18 @@ def finetune(
 
     Args:
         radius: of the moving Gaussians, world units.
-        on_step: called with (step, loss).
+        on_step: called with (step, loss) for each view of a step.
     """
-    steps = settings.finetune_steps * len(frames)
+    steps = -(-settings.finetune_steps * len(frames) // settings.finetune.views)
     run = _Finetuner(group, views, frames, settings, radius)
     order: list[int] = []
+    larger = settings.finetune.views**0.5  # rates, since the gradient of several views has less noise
     for step in range(steps):
         # The first and the last frame come twice: they have neighbours on one side only.
         order = order or run.rng.permutation([0, *range(len(frames)), len(frames) - 1]).tolist()
         if step == round(settings.finetune.topology_at * steps):
             run.change_topology()
-        loss = run.step(order.pop(), settings.finetune.rate_decay ** (step / steps))
-        if on_step:
+        loss = run.step(order.pop(), larger * settings.finetune.rate_decay ** (step / steps))
+        for _ in range(settings.finetune.views if on_step else 0):
             on_step(step, loss)
     run.finish()

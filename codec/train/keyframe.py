@@ -30,10 +30,10 @@ class Statistics:
 
     Attributes:
         screen_gradient: [N], sum of the screen-space gradients.
-        seen: [N], steps that showed the Gaussian.
+        seen: [N], views that showed the Gaussian.
         max_weight: [N], largest blending weight.
         squared_opacity_gradient: [N], sum; in units of the squared error of the image.
-        views: steps.
+        views: number of them.
     """
 
     def __init__(self, count: int, mse_min: float):
@@ -42,16 +42,16 @@ class Statistics:
         self.squared_opacity_gradient = torch.zeros(count)
         self.views = 0
 
-    def add(self, result: RenderLoss) -> None:
-        """One step's statistics."""
+    def add(self, result: RenderLoss, views: int = 1) -> None:
+        """The statistics of one step, whose loss is that of so many views."""
         weight = torch.as_tensor(result.max_weight)
         self.screen_gradient += torch.as_tensor(result.grad2d)
-        self.seen += weight > 0
+        self.seen.add_(weight > 0, alpha=views)
         torch.maximum(self.max_weight, weight, out=self.max_weight)
         self.squared_opacity_gradient += torch.as_tensor(result.grads["logit_opacities"]).square() * (
-            3 * result.pixels / max(result.mse, self.mse_min)
+            3 * result.pixels / views / max(result.mse, self.mse_min)
         )
-        self.views += 1
+        self.views += views
 
     def contribution(self, opacities: torch.Tensor) -> torch.Tensor:
         """Increase of the error without each Gaussian, [N], in shares of the error per Gaussian; `opacities`: [N].
@@ -64,7 +64,7 @@ class Statistics:
         return self.squared_opacity_gradient * len(opacities) / views / (1 - opacities).clamp(min=1e-3).square()
 
     def mean_screen_gradient(self) -> torch.Tensor:
-        """[N], over the steps that showed the Gaussian."""
+        """[N], over the views that showed the Gaussian."""
         return self.screen_gradient / self.seen.clamp(min=1)
 
 
@@ -135,7 +135,7 @@ class _Run:
         target = views.draw(self.frame, picture_scale(step / self.steps, views.largest_side, s.keyframe))
         params, dropped = self.model.params, self.dropout * step / self.steps
         params = _without_some(params, dropped, self.rng) if dropped else params
-        pending = start_photometric_loss(params, target, s, self.rng, views.backend)
+        pending = start_photometric_loss(params, [target], s, self.rng, views.backend)
         self.finish()
         self._started = _View(step, target, pending)
 

@@ -190,12 +190,13 @@ def photometric_loss(
 
 
 def start_photometric_loss(
-    params: dict, target: Target, settings: TrainSettings, rng: np.random.Generator, backend: Backend
+    params: dict, targets: Sequence[Target], settings: TrainSettings, rng: np.random.Generator, backend: Backend
 ) -> PendingLoss:
-    """`photometric_loss` of Gaussians as they are now, beside the caller (`Backend.start_photometric_loss`)."""
-    crop = _crop(target, rng)
+    """`photometric_loss` of Gaussians as they are now against all `targets`, summed, beside the caller
+    (`Backend.start_photometric_loss`)."""
+    crops = [_crop(t, rng) for t in targets]
     return backend.start_photometric_loss(
-        params, [crop], ssim_lambda=settings.ssim_lambda, mask_lambda=settings.mask_lambda
+        params, crops, ssim_lambda=settings.ssim_lambda, mask_lambda=settings.mask_lambda
     )
 
 

@@ -68,7 +68,7 @@ class TrainSettings:
         gop: most frames in a group.
         keyframe_steps: optimisation steps of a keyframe of small pictures (budget.py).
         motion_steps: steps a frame for tracking, of small pictures.
-        finetune_steps: steps a frame for the joint fine-tuning of a group, of small pictures.
+        finetune_steps: views a frame for the joint fine-tuning of a group, of small pictures.
         gaussians_max: bound on the count of Gaussians, and so on the memory; how many there are follows from the scene.
         initial_points: of a keyframe, about; None: as the scene needs (budget.py).
         sh_degree: bound on the degree of spherical harmonics; a keyframe keeps them where they lower the error.
@@ -83,9 +83,9 @@ class TrainSettings:
     """
 
     gop: int = GOP
-    keyframe_steps: int = 2000
+    keyframe_steps: int = 3200
     motion_steps: int = 200
-    finetune_steps: int = 260
+    finetune_steps: int = 360
     gaussians_max: int = 120_000
     initial_points: int | None = None
     sh_degree: int = 3
@@ -134,9 +134,9 @@ class TrainSettings:
 
 
 PRESETS = {
-    "fast": {"keyframe_steps": 1200, "motion_steps": 130, "finetune_steps": 130},
+    "fast": {"keyframe_steps": 1600, "motion_steps": 130, "finetune_steps": 200},
     "medium": {},
-    "slow": {"keyframe_steps": 5000, "motion_steps": 250, "finetune_steps": 500},
+    "slow": {"keyframe_steps": 7000, "motion_steps": 250, "finetune_steps": 900},
 }
 PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
     "fast": {"gradient_min": 4e-4, "contribution_min": 10.0},
