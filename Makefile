@@ -5,8 +5,9 @@ BIN := $(VENV)/bin
 NATIVE := $(shell find codec/native -name '*.rs' -not -path '*/target/*') codec/native/Cargo.toml codec/native/Cargo.lock
 CARGO := cd codec/native && cargo
 DEMO := demo
+DIST := dist
 
-.PHONY: venv demo test lint format bench player spark browser clean
+.PHONY: venv demo test lint format bench wheel player spark browser clean
 venv: $(VENV)/.done
 
 # Once: the environment. Again: only when dependencies or the native code change.
@@ -61,6 +62,10 @@ browser:
 		|| { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq >/dev/null \
 			&& DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends chromium >/dev/null; } \
 		|| echo "note: no Chromium, the player's browser tests will be skipped"
+
+# A wheel that installs where there is no Rust.
+wheel:
+	$(PYTHON) -m pip wheel --quiet --no-deps -w $(DIST) .
 
 bench: venv
 	$(BIN)/python -m bench.run

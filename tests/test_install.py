@@ -20,10 +20,11 @@ def player(tmp_path_factory):
     from gscodec.encode.encode import stream_config
 
     path = tmp_path_factory.mktemp("player")
-    subprocess.run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", path, ROOT], check=True)
+    subprocess.run(["make", "-s", "wheel", f"PYTHON={sys.executable}", f"DIST={path}"], cwd=ROOT, check=True)
     venv.create(path / "env", with_pip=True)
     wheel = next(path.glob("gscodec-*.whl"))
-    subprocess.run([path / "env/bin/python", "-m", "pip", "install", "-q", wheel], check=True)
+    no_rust = {"PATH": f"{path}/env/bin:/usr/bin:/bin", "HOME": os.environ.get("HOME", "/")}
+    subprocess.run([path / "env/bin/python", "-m", "pip", "install", "-q", wheel], check=True, env=os.environ | no_rust)
     sequence = turning(100, frames=3)
     write_sequence(sequence, path / "plys")
     encode_sequence(sequence, path / "a.gsv", stream_config(fps=25, sh_degree=0, gaussians=100, frames=6))

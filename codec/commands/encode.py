@@ -93,7 +93,7 @@ def encode(
             stdout.print(f"the group from frame {group['frame']} ends before frame {end}: {ENDED[group['ended']]}")
     if result.chosen_quality:
         stdout.print(
-            f"quality {result.quality:.1f}, at which coding costs at most {result.loss} dB of what was trained"
+            f"quality {result.quality:.1f}, at which coding costs at most {result.loss} dB against very fine steps"
         )
     if result.interrupted:
         print("stopped early: the file holds the groups done, the same command goes on", file=sys.stderr)
