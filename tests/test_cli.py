@@ -163,6 +163,7 @@ def test_a_stream_without_frames_is_refused(folder, tmp_path):
     told = run("info", empty)
     assert told.returncode == 0
     assert "0 frames" in told.stdout
+    assert "bits" not in told.stdout, "of no Gaussian"
     assert "per Gaussian" not in told.stdout
 
 

@@ -91,9 +91,9 @@ def _of_stream(path: Path, maps: Path | None, as_json: bool) -> None:
     if len(facts["layers"]) > 1:
         stdout.print("bytes of the layers: " + ", ".join(str(layer["bytes"]) for layer in facts["layers"]))
     for name, u in facts["units"].items():
-        stdout.print(
-            f"  {name:<32}{u['bytes']:>10} bytes {u['share']:>6.1%} {u['bits_per_gaussian']:>8.2f} bits/Gaussian/group"
-        )
+        per_gaussian = u["bits_per_gaussian"]  # None where there are none
+        per_gaussian = "" if per_gaussian is None else f" {per_gaussian:>8.2f} bits/Gaussian/group"
+        stdout.print(f"  {name:<32}{u['bytes']:>10} bytes {u['share']:>6.1%}{per_gaussian}")
 
 
 def _of_splats(path: Path, as_json: bool) -> None:

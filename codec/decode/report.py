@@ -38,7 +38,8 @@ def describe(stream: Stream) -> dict:
     if sound:
         units["sound"] = sound["bytes"]
     units["container"] = total - sum(units.values())
-    coded = max(sum(g["gaussians"] for g in groups), 1)
+    coded = sum(g["gaussians"] for g in groups)
+    per = {n: 8 * b / coded if coded else None for n, b in units.items()}
     return {
         "frames": stream.frame_count,
         "fps": stream.fps,
@@ -54,7 +55,7 @@ def describe(stream: Stream) -> dict:
         "cameras": [c["name"] for c in stream.config["cameras"]],
         "sound": sound,
         "complete": stream.complete,
-        "units": {n: {"bytes": b, "share": b / total, "bits_per_gaussian": 8 * b / coded} for n, b in units.items()},
+        "units": {n: {"bytes": b, "share": b / total, "bits_per_gaussian": per[n]} for n, b in units.items()},
         "layers": [{"bytes": layers[k]} for k in sorted(layers)],
         "per_group": groups,
     }
