@@ -83,9 +83,9 @@ class TrainSettings:
     """
 
     gop: int = GOP
-    keyframe_steps: int = 3200
+    keyframe_steps: int = 2400
     motion_steps: int = 200
-    finetune_steps: int = 360
+    finetune_steps: int = 300
     gaussians_max: int = 120_000
     initial_points: int | None = None
     sh_degree: int = 3
@@ -134,7 +134,7 @@ class TrainSettings:
 
 
 PRESETS = {
-    "fast": {"keyframe_steps": 1600, "motion_steps": 130, "finetune_steps": 200},
+    "fast": {"keyframe_steps": 1400, "motion_steps": 130, "finetune_steps": 170},
     "medium": {},
     "slow": {"keyframe_steps": 7000, "motion_steps": 250, "finetune_steps": 900},
 }
