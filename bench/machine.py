@@ -26,9 +26,11 @@ def machine() -> dict:
 
 
 def commit() -> str:
-    """Short hash of the checkout, "+" if it has changes; empty outside of one."""
+    """Short hash of the checkout, "+" if it has changes besides results; empty outside of one."""
     git = lambda *a: subprocess.run(["git", *a], cwd=ROOT, capture_output=True, text=True).stdout.strip()  # noqa: E731
-    return git("rev-parse", "--short", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
+    return git("rev-parse", "--short", "HEAD") + (
+        "+" if git("status", "--porcelain", "-uno", "--", ".", ":!bench/results") else ""
+    )
 
 
 def write_result(path: Path, result: dict) -> None:

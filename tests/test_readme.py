@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from bench import sources
+
 ROOT = Path(__file__).resolve().parent.parent
 README = "\n".join(p.read_text() for p in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))))
 RESULTS = ROOT / "bench" / "results"
@@ -94,3 +96,9 @@ def test_table_of_sparse_points():
         none, points = (found[f"{name}, frame 0, fast, {k}"] for k in ("none", "points"))
         values = [points["points"], none["psnr"], points["psnr"], none["ssim"], points["ssim"]]
         assert all(map(agrees, figures, values)), (name, figures, values)
+
+
+def test_the_table_of_sources_is_that_of_the_results():
+    page = sources.PAGE.read_text()
+    assert sources.with_table(page) == page, "run python -m bench.sources"
+    assert len(rows("figures")) > 15

@@ -1,0 +1,70 @@
+"""Where each figure of README.md and docs/ comes from: its file in bench/results, the command that makes it, the commit
+at which it was measured ("+": with changes that were not committed; in older ones also of results alone), and the cores
+that other work kept busy meanwhile.
+
+`python -m bench.sources` writes the table into docs/figures.md; a test compares both.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+
+from .machine import RESULTS, ROOT
+
+PAGE = ROOT / "docs" / "figures.md"
+HEAD = "| figures | file in bench/results | command | commit | busy beside |\n|---|---|---|---|---|\n"
+FILES = {  # what -> file, command
+    "bundled lumberjack": ("demo.json", "python -m bench.run demo"),
+    "statue, 20 frames": ("statue.json", "python -m bench.run statue"),
+    "statue, 40 frames": ("statue40.json", "python -m bench.run statue40"),
+    "yellow_clip3.splatv": ("splatv.json", "python -m bench.run splatv"),
+    "page, its speed": ("player.json", "python -m bench.player FOLDER"),
+    "page, first picture": ("first_picture.json", "python -m bench.player FOLDER"),
+    "rasterizer": ("raster.json", "gscodec bench raster"),
+    "tiles": ("tiles.json", "python -m bench.tiles"),
+    "fuzzing": ("fuzz.json", "python -m bench.fuzz --seconds 600"),
+}
+
+
+def table() -> str:
+    """The table in markdown, one row a figure or group of figures."""
+    return HEAD + "".join(f"| {' | '.join(row)} |\n" for row in _rows())
+
+
+def _rows() -> Iterator[tuple[str, ...]]:
+    for what, (file, command) in FILES.items():
+        yield what, file, f"`{command}`", _commits([json.loads((RESULTS / file).read_text())]), "-"
+    for e in _entries("train.json"):
+        what = f"{e['capture']}, {e['preset']}, {e['recipe']}"
+        recipe = e["recipe"].removesuffix("-coded").replace("model", "gscodec")
+        command = f"`gscodec bench train --capture {e['capture']} --preset {e['preset']} --recipe {recipe}`"
+        yield what, "train.json", command, _commits([e]), f"{e['measured'].get('busy_beside', '-')}"
+    for file, what, command in (
+        ("rd.json", "other codecs", "gscodec bench rd"),
+        ("ablation.json", "losses and tools", "gscodec bench ablation"),
+        ("stress.json", "stress", "gscodec bench stress"),
+    ):
+        yield what, file, f"`{command}`", _commits(_entries(file)), "-"
+    points = json.loads((RESULTS / "points.json").read_text())
+    yield "sparse points", "points.json", "`python -m bench.sparse_points`", _commits(list(points.values())), "-"
+
+
+def _entries(file: str) -> list[dict]:
+    return json.loads((RESULTS / file).read_text())["entries"]
+
+
+def _commits(results: list[dict]) -> str:
+    """The commits of some results, in alphabetical order; "not recorded" where there is none."""
+    found = {r.get("measured", r).get("commit") or r.get("commit") for r in results}
+    return ", ".join(sorted(c for c in found if isinstance(c, str))) or "not recorded"
+
+
+def with_table(page: str) -> str:
+    """The text of the page with the table as it should be."""
+    return re.sub(re.escape(HEAD) + r"(\|.*\n)*", lambda _: table(), page)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(with_table(PAGE.read_text()))
