@@ -54,6 +54,7 @@ class Case:
         frames: the first frames that are used; None: all.
         splat: a static splat of the data folder instead, which `animate_splat` moves and `drawn.py` draws.
         vmaf: it is measured too.
+        rounds: times that its frames follow each other: a walk that ends where it began.
     """
 
     folder: str
@@ -62,6 +63,7 @@ class Case:
     frames: int | None = None
     splat: str | None = None
     vmaf: bool = False
+    rounds: int = 1
 
     def open(self, data: Path) -> Capture:
         """The capture.
@@ -78,17 +80,31 @@ class Case:
         if not folder.is_dir():
             raise UsageError(f"{folder} does not exist")
         capture = open_capture(folder).frames(0, self.frames).scaled(self.scale)
-        return capture if not self.test else held_out(capture, self.test)
+        capture = capture if not self.test else held_out(capture, self.test)
+        return capture if self.rounds == 1 else repeated(capture, self.rounds)
 
 
 CASES = {
     "lumberjack": Case("lumberjack"),
+    "lumberjack-150": Case("lumberjack", rounds=5),
     "lumberjack-upper": Case("lumberjack", test=("cam16", "cam17", "cam18", "cam19")),  # the upper ring left out
     "stage": Case("stage"),
     "basketball": Case("basketball", frames=60),
     "statue-drawn": Case("", splat="splats/statue.ply", frames=40, vmaf=True),
     "pose2sim": Case("pose2sim", test=("cam04",), scale=0.25, frames=10),
 }
+
+
+def repeated(capture: Capture, rounds: int) -> Capture:
+    """The frames of a capture so many times, one after the other."""
+    at = lambda t: capture.first_frame + t % capture.frame_count  # noqa: E731
+    return replace(
+        capture,
+        first_frame=0,
+        frame_count=rounds * capture.frame_count,
+        read=lambda camera, t: capture.read(camera, at(t)),
+        poses=capture.poses and (lambda camera, t: capture.poses(camera, at(t))),
+    )
 
 
 def held_out(capture: Capture, names: tuple[str, ...]) -> Capture:

@@ -19,7 +19,7 @@ from bench.raster import measure, run
 from bench.scenes import capsule, capsule_camera
 from bench.sequences import lasting
 from bench.still import still_share
-from bench.train import held_out
+from bench.train import held_out, repeated
 from gscodec.capture import open_capture
 from gscodec.errors import CaptureError, UsageError
 from gscodec.fit import fit_groups
@@ -176,6 +176,13 @@ def test_cameras_are_taken_out_of_training(tmp_path):
     )
     with pytest.raises(UsageError, match="no camera cam99"):
         held_out(capture, ("cam99",))
+
+
+def test_a_walk_goes_round():
+    capture = open_capture(ROOT / "examples/lumberjack").frames(3, 5)
+    twice = repeated(capture, 2)
+    assert twice.frame_count == 4
+    assert [np.array_equal(twice.view(0, t).rgb, capture.view(0, t % 2).rgb) for t in range(4)] == [True] * 4
 
 
 def test_a_missing_file_is_said(tmp_path):
