@@ -26,10 +26,10 @@ def machine() -> dict:
 
 
 def commit() -> str:
-    """Short hash of the checkout, "+" if it has changes besides results; empty outside of one."""
+    """Short hash of the checkout, "+" if it has changes besides results and charts; empty outside of one."""
     git = lambda *a: subprocess.run(["git", *a], cwd=ROOT, capture_output=True, text=True).stdout.strip()  # noqa: E731
     return git("rev-parse", "--short", "HEAD") + (
-        "+" if git("status", "--porcelain", "-uno", "--", ".", ":!bench/results") else ""
+        "+" if git("status", "--porcelain", "-uno", "--", ".", ":!bench/results", ":!bench/charts") else ""
     )
 
 
