@@ -2,11 +2,12 @@
 at which it was measured ("+": with changes that were not committed; in older ones also of results alone), and the cores
 that other work kept busy meanwhile.
 
-`python -m bench.sources` writes the table into docs/figures.md; a test compares both.
+usage: python -m bench.sources        writes the table into docs/figures.md; a test compares both
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 from collections.abc import Iterator
@@ -67,4 +68,5 @@ def with_table(page: str) -> str:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.split("\n")[0], usage="python -m bench.sources").parse_args()
     PAGE.write_text(with_table(PAGE.read_text()))
