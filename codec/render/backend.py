@@ -154,7 +154,8 @@ class Backend(Protocol):
         rounding, and along that by their bits: Laplace code lengths with uniform noise in place of rounding.
 
         Args:
-            arrays: coefficients [K, N, C], gradient [N, C] by the sum, first and second moment [K, N, C]; f32.
+            arrays: coefficients [K, N, C], gradient [N, C] by the sum, first moment [K, N, C], and second [N, C], which
+                the K share; f32.
             at: [K], as of `trajectory_sum`.
             price: loss of one bit, Laplace scales [K], and at least N * C + K - 1 uniform values in -0.5 .. 0.5.
             step: of these coefficients, from 1.
