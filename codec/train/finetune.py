@@ -8,7 +8,7 @@ them; their gradient passes straight through the rounding. joint_optimization.py
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ import torch
 from ..bitstream.color import STEP_WEIGHTS
 from ..bitstream.quantization import Steps, trajectory_step
 from ..model.parametric_group import NodeMotion, ParametricGroup
-from ..model.rotations import quat_conjugate, quat_multiply, quat_normalize, quat_to_rotvec, rotate, rotvec_to_quat
+from ..model.rotations import quat_conjugate, quat_multiply, quat_to_rotvec, rotate
 from ..model.temporal_transform import dct_basis
 from ..render.backend import Backend
 from .deformation_graph import NodeGraph, Pose
@@ -32,8 +32,8 @@ class Frame:
 
     Attributes:
         params: attributes as they are rendered.
-        pose: of the nodes, with its leaves `turn` and `shift` [M, 3].
-        means, rotations: [N, 3] and [N, 4], where the nodes carry the Gaussians; differentiable in the leaves.
+        pose: of the nodes; turn: [M, 3] rotation vectors behind the tracked one.
+        means, rotations: [N, 3] and [N, 4], where the nodes carry the Gaussians. rest: [N, 3], canonical means.
         residual: [N, 4], the residual rotation, unit. inner: [N, 4], rotation before it. quats: [N, 4], canonical.
         shown: [N] bool.
     """
@@ -41,8 +41,8 @@ class Frame:
     params: dict[str, torch.Tensor]
     pose: Pose
     turn: torch.Tensor
-    shift: torch.Tensor
     means: torch.Tensor
+    rest: torch.Tensor
     rotations: torch.Tensor
     residual: torch.Tensor
     inner: torch.Tensor
@@ -182,13 +182,20 @@ class GroupModel:
         """Residual at frame `t` for each coefficient of an attribute that is 1, [K] f32."""
         return self.unit[name] * self.basis[: len(self.coefficients[name]), t]
 
-    def pose(self, t: int) -> tuple[Pose, torch.Tensor, torch.Tensor]:
-        """Corrected pose of the nodes at frame `t`, differentiable in the correction [M, 3] and [M, 3] behind it."""
-        tracked, turn, shift = self._tracked_poses[t], self.turns[t].clone(), self.shifts[t].clone()
-        turn, shift = turn.requires_grad_(), shift.requires_grad_()
-        by_field = (0.0, 0.0) if self.field is None else self.field(t)
-        rotations = quat_normalize(quat_multiply(rotvec_to_quat(turn + by_field[0]), tracked.rotations))
-        return replace(tracked, rotations=rotations, nodes=tracked.nodes + shift + by_field[1]), turn, shift
+    def pose(self, t: int) -> tuple[Pose, torch.Tensor]:
+        """Corrected pose of the nodes at frame `t`, and their turn behind the tracked one, [M, 3] rotation vectors."""
+        turn, shift = self.turns[t], self.shifts[t]
+        if self.field is not None:
+            by_field = self.field(t)
+            turn, shift = turn + by_field[0], shift + by_field[1]
+        return self._tracked_poses[t].moved(turn, shift), turn
+
+    def by_nodes(
+        self, t: int, frame: Frame, by_carried: tuple[torch.Tensor, torch.Tensor], rigidity: float
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Gradients [M, 3] and [M, 3] by the turns and shifts of the nodes at frame `t` (`NodeGraph.gradients`)."""
+        base = self._tracked_poses[t].rotations, frame.turn
+        return self.graph.gradients(frame.rest, base, frame.pose, by_carried, rigidity)
 
     def frame(self, t: int, backend: Backend, noise: dict[str, torch.Tensor] | None = None) -> Frame:
         """Frame `t`.
@@ -202,25 +209,23 @@ class GroupModel:
         delta = {
             n: torch.from_numpy(backend.trajectory_sum(c, self.at(n, t), zone)) for n, c in self.coefficients.items()
         }
-        pose, turn, shift = self.pose(t)
+        pose, turn = self.pose(t)
         means, rotations = self.graph.carry(p["means"], pose)
-        with torch.no_grad():
-            dq = delta["quats"]
-            residual = torch.cat([(1 - dq.square().sum(1, keepdim=True)).clamp(min=1e-6).sqrt(), dq], 1)
-            inner = quat_multiply(rotations, p["quats"])
-            shown = (self.start <= t) & (t < self.end)
-            opacities = p["logit_opacities"] + delta["logit_opacities"][:, 0]
-            params = {
-                **p,
-                "means": means + delta["means"],
-                "quats": quat_multiply(residual, inner),
-                "log_scales": p["log_scales"] + delta["log_scales"],
-                "logit_opacities": torch.where(shown, opacities, REMOVED_LOGIT),
-                "sh0": p["sh0"] + delta["sh0"],
-            }
-        return Frame(params, pose, turn, shift, means, rotations, residual, inner, p["quats"], shown)
+        dq = delta["quats"]
+        residual = torch.cat([(1 - dq.square().sum(1, keepdim=True)).clamp(min=1e-6).sqrt(), dq], 1)
+        inner = quat_multiply(rotations, p["quats"])
+        shown = (self.start <= t) & (t < self.end)
+        opacities = p["logit_opacities"] + delta["logit_opacities"][:, 0]
+        params = {
+            **p,
+            "means": means + delta["means"],
+            "quats": quat_multiply(residual, inner),
+            "log_scales": p["log_scales"] + delta["log_scales"],
+            "logit_opacities": torch.where(shown, opacities, REMOVED_LOGIT),
+            "sh0": p["sh0"] + delta["sh0"],
+        }
+        return Frame(params, pose, turn, means, p["means"], rotations, residual, inner, p["quats"], shown)
 
-    @torch.no_grad()
     def gradients(self, frame: Frame, grads: dict[str, torch.Tensor]) -> tuple[dict, dict, torch.Tensor]:
         """From the gradients by what is rendered: those by the residuals, attribute -> [N, C], 0 for Gaussians that are
         not free; those by the canonical attributes; and that by the rotations of the nodes, [N, 4]."""
@@ -256,7 +261,6 @@ class GroupModel:
             rate_optimized=True,
         )
 
-    @torch.no_grad()
     def nodes(self) -> NodeMotion:
         """The carrying motion."""
         rotations, near = [], None
