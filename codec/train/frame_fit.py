@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from ..model.rotations import quat_conjugate, quat_multiply
 from ..render.optimizer import Adam
 from .deformation_graph import Pose
 from .keyframe import Statistics
-from .model import Model
+from .model import Model, quat_product
 from .motion_field import MotionField
 from .views import Target, photometric_loss
 
@@ -36,7 +35,7 @@ class FrameFit:
     def __init__(self, tracker: Tracker, rng: np.random.Generator):
         s, backend = tracker.settings.tracking, tracker.views.backend
         self.tracker, self._rng = tracker, rng
-        self._moving = tracker.moving.float()
+        self._moving, self._all_move = tracker.moving.float(), bool(tracker.moving.all())
         carriers = tracker.graph.carriers(tracker.moving).float()[:, None]
         self._nodes = {
             "angular_velocity": tracker.pose.angular_velocity * carriers,
@@ -75,11 +74,13 @@ class FrameFit:
         if full:
             self.statistics.add(result)
         grads = result.grads
-        by_rotations = quat_multiply(grads["quats"], quat_conjugate(self.own.params["quats"]))
+        by_rotations = quat_product(grads["quats"], self.own.params["quats"], inverse_b=True)
         rigidity = (s.first_round_rigidity if first else 1.0) * t.settings.rigidity
         self._step_nodes(pose, (grads["means"], by_rotations), rigidity, decay)
-        grads = {**grads, "quats": quat_multiply(quat_conjugate(rotations), grads["quats"])}  # before rotation
-        free = {n: g * self._moving.view(-1, *[1] * (g.dim() - 1)) for n, g in grads.items()}
+        grads = {**grads, "quats": quat_product(rotations, grads["quats"], inverse_a=True)}  # before rotation
+        free = grads
+        if not self._all_move:
+            free = {n: g * self._moving.view(-1, *[1] * (g.dim() - 1)) for n, g in grads.items()}
         self.own.step(free, s.rates.scaled(t.radius, decay * (s.first_round_rates if first else 1.0)))
         return result.loss - t.settings.mask_lambda * result.mask
 

@@ -38,6 +38,7 @@ pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(container::read_audio, m)?)?;
     m.add_function(wrap_pyfunction!(rigid_blend::blend_rigid, m)?)?;
     m.add_function(wrap_pyfunction!(rigid_blend::node_gradients, m)?)?;
+    m.add_function(wrap_pyfunction!(rigid_blend::quat_product, m)?)?;
     m.add_function(wrap_pyfunction!(attributes, m)?)?;
     m.add_class::<parametric::ParametricEvaluator>()?;
     m.add_class::<decoded::DecodedGroup>()

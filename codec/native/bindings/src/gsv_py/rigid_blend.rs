@@ -2,6 +2,7 @@
 
 use super::values::invalid;
 use gsv::blend::Blend;
+use gsv::dequantize::multiply;
 use gsv::pose_gradient::{self, Edges, Moved};
 use gsv::rigid_blend::{self, RigidBlend};
 use numpy::{IntoPyArray, PyArrayMethods, PyReadonlyArray2, PyUntypedArrayMethods};
@@ -131,4 +132,26 @@ pub fn node_gradients<'py>(
         Ok(a.into_flattened().into_pyarray(py).reshape([count, 3])?.into_any())
     };
     Ok((array(by_turns)?, array(by_shifts)?))
+}
+
+/// Products [N, 4] of quaternions [N, 4] wxyz, each of the two as it is or conjugated: the rotation `b`, then `a`.
+#[pyfunction]
+pub fn quat_product<'py>(
+    py: Python<'py>,
+    a: Floats<'py>,
+    b: Floats<'py>,
+    conjugated: (bool, bool),
+) -> PyResult<Bound<'py, PyAny>> {
+    let first: &[[f32; 4]] = rows(&a, "a", "N", None)?;
+    let second: &[[f32; 4]] = rows(&b, "b", "N", Some(first.len()))?;
+    let signs = [conjugated.0, conjugated.1].map(|c| if c { -1.0 } else { 1.0 });
+    let of = |[w, x, y, z]: [f32; 4], s: f32| [w, s * x, s * y, s * z];
+    let all = first.iter().zip(second);
+    let products: Vec<[f32; 4]> = all.map(|(a, b)| multiply(of(*a, signs[0]), of(*b, signs[1]))).collect();
+    let count = products.len();
+    Ok(products
+        .into_flattened()
+        .into_pyarray(py)
+        .reshape([count, 4])?
+        .into_any())
 }
