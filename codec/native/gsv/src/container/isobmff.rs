@@ -339,7 +339,7 @@ fn audio_traf(body: &[u8], audio: &Audio, start: u64) -> Result<Option<AudioRun>
         return Ok(None);
     };
     let time = decode_time(body)?;
-    let (trun, base) = find(body, &[b"trun"])?;
+    let (trun, base) = only_trun(body)?;
     let (offset, samples) = audio_run(&mut Reader::new(trun), defaults).map_err(|e| e.at(base, ""))?;
     let Some(offset) = data.checked_add_signed(i64::from(offset)) else {
         return Err(Error::bitstream(base, "", "a data offset within the file"));
@@ -389,7 +389,7 @@ fn traf(body: &[u8], track: &Track, start: u64) -> Result<Option<Entry>> {
         return Ok(None);
     };
     let time = decode_time(body)?;
-    let (trun, base) = find(body, &[b"trun"])?;
+    let (trun, base) = only_trun(body)?;
     let (offset, sample) = run(&mut Reader::new(trun), defaults).map_err(|e| e.at(base, ""))?;
     let fail = |expected: &str| Err(Error::bitstream(base, "", expected));
     let Some(offset) = data.checked_add_signed(i64::from(offset)) else {
@@ -451,6 +451,20 @@ fn decode_time(traf: &[u8]) -> Result<u64> {
     };
     read().map_err(|e| e.at(base, ""))?;
     Ok(long.max(u64::from(short)))
+}
+
+/// The body of the trun of a traf and its offset; a second trun is an error (spec 2.4).
+#[inline(never)]
+fn only_trun(traf: &[u8]) -> Result<(&[u8], usize)> {
+    let second = boxes(traf)?.into_iter().filter(|b| &b.kind == b"trun").nth(1);
+    match second {
+        Some(b) => Err(Error::bitstream(
+            b.offset,
+            "",
+            "one trun of a track, found a second one",
+        )),
+        None => find(traf, &[b"trun"]),
+    }
 }
 
 /// trun: data offset and the only sample.
