@@ -158,8 +158,8 @@ fn audio(body: &[u8]) -> Result<Option<(u32, AudioTrack)>> {
     if timescale == 0 {
         return Err(Error::bitstream(base, "", "a timescale > 0"));
     }
-    let media_start = match find(body, &[b"edts", b"elst"]) {
-        Ok((elst, base)) => edit(&mut Reader::new(elst)).map_err(|e| e.at(base, "elst box"))?,
+    let media_start = match find(body, &[b"edts"]) {
+        Ok((edts, base)) => edits(edts).map_err(|e| e.at(base, "edts box"))?,
         Err(_) => 0,
     };
     let entry = entries[entry.offset - 8..entry.offset + entry.body.len()].to_vec();
@@ -172,6 +172,15 @@ fn audio(body: &[u8]) -> Result<Option<(u32, AudioTrack)>> {
             entry,
         },
     )))
+}
+
+/// edts: media_time of the only edit, 0 without elst.
+fn edits(edts: &[u8]) -> Result<u32> {
+    let inner = boxes(edts)?;
+    let elst = inner.iter().find(|b| &b.kind == b"elst");
+    elst.map_or(Ok(0), |b| {
+        edit(&mut Reader::new(b.body)).map_err(|e| e.at(b.offset, "elst box"))
+    })
 }
 
 /// elst: media_time of the only edit.
