@@ -443,10 +443,10 @@ def main():
         file = f"valid/{name}.gsv"
         files[file] = build()
         manifest["valid"].append({"file": file, "about": about} | describe(files[file]))
-    for name, (error, _, build) in INVALID.items():
+    for name, (error, reason, build) in INVALID.items():
         file = f"invalid/{name}.gsv"
         files[file] = build()
-        manifest["invalid"].append({"file": file, "error": error})
+        manifest["invalid"].append({"file": file, "error": error, "reason": reason})
     for old in HERE.glob("*valid/*.gsv"):
         old.unlink()
     for file, data in files.items():
