@@ -12,7 +12,7 @@ TOOLS := $(CURDIR)/build/tools
 CI_TESTS := $(if $(CI),ci)
 CI_ENV := $(if $(CI),PATH="$(TOOLS)/node_modules/.bin:$$PATH")
 NEON := aarch64-unknown-linux-gnu
-EMULATED := CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc \
+EMULATED := CARGO_PROFILE_RELEASE_LTO=off CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc \
 	CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER="qemu-aarch64 -L /usr/aarch64-linux-gnu"
 APT := apt-get update -qq >/dev/null && DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends
 
