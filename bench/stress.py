@@ -24,7 +24,6 @@ from gscodec.capture import Capture
 from gscodec.encode.settings import EncodeSettings
 from gscodec.errors import UsageError
 from gscodec.model.gaussians import Gaussians
-from gscodec.model.parametric_group import ParametricGroup
 
 from . import train
 from .machine import update_entries
@@ -136,7 +135,7 @@ def _alone(capture: Capture, ours: dict, there: list[int], settings) -> dict:
     settings = _converged(capture, next((t for t in chosen if t in there), chosen[0]), settings)
     alone, seconds = train.every_frame_alone(capture, chosen, settings)
     part = train.part(capture, chosen)
-    size, decoded, *_ = train.coded(part, [ParametricGroup(1, g) for g in alone], settings, EncodeSettings(QUALITY))
+    size, decoded, *_ = train.coded(part, alone, settings, EncodeSettings(QUALITY))
     theirs = train.evaluate(part, decoded)
     both = [(t, i) for i, t in enumerate(chosen) if t in there]
     lost = [theirs["per_frame"][i]["psnr_fg"] - ours["per_frame"][t]["psnr_fg"] for t, i in both]
@@ -154,12 +153,14 @@ def _alone(capture: Capture, ours: dict, there: list[int], settings) -> dict:
 
 
 def _converged(capture: Capture, frame: int, settings):
-    """The settings with as many steps of a keyframe as `frame` needs."""
-    best = None
+    """The settings with as many steps of a keyframe as `frame` needs, by its training views."""
+    from gscodec.metrics.evaluate import evaluate_capture
+
+    part, best = train.part(capture, range(frame, frame + 1)), None
     for factor in FACTORS:
         longer = replace(settings, keyframe_steps=factor * settings.keyframe_steps)
-        (model,), _ = train.every_frame_alone(capture, [frame], longer)
-        reached = train.evaluate(train.part(capture, range(frame, frame + 1)), [model])["psnr_fg"]
+        (alone,), _ = train.every_frame_alone(capture, [frame], longer)
+        reached = evaluate_capture(lambda _, g=alone.canonical: g, part, "train", with_vmaf=False)["psnr_fg"]
         if best is not None and (reached is None or reached < best[0] + CONVERGED_DB):
             break
         best = reached, longer
