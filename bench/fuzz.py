@@ -11,6 +11,7 @@ over runs, per state of the code (git tree of gsv/src).
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import re
@@ -24,8 +25,14 @@ FUZZ = ROOT / "codec" / "native" / "fuzz"
 SHARES = {"units": 0.8, "group": 0.15, "demux": 0.05}  # of the time
 LENGTHS = {"units": 1024, "group": 4096, "demux": 8192}  # bytes of an input
 SECONDS_OF_INPUT, MEGABYTES = 120, 512  # of one input; more is a finding. Seconds by the clock: of a busy machine
-HOST = "x86_64-unknown-linux-gnu"
 COVERAGE = ("level=4", "inline-8bit-counters", "pc-table")
+
+
+@functools.cache
+def host() -> str:
+    """The machine that rustc compiles for."""
+    told = subprocess.run(["rustc", "-vV"], capture_output=True, text=True, check=True).stdout
+    return re.search(r"host: (\S+)", told)[1]
 
 
 def build(target: str) -> None:
@@ -33,7 +40,7 @@ def build(target: str) -> None:
     compares = ("trace-compares",) if target != "units" else ()  # of no use where the bytes are arithmetic code
     coverage = [f"-Cllvm-args=-sanitizer-coverage-{option}" for option in COVERAGE + compares]
     flags = ["--cfg", "fuzzing", "-Cpasses=sancov-module", *coverage, "-Ccodegen-units=1", "-Cdebug-assertions"]
-    command = ["cargo", "build", "--release", "--quiet", "--locked", "--target", HOST, "--bin", target]
+    command = ["cargo", "build", "--release", "--quiet", "--locked", "--target", host(), "--bin", target]
     subprocess.run(command, cwd=FUZZ, env=os.environ | {"RUSTFLAGS": " ".join(flags)}, check=True)
 
 
@@ -44,7 +51,7 @@ def fuzz(target: str, seconds: int) -> int:
     limits = [f"-max_total_time={seconds}", f"-timeout={SECONDS_OF_INPUT}", f"-rss_limit_mb={MEGABYTES}"]
     artifacts = FUZZ / "artifacts" / target
     artifacts.mkdir(parents=True, exist_ok=True)
-    program = FUZZ / "target" / HOST / "release" / target
+    program = FUZZ / "target" / host() / "release" / target
     command = [program, corpus, *limits, f"-max_len={LENGTHS[target]}", f"-artifact_prefix={artifacts}/"]
     done = subprocess.run(command, stderr=subprocess.PIPE, text=True, errors="replace")
     found = re.search(r"Done (\d+) runs", done.stderr)
