@@ -26,6 +26,8 @@ AMBIENT = 0.45
 OPENGL = np.diag([1.0, -1, -1, 1])  # OpenCV camera axes -> OpenGL's
 WAVES = 3  # sines of which the motion of a handheld camera is made
 PERIODS = (7.0, 30.0)  # frames, of these sines
+ROLL = 20  # frames, the period of an exposure that rolls
+EXPOSURES = 5  # moments of a picture whose shutter is open for some time
 
 
 @dataclass(frozen=True)
@@ -60,22 +62,27 @@ class Scene:
     """One capture.
 
     Attributes:
-        shapes: what is there at a frame.
+        shapes: what is there at a frame, or at a moment between two.
         light: at a frame.
         exposure: of the images of each training camera, a range (lowest, highest) of gains.
+        rolling: amplitude of a gain of each training camera that rises and falls over `ROLL` frames, each by its own
+            phase.
+        shutter: share of a frame's time for which the shutter is open: what moves is blurred.
         pose_noise: degrees and metres by which the calibration of each training camera is wrong.
         handheld: degrees and metres (root mean square) by which each camera shakes, each in its own way.
         orbit: degrees a frame by which all cameras go around the subject.
         masks: the views have alpha.
     """
 
-    shapes: Callable[[int], list[Shape]]
-    light: Callable[[int], Light] = lambda t: Light()
-    frames: int = 12
+    shapes: Callable[[float], list[Shape]]
+    light: Callable[[float], Light] = lambda t: Light()
+    frames: int = 30
     train: int = 12
     test: int = 2
     size: int = 128
     exposure: tuple[float, float] = (1.0, 1.0)
+    rolling: float = 0.0
+    shutter: float = 0.0
     pose_noise: tuple[float, float] = (0.0, 0.0)
     handheld: tuple[float, float] = (0.0, 0.0)
     orbit: float = 0.0
@@ -88,6 +95,7 @@ class Scene:
         wrong = [_error(*self.pose_noise, rng) if c.split == "train" else np.eye(4) for c in rig]
         gains = np.where([c.split == "train" for c in rig], rng.uniform(*self.exposure, len(rig)), 1)
         shaken = [_shake(*self.handheld, np.random.default_rng([1, i])) for i in range(len(rig))]
+        phases = np.random.default_rng(2).uniform(0, 2 * np.pi, len(rig))
 
         @cache
         def true(camera: int, frame: int) -> Camera:
@@ -99,17 +107,27 @@ class Scene:
             there = true(camera, frame)
             return replace(there, viewmat=wrong[camera] @ there.viewmat)
 
+        def gain(camera: int, frame: int) -> float:
+            rolled = self.rolling * np.sin(2 * np.pi * frame / ROLL + phases[camera])
+            return gains[camera] * (1 + rolled if rig[camera].split == "train" else 1)
+
         @cache
         def read(camera: int, frame: int) -> View:
-            rgba = trace(self.shapes(frame), self.light(frame), true(camera, frame))
+            rgba = self._exposed(true(camera, frame), frame)
             rgb, alpha = rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6), rgba[..., 3]
             if not self.masks:
-                return View(_u8(gains[camera] * rgba[..., :3]))
-            return View(_u8(gains[camera] * rgb), _u8(alpha))
+                return View(_u8(gain(camera, frame) * rgba[..., :3]))
+            return View(_u8(gain(camera, frame) * rgb), _u8(alpha))
 
         poses = told if self.orbit or any(self.handheld) else None
         cameras = [told(i, 0) for i in range(len(rig))]
         return Capture(name, 25.0, cameras, self.frames, self.masks, read, poses=poses)
+
+    def _exposed(self, camera: Camera, frame: int) -> np.ndarray:
+        """[H, W, 4] f32, premultiplied: the mean over the time for which the shutter is open."""
+        count = EXPOSURES if self.shutter else 1
+        times = frame + self.shutter * (np.arange(count) - (count - 1) / 2) / count
+        return np.mean([trace(self.shapes(t), self.light(t), camera) for t in times], 0)
 
 
 def write_transforms(capture: Capture, folder: Path) -> None:

@@ -29,11 +29,12 @@ def measure(capture: Capture, preset: str, frame: int) -> dict:
 
     settings, start = train_settings(preset), time.process_time()
     own = replace(settings.initialization, triangulate=False)  # those of `capture`, or none
-    models, seconds = every_frame_alone(capture, range(frame, frame + 1), replace(settings, initialization=own))
+    (alone,), seconds = every_frame_alone(capture, [frame], replace(settings, initialization=own))
+    model = alone.canonical
     cpu = round(time.process_time() - start, 1)
-    found = evaluate_capture(lambda _: models[0], part(capture, range(frame, frame + 1)), "test")
+    found = evaluate_capture(lambda _: model, part(capture, range(frame, frame + 1)), "test")
     quality = {k: round(found[k], 3) for k in ("psnr", "psnr_fg", "psnr_corrected", "ssim")}
-    return {**quality, "seconds": round(seconds, 1), "cpu_seconds": cpu, "gaussians": len(models[0])}
+    return {**quality, "seconds": round(seconds, 1), "cpu_seconds": cpu, "gaussians": len(model)}
 
 
 def main() -> None:

@@ -81,7 +81,7 @@ PAIRS = {1: 2**26, 2: 2**28, 3: 2**30, 4: 2**32}  # clause 5: N M
 
 # ---- 2. Container ---------------------------------------------------------------------------------------------------
 
-HEADER_BOXES = (b"ftyp", b"moov", b"sidx", b"moof")  # of the top level
+HEADER_BOXES = (b"ftyp", b"moov", b"sidx", b"ssix", b"moof")  # of the top level
 
 
 def boxes(data, position, end, top_level=False):
@@ -101,6 +101,8 @@ def boxes(data, position, end, top_level=False):
         elif size == 0:
             require(kind == b"mdat" and top_level, f"box {kind!r} at byte {offset}: size 0 is for mdat only")
             size = 2**64  # to the end of the file, which may still grow
+        elif offset + size >= 2**64:
+            raise BitstreamError(f"box {kind!r} at byte {offset}: size {size}, expected an end below 2^64")
         require(size >= header, f"box {kind!r} at byte {offset}: size {size} is less than its header")
         if top_level and kind in HEADER_BOXES and size - header > 2**24:
             raise LimitError(f"box {kind!r} at byte {offset}: {size} bytes, at most 16 MiB are allowed")
@@ -119,6 +121,14 @@ def find_box(data, box, path):
         if box is None:
             return None
     return box
+
+
+def find_leniently(data, box, path):
+    """As `find_box`; None also where a box on the way is malformed: that of a track which readers ignore."""
+    try:
+        return find_box(data, box, path)
+    except BitstreamError:
+        return None
 
 
 def open_box(data, box, path):
@@ -173,9 +183,11 @@ class Sample:
 def read_container(data):
     """Clause 2: bytes of a file -> (Config, [Sample])."""
     config, pending, samples, first = None, [], [], True
+    require(
+        len(data) < 8 or data[4:8] == b"ftyp", f"the first box is {bytes(data[4:8])!r}, expected ftyp: not a gsv file"
+    )
     for box in boxes(data, 0, len(data), top_level=True):
         kind, offset, body, end = box
-        require(kind == b"ftyp" or not first, f"the first box is {kind!r}, expected ftyp: not a gsv file")
         if first:
             read_ftyp(data, body, end)
         elif kind == b"moov":
@@ -208,7 +220,7 @@ def read_ftyp(data, body, end):
 def tracks(data, moov, handler):
     """The tracks of a handler."""
     for trak in list(boxes(data, moov[2], moov[3])):
-        hdlr = find_box(data, trak, [b"mdia", b"hdlr"]) if trak[0] == b"trak" else None
+        hdlr = find_leniently(data, trak, [b"mdia", b"hdlr"]) if trak[0] == b"trak" else None
         if hdlr is not None and data[hdlr[2] + 8 : min(hdlr[3], hdlr[2] + 12)] == handler:
             yield trak
 
@@ -240,8 +252,8 @@ def read_defaults(data, moov, track_id):
 def read_audio_track(data, moov):
     """Clause 2.7, moov; None if there is none."""
     for trak in tracks(data, moov, b"soun"):
-        stsd = find_box(data, trak, [b"mdia", b"minf", b"stbl", b"stsd"])
-        entry = next(boxes(data, stsd[2] + 8, stsd[3]), None) if stsd else None
+        stsd = find_leniently(data, trak, [b"mdia", b"minf", b"stbl", b"stsd"])
+        entry = next(iter(list(boxes(data, stsd[2] + 8, stsd[3])) if stsd else ()), None)
         if entry is None or entry[0] not in (b"mp4a", b"Opus"):
             continue
         kind, offset, body, end = entry
@@ -271,7 +283,7 @@ def read_sample_entry(data, trak):
     """Clause 2.2: stsd with the entry gsv1, and in it gsvC."""
     reader = open_box(data, trak, [b"mdia", b"minf", b"stbl", b"stsd"])
     reader.take(8)  # version, flags, entry_count
-    entry = next((e for e in boxes(data, reader.position, reader.end) if e[0] == b"gsv1"), None)
+    entry = next((e for e in list(boxes(data, reader.position, reader.end)) if e[0] == b"gsv1"), None)
     require(entry is not None, "stsd: no sample entry gsv1")
     Reader(data, entry[2], entry[3], "gsv1").take(40)
     kind, offset, body, end = entry
@@ -316,8 +328,8 @@ def read_gsvc(r):
     )
 
 
-def read_traf(data, moof, track_id, defaults):
-    """Clause 2.4: (base, defaults, time, trun) of the traf of a track; None if there is none."""
+def read_trafs(data, moof, track_id, defaults):
+    """Clause 2.4: yields (base, defaults, time, trun) of each traf of a track."""
     for traf in list(boxes(data, moof[2], moof[3])):
         if traf[0] != b"traf":
             continue
@@ -325,24 +337,23 @@ def read_traf(data, moof, track_id, defaults):
         flags, found = tfhd.u32() & 0xFFFFFF, tfhd.u32()
         if found != track_id:
             continue
-        defaults = dict(defaults)
+        own = dict(defaults)
         base = tfhd.u64() if flags & 0x01 else moof[1]
         if flags & 0x02:
             tfhd.u32()  # sample_description_index
         for bit, name in ((0x08, "duration"), (0x10, "size"), (0x20, "flags")):
             if flags & bit:
-                defaults[name] = tfhd.u32()
+                own[name] = tfhd.u32()
         tfdt = open_box(data, traf, [b"tfdt"])
         time = tfdt.u64() if tfdt.u32() >> 24 == 1 else tfdt.u32()
         truns = sum(box[0] == b"trun" for box in boxes(data, traf[2], traf[3]))
         require(truns <= 1, f"moof at byte {moof[1]}: {truns} trun of a track, expected one, of one sample or of sound")
-        return base, defaults, time, open_box(data, traf, [b"trun"])
-    return None
+        yield base, own, time, open_box(data, traf, [b"trun"])
 
 
 def read_moof(data, moof, config):
     """Clause 2.4: [(offset, size, start_frame, frames, sync, audio)] of the gsv track: none or one."""
-    found = read_traf(data, moof, config.track_id, config.defaults)
+    found = next(read_trafs(data, moof, config.track_id, config.defaults), None)
     if found is None:
         return []
     base, sample, time, trun = found
@@ -352,7 +363,7 @@ def read_moof(data, moof, config):
     if flags & 0x004:
         sample["flags"] = trun.u32()  # first_sample_flags
     for bit, name in ((0x100, "duration"), (0x200, "size"), (0x400, "flags")):
-        if flags & bit:
+        if flags & bit and not (name == "flags" and flags & 0x004):
             sample[name] = trun.u32()
     frames, rest = divmod(sample["duration"], config.frame_duration)
     require(
@@ -367,10 +378,18 @@ def read_moof(data, moof, config):
 
 def read_sound(data, moof, audio, group):
     """Clause 2.7: (media time, [(size, duration)]) of the samples in front of a group, None if there are none."""
-    found = read_traf(data, moof, audio.track_id, audio.defaults)
-    if found is None:
-        return None
-    base, defaults, time, trun = found
+    for base, defaults, time, trun in read_trafs(data, moof, audio.track_id, audio.defaults):
+        start, samples = read_run(trun, base, defaults)
+        end = start + sum(size for size, _ in samples)
+        fits = not samples or end == group
+        require(fits, f"moof at byte {moof[1]}: sound ends at byte {end}, expected where the group starts")
+        if samples:
+            return time, samples
+    return None
+
+
+def read_run(trun, base, defaults):
+    """Clause 2.7: offset of the first sample of a trun of sound, and [(size, duration)]."""
     flags, count = trun.u32() & 0xFFFFFF, trun.u32()
     if count > 65536:
         raise LimitError(f"traf of the audio track: {count} samples, at most 65536 are allowed")
@@ -381,9 +400,8 @@ def read_sound(data, moof, audio, group):
         duration = trun.u32() if flags & 0x100 else defaults["duration"]
         size = trun.u32() if flags & 0x200 else defaults["size"]
         trun.take(4 * (flags >> 10 & 3).bit_count())  # flags, composition offset
-        require(size > 0 and duration > 0, f"moof at byte {moof[1]}: {size} bytes, {duration} units, at least one byte")
+        require(
+            size > 0 and duration > 0, f"trun: a sample of {size} bytes, {duration} units, expected at least one byte"
+        )
         samples.append((size, duration))
-    end = start + sum(size for size, _ in samples)
-    fits = not samples or end == group
-    require(fits, f"moof at byte {moof[1]}: sound ends at byte {end}, expected where the group starts")
-    return (time, samples) if samples else None
+    return start, samples

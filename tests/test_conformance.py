@@ -56,7 +56,8 @@ def assert_close(got, expected, name):
 
 def test_manifest_lists_the_cases():
     assert list(VALID) == list(make.VALID)
-    assert {name: entry["error"] for name, entry in INVALID.items()} == {n: c[0] for n, c in make.INVALID.items()}
+    reasons = {name: (entry["error"], entry["reason"]) for name, entry in INVALID.items()}
+    assert reasons == {name: case[:2] for name, case in make.INVALID.items()}
     files = {path.relative_to(VECTORS).as_posix() for path in VECTORS.glob("*valid/*")}
     assert files == {entry["file"] for entry in MANIFEST["valid"] + MANIFEST["invalid"]}
 

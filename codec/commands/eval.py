@@ -65,8 +65,6 @@ def evaluate_stream(stream_path: Path, source: Path, *, split: str, frames: str 
         return evaluate_capture(stream.frame, reference.frames(chosen.start, chosen.stop), split=split, **options)
 
     result = measure(whole, whole.byte_count)
-    if splats:
-        result["gaussians_encoded"] = len(reference.frame(chosen.start))
     later = [layer["bytes"] for layer in describe(whole)["layers"]][1:]
     if later:
         result["prefixes"] = []

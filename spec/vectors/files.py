@@ -122,6 +122,26 @@ def other_mdat_sizes():
     return parts[0][1] + parts[1][1] + shift_data(first_moof, 8) + first_mdat + last_moof + bytes(4) + last_mdat[4:]
 
 
+def second_trun(data, which):
+    """The file with the trun number `which` of its first moof written twice in its traf; its samples stay in place."""
+    parts = split_boxes(data)
+    at = next(i for i, (kind, _) in enumerate(parts) if kind == b"moof")
+    inner, result, number = parts[at][1][8:], b"", 0
+    for kind, start, body, end in boxes(inner, 0, len(inner)):
+        whole = inner[start:end]
+        if kind == b"traf":
+            trun = whole[whole.index(b"trun") - 4 :]  # the last box of a traf
+            whole = box(b"traf", inner[body:end] + trun) if number == which else whole
+            number += 1
+        result += whole
+    moof = box(b"moof", result)
+    grown, position = len(moof) - len(parts[at][1]), -1
+    while (position := moof.find(b"trun", position + 1)) >= 0:
+        place = position + 12
+        moof = poke(moof, place, struct.pack(">i", struct.unpack_from(">i", moof, place)[0] + grown))
+    return b"".join(whole if i != at else moof for i, (_, whole) in enumerate(parts))
+
+
 def full_box(kind, flags, *fields, version=0):
     """Fields are u32 or bytes."""
     body = b"".join(f if isinstance(f, bytes) else struct.pack(">I", f) for f in fields)

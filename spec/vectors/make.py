@@ -28,6 +28,7 @@ from files import (  # noqa: E402
     other_mdat_sizes,
     other_track,
     second_moof,
+    second_trun,
     sound_file,
     sound_patched,
     truncated,
@@ -227,7 +228,7 @@ B, L = "BitstreamError", "LimitError"
 INVALID = {  # name: (error, part of the message of both decoders, bytes)
     # Container
     "container_empty": (B, "moov", lambda: b""),
-    "container_text": (B, "gsv file", lambda: b"This is not a volumetric video, it only has a friendly name.\n"),
+    "container_text": (B, "ftyp", lambda: b"This is not a volumetric video, it only has a friendly name.\n"),
     "container_magic": (B, "ftyp", other_top(lambda p: [(b"ftyp", box(b"ftyp", b"isom\0\0\0\0isommp42")), *p[1:]])),
     "container_no_moov": (B, "moov", other_top(lambda p: p[:1])),
     "container_no_ftyp": (B, "ftyp", other_top(lambda p: p[1:])),
@@ -239,6 +240,7 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "container_huge_header_box": (L, "moof", patched(b"moof", -8, u32(2**24 + 9))),
     "container_nested_size": (B, "bytes", patched(b"traf", -8, u32(10**6))),
     "container_two_samples": (B, "sample", patched(b"trun", 4, u32(2))),
+    "container_second_trun": (B, "trun", lambda: second_trun(groups_file(make_group(30, 2), finish=False), 0)),
     "container_outside_mdat": (B, "mdat", patched(b"trun", 8, u32(4))),
     "container_no_mdat": (B, "mdat", no_mdat),
     "container_second_moov": (B, "moov", other_top(lambda p: [*p[:2], *p[1:]])),
@@ -257,7 +259,7 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "config_background": (B, "background", patched(b"gsvC", 12, f32(1.5))),
     "config_sh_degree": (B, "sh_degree", patched(b"gsvC", 24, b"\4")),
     "config_sh_frame": (B, "sh_frame", patched(b"gsvC", 25, b"\2")),
-    "config_camera_count": (B, "gsvC", patched(b"gsvC", 26, b"\xff\xff")),
+    "config_camera_count": (B, "63 more", patched(b"gsvC", 26, b"\xff\xff")),
     "config_camera_name": (B, "camera name", patched(b"gsvC", 29, b"\xff\xff")),
     "config_camera_width": (B, "pixel", patched(b"gsvC", 29 + len(CAMERA["name"].encode()), u32(0))),
     "config_camera_near": (B, "near", patched(b"gsvC", 29 + len(CAMERA["name"].encode()) + 76, f32(0))),
@@ -272,6 +274,7 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "sound_edit_empty": (B, "one edit", sound_patched(b"elst", 12, u32(2**32 - 1), 0)),
     "sound_many_samples": (L, "65536", sound_patched(b"trun", 4, u32(65537))),
     "sound_samples_missing": (B, "4 more", sound_patched(b"trun", 4, u32(4))),
+    "sound_second_trun": (B, "trun", lambda: second_trun(sound_file(finish=False), 0)),
     "sound_sample_empty": (B, "at least one byte", sound_patched(b"trun", 16, u32(0))),
     "sound_elsewhere": (B, "where the group starts", sound_patched(b"trun", 8, u32(4))),
     "sound_too_long": (B, "where the group starts", sound_patched(b"trun", 16, u32(2**32 - 1))),
@@ -440,10 +443,10 @@ def main():
         file = f"valid/{name}.gsv"
         files[file] = build()
         manifest["valid"].append({"file": file, "about": about} | describe(files[file]))
-    for name, (error, _, build) in INVALID.items():
+    for name, (error, reason, build) in INVALID.items():
         file = f"invalid/{name}.gsv"
         files[file] = build()
-        manifest["invalid"].append({"file": file, "error": error})
+        manifest["invalid"].append({"file": file, "error": error, "reason": reason})
     for old in HERE.glob("*valid/*.gsv"):
         old.unlink()
     for file, data in files.items():

@@ -126,7 +126,13 @@ fn header_of(first: &Unit, how: &Decoding) -> Result<Header> {
 fn open<'a>(payload: &'a [u8], how: &Decoding) -> Result<(Header, Vec<Unit<'a>>)> {
     how.level.cap("group", "bytes", payload.len() as u64, how.level.bytes)?;
     let header = read_header(payload, how)?;
-    let units = unit::scan(payload, how.layers, |layer, tile| how.wants(&header, layer, tile))?;
+    let mut units = unit::scan(payload, how.layers, |layer, tile| how.wants(&header, layer, tile))?;
+    for u in units.iter_mut().filter(|u| u.kind == Some(UnitType::Tile)) {
+        let unasked = !how.asks(u.layer.into(), u.index.into());
+        if let (true, Some(Error::Bitstream { expected, .. })) = (unasked, &mut u.damage) {
+            expected.push_str("; the tiles that were asked for start from it");
+        }
+    }
     Ok((header, units))
 }
 

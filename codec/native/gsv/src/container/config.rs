@@ -3,6 +3,7 @@
 use super::audio::AudioTrack;
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader, Writer};
+use crate::levels::Level;
 
 /// Names of `up_axis` values.
 pub const UP_AXES: [&str; 6] = ["x", "y", "z", "-x", "-y", "-z"];
@@ -81,6 +82,7 @@ impl Config {
         f.u8(&mut version)?;
         f.must(version == 4, || format!("configuration_version 4, found {version}"))?;
         f.u8(&mut self.level)?;
+        Level::get(self.level)?;
         f.u32(&mut self.frame_duration)?;
         f.must(self.frame_duration > 0, || "frame_duration > 0, found 0".into())?;
         f.step(&mut self.metres_per_unit, "metres_per_unit")?;

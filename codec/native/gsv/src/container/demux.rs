@@ -198,7 +198,7 @@ impl Demuxer {
         if std::mem::take(&mut self.first) && &kind != b"ftyp" {
             return Err(Error::bitstream(
                 start as usize,
-                "",
+                "file",
                 "a .gsv file, which starts with an ftyp box",
             ));
         }

@@ -158,8 +158,8 @@ fn audio(body: &[u8]) -> Result<Option<(u32, AudioTrack)>> {
     if timescale == 0 {
         return Err(Error::bitstream(base, "", "a timescale > 0"));
     }
-    let media_start = match find(body, &[b"edts", b"elst"]) {
-        Ok((elst, base)) => edit(&mut Reader::new(elst)).map_err(|e| e.at(base, "elst box"))?,
+    let media_start = match find(body, &[b"edts"]) {
+        Ok((edts, base)) => edits(edts).map_err(|e| e.at(base, "edts box"))?,
         Err(_) => 0,
     };
     let entry = entries[entry.offset - 8..entry.offset + entry.body.len()].to_vec();
@@ -172,6 +172,15 @@ fn audio(body: &[u8]) -> Result<Option<(u32, AudioTrack)>> {
             entry,
         },
     )))
+}
+
+/// edts: media_time of the only edit, 0 without elst.
+fn edits(edts: &[u8]) -> Result<u32> {
+    let inner = boxes(edts)?;
+    let elst = inner.iter().find(|b| &b.kind == b"elst");
+    elst.map_or(Ok(0), |b| {
+        edit(&mut Reader::new(b.body)).map_err(|e| e.at(b.offset, "elst box"))
+    })
 }
 
 /// elst: media_time of the only edit.
@@ -339,7 +348,7 @@ fn audio_traf(body: &[u8], audio: &Audio, start: u64) -> Result<Option<AudioRun>
         return Ok(None);
     };
     let time = decode_time(body)?;
-    let (trun, base) = find(body, &[b"trun"])?;
+    let (trun, base) = only_trun(body)?;
     let (offset, samples) = audio_run(&mut Reader::new(trun), defaults).map_err(|e| e.at(base, ""))?;
     let Some(offset) = data.checked_add_signed(i64::from(offset)) else {
         return Err(Error::bitstream(base, "", "a data offset within the file"));
@@ -389,7 +398,7 @@ fn traf(body: &[u8], track: &Track, start: u64) -> Result<Option<Entry>> {
         return Ok(None);
     };
     let time = decode_time(body)?;
-    let (trun, base) = find(body, &[b"trun"])?;
+    let (trun, base) = only_trun(body)?;
     let (offset, sample) = run(&mut Reader::new(trun), defaults).map_err(|e| e.at(base, ""))?;
     let fail = |expected: &str| Err(Error::bitstream(base, "", expected));
     let Some(offset) = data.checked_add_signed(i64::from(offset)) else {
@@ -451,6 +460,20 @@ fn decode_time(traf: &[u8]) -> Result<u64> {
     };
     read().map_err(|e| e.at(base, ""))?;
     Ok(long.max(u64::from(short)))
+}
+
+/// The body of the trun of a traf and its offset; a second trun is an error (spec 2.4).
+#[inline(never)]
+fn only_trun(traf: &[u8]) -> Result<(&[u8], usize)> {
+    let second = boxes(traf)?.into_iter().filter(|b| &b.kind == b"trun").nth(1);
+    match second {
+        Some(b) => Err(Error::bitstream(
+            b.offset,
+            "",
+            "one trun of a track, found a second one",
+        )),
+        None => find(traf, &[b"trun"]),
+    }
 }
 
 /// trun: data offset and the only sample.
