@@ -80,7 +80,7 @@ class FrameFit:
         grads = {**grads, "quats": quat_multiply(quat_conjugate(rotations.detach()), grads["quats"])}  # before rotation
         free = {n: g * self._moving.view(-1, *[1] * (g.dim() - 1)) for n, g in grads.items()}
         self.own.step(free, s.rates.scaled(t.radius, decay * (s.first_round_rates if first else 1.0)))
-        return result.loss - t.settings.mask_lambda * result.mask
+        return result.image_loss
 
     def _step_nodes(self, params: dict, grads: dict, rigidity: torch.Tensor, decay: float) -> None:
         """One step of the nodes along the gradients by the carried means and quats, and along that of `rigidity`."""
