@@ -87,6 +87,11 @@ class Stream:
         g = self.groups[i]
         return bytes(self._data[g["offset"] : g["offset"] + g["size"]])
 
+    def sound(self, i: int) -> bytes:
+        """Samples of the sound that go with group `i`, one behind the other."""
+        offset, _, samples = self.groups[i].get("audio", (0, 0, []))
+        return bytes(self._data[offset : offset + sum(size for size, _ in samples)])
+
     def group(self, i: int):
         """Group `i`, decoded (`_native.DecodedGroup`).
 
