@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from rig_layouts import FRAMES, NAMES, H, W, easyvolcap
 from test_raster import BACKGROUND, camera, scene
 
 from gscodec.capture import open_capture
@@ -162,6 +163,19 @@ def test_distances_along_rays_become_depth():
     y, x = np.mgrid[: cam.height, : cam.width] + 0.5
     rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(cam.K).T
     np.testing.assert_allclose(along_axis(z * np.linalg.norm(rays, axis=-1), cam.K), z, rtol=1e-6)
+
+
+def test_depth_images_of_easyvolcap(tmp_path):
+    """Distances from the camera, as its loader has them by default."""
+    easyvolcap(tmp_path)
+    for name in NAMES:
+        (tmp_path / "depths" / name).mkdir(parents=True)
+        for t in range(FRAMES):
+            np.save(tmp_path / "depths" / name / f"{t:06}.npy", np.full((H, W, 1), 2 + t, np.float32))
+    capture = open_capture(tmp_path)
+    depth = capture.view(1, 1).depth
+    np.testing.assert_allclose(depth, along_axis(np.full((H, W), 3.0), capture.cameras[1].K), rtol=1e-6)
+    assert depth[0, 0] < 0.95 * depth.max()
 
 
 def test_points_of_depth_images_lie_on_their_surface():

@@ -5,9 +5,9 @@ import json
 import cv2
 import numpy as np
 import pytest
+from rig_layouts import LAYOUTS, zju_mocap
 from test_capture import GL, write_image
 from test_cli import fails, run
-from test_layouts import LAYOUTS, zju_mocap
 
 from gscodec.capture import open_capture
 from gscodec.capture.masks import make_masks
