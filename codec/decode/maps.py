@@ -9,13 +9,13 @@ all samples, one behind the other; maps.json has their sizes and durations by gr
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 
-from ..atomic_write import part_file
 from ..bitstream.hilbert_layout import HilbertLayout
 from ..bitstream.quantized_group import QuantizedGroup
 from ..render.png import write_png
@@ -82,8 +82,9 @@ def write_maps(stream: Stream, folder: Path) -> int:
 
 
 def _write(path: Path, data: bytes) -> None:
-    with part_file(path) as part:
-        part.write_bytes(data)
+    part = path.with_name(path.name + ".part")
+    part.write_bytes(data)
+    os.replace(part, path)
 
 
 def _write_plane(path: Path, plane: np.ndarray) -> int:
