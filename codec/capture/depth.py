@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import CaptureError, require
+from .images import first_line
 
 SUFFIXES = (".exr", ".png", ".npy", ".tif", ".tiff", ".pfm", ".hdr")
 
@@ -89,5 +90,5 @@ def _pixels(path: Path) -> np.ndarray:
     pixels, message = image.read_image(of), image.geterror()
     image.close()
     if pixels is None or message:
-        raise CaptureError(f"{path}: damaged depth image ({message or 'no pixels'})")
+        raise CaptureError(f"{path}: damaged depth image ({first_line(message)}), expected a whole file; copy it again")
     return pixels.reshape(spec.height, spec.width, -1)[..., 0]

@@ -79,7 +79,7 @@ def read_image(path: Path) -> View:
     message = image.geterror()
     image.close()
     if pixels is None or message:
-        raise CaptureError(f"{path}: damaged image ({message or 'no pixels'})")
+        raise CaptureError(f"{path}: damaged image ({first_line(message)}), expected a whole file; copy it again")
     colour, a = _channels(spec.channelnames)
     pixels = pixels.reshape(spec.height, spec.width, -1)
     alpha = None if a is None else pixels[..., a]
@@ -90,6 +90,11 @@ def read_image(path: Path) -> View:
     if not integer:
         rgb = _srgb(rgb)
     return View(_u8(rgb), None if alpha is None else _u8(alpha))
+
+
+def first_line(message: str) -> str:
+    """What OpenImageIO says of a file without pixels, without the libraries below it that say it again."""
+    return message.splitlines()[0] if message else "no pixels"
 
 
 def read_mask(path: Path, *, labels: bool = False) -> np.ndarray:

@@ -170,7 +170,8 @@ def _missing(capture: Capture, path: Path, facts: dict) -> list[str]:
     if not capture.indices("test"):
         out.append("no test cameras: quality can only be measured on pictures that were trained on")
     if trained < FEW:
-        out.append(f"{trained} training cameras: what lies between their views is hardly constrained")
+        count = "1 training camera: what its view does not show" if trained == 1 else None
+        out.append(f"{count or f'{trained} training cameras: what lies between their views'} is hardly constrained")
     error = facts["epipolar_error"]
     if error is None and len(capture.cameras) > 1:
         out.append(f"{facts['matches']} features match between neighbours, too few to check the calibration")
