@@ -118,7 +118,8 @@ class Scene:
 
 
 def write_transforms(capture: Capture, folder: Path) -> None:
-    """Writes a capture as transforms.json and PNG files, with the pose and the intrinsics of each frame."""
+    """Writes a capture as transforms.json and PNG files, depth in millimetres, with the pose and the intrinsics of each
+    frame."""
     import cv2
 
     entries = []
@@ -130,6 +131,9 @@ def write_transforms(capture: Capture, folder: Path) -> None:
             (fl_x, _, cx), (_, fl_y, cy) = camera.K[:2].tolist()
             entry = {"file_path": name, "camera": camera.name, "frame": t, "split": camera.split}
             entry |= {"w": camera.width, "h": camera.height, "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
+            if view.depth is not None:
+                entry["depth_file_path"] = f"depth_{name}"
+                cv2.imwrite(str(folder / entry["depth_file_path"]), np.rint(1000 * view.depth).astype(np.uint16))
             pose = np.linalg.inv(camera.viewmat) @ OPENGL
             entries.append(entry | {"transform_matrix": pose.tolist()})
     (folder / "transforms.json").write_text(json.dumps({"fps": capture.fps, "frames": entries}))

@@ -82,6 +82,7 @@ def test_what_moves_is_the_subject_and_light_is_not(tmp_path):
     assert overlaps(tmp_path).mean() > 0.85
 
 
+@pytest.mark.filterwarnings("ignore:.*nothing is found")
 def test_a_subject_of_the_colours_of_the_background_is_seen_where_other_frames_show_that(tmp_path):
     write_scene(tmp_path, alike=True, frames=20)  # it leaves the picture after ten
     make_masks(open_capture(tmp_path))

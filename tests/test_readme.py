@@ -98,6 +98,16 @@ def test_table_of_sparse_points():
         assert all(map(agrees, figures, values)), (name, figures, values)
 
 
+def test_table_of_depth_images():
+    found = {(e["scene"], e["cameras"], e["variant"]): e for e in result("depth")["entries"]}
+    variants = ("without", "start", "loss", "both")
+    for name, *figures in rows("frame 3 of"):
+        scene, cameras = name.removesuffix(" cameras").rsplit(", ", 1)
+        entries = [found[scene, int(cameras), v] for v in variants]
+        values = [e[key] for key in ("psnr_fg", "depth_error") for e in entries]
+        assert all(map(agrees, figures, values)), (name, figures, values)
+
+
 def test_the_table_of_sources_is_that_of_the_results():
     page = sources.PAGE.read_text()
     assert sources.with_table(page) == page, "run python -m bench.sources"
