@@ -72,6 +72,7 @@ class Scene:
         handheld: degrees and metres (root mean square) by which each camera shakes, each in its own way.
         orbit: degrees a frame by which all cameras go around the subject.
         masks: the views have alpha.
+        depth_noise: standard deviation of the noise of the depth images, a share of the depth; None: there are none.
     """
 
     shapes: Callable[[float], list[Shape]]
@@ -87,6 +88,7 @@ class Scene:
     handheld: tuple[float, float] = (0.0, 0.0)
     orbit: float = 0.0
     masks: bool = True
+    depth_noise: float | None = None
 
     def capture(self, name: str) -> Capture:
         """The scene as its cameras see it."""
@@ -113,25 +115,31 @@ class Scene:
 
         @cache
         def read(camera: int, frame: int) -> View:
-            rgba = self._exposed(true(camera, frame), frame)
+            rgba, depth = self._exposed(true(camera, frame), frame)
             rgb, alpha = rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6), rgba[..., 3]
+            seed = np.random.default_rng([2, camera, frame])
+            depth = None if self.depth_noise is None else _sensed(depth, self.depth_noise, seed)
             if not self.masks:
-                return View(_u8(gain(camera, frame) * rgba[..., :3]))
-            return View(_u8(gain(camera, frame) * rgb), _u8(alpha))
+                return View(_u8(gain(camera, frame) * rgba[..., :3]), depth=depth)
+            return View(_u8(gain(camera, frame) * rgb), _u8(alpha), depth)
 
         poses = told if self.orbit or any(self.handheld) else None
         cameras = [told(i, 0) for i in range(len(rig))]
-        return Capture(name, 25.0, cameras, self.frames, self.masks, read, poses=poses)
+        has_depth = self.depth_noise is not None
+        return Capture(name, 25.0, cameras, self.frames, self.masks, read, has_depth=has_depth, poses=poses)
 
-    def _exposed(self, camera: Camera, frame: int) -> np.ndarray:
-        """[H, W, 4] f32, premultiplied: the mean over the time for which the shutter is open."""
+    def _exposed(self, camera: Camera, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """[H, W, 4] f32, premultiplied, the mean over the time for which the shutter is open, and the depth [H, W] in
+        the middle of it."""
         count = EXPOSURES if self.shutter else 1
         times = frame + self.shutter * (np.arange(count) - (count - 1) / 2) / count
-        return np.mean([trace(self.shapes(t), self.light(t), camera) for t in times], 0)
+        traced = [trace(self.shapes(t), self.light(t), camera) for t in times]
+        return np.mean([rgba for rgba, _ in traced], 0), traced[count // 2][1]
 
 
 def write_transforms(capture: Capture, folder: Path) -> None:
-    """Writes a capture as transforms.json and PNG files, with the pose and the intrinsics of each frame."""
+    """Writes a capture as transforms.json and PNG files, depth in millimetres, with the pose and the intrinsics of each
+    frame."""
     import cv2
 
     entries = []
@@ -143,6 +151,9 @@ def write_transforms(capture: Capture, folder: Path) -> None:
             (fl_x, _, cx), (_, fl_y, cy) = camera.K[:2].tolist()
             entry = {"file_path": name, "camera": camera.name, "frame": t, "split": camera.split}
             entry |= {"w": camera.width, "h": camera.height, "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
+            if view.depth is not None:
+                entry["depth_file_path"] = f"depth_{name}"
+                cv2.imwrite(str(folder / entry["depth_file_path"]), np.rint(1000 * view.depth).astype(np.uint16))
             pose = np.linalg.inv(camera.viewmat) @ OPENGL
             entries.append(entry | {"transform_matrix": pose.tolist()})
     (folder / "transforms.json").write_text(json.dumps({"fps": capture.fps, "frames": entries}))
@@ -150,6 +161,12 @@ def write_transforms(capture: Capture, folder: Path) -> None:
 
 def _u8(x: np.ndarray) -> np.ndarray:
     return np.rint(255 * x.clip(0, 1)).astype(np.uint8)
+
+
+def _sensed(depth: np.ndarray, noise: float, rng: np.random.Generator) -> np.ndarray:
+    """A depth image as a sensor gives it: noise that grows with the depth, in steps of a millimetre."""
+    noisy = depth * (1 + noise * rng.standard_normal(depth.shape))
+    return (np.rint(1000 * noisy) / 1000).astype(np.float32)
 
 
 def _rig(train: int, test: int, size: int) -> list[Camera]:
@@ -202,8 +219,9 @@ def rotation(axis: Sequence[float], angle: float) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
 
 
-def trace(shapes: Sequence[Shape], light: Light, camera: Camera) -> np.ndarray:
-    """[H, W, 4] f32, premultiplied, 0..1: the view of the camera, the mean of `SAMPLES`^2 rays per pixel."""
+def trace(shapes: Sequence[Shape], light: Light, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """The view of a camera: [H, W, 4] f32, premultiplied, 0..1, the mean of `SAMPLES`^2 rays per pixel; and [H, W] f32
+    depth along the optical axis of the middle ray, 0 where nothing is there."""
     w, h, R = camera.width, camera.height, camera.viewmat[:3, :3].astype(np.float32)
     x = ((np.arange(SAMPLES * w) + 0.5) / SAMPLES - camera.K[0, 2]) / camera.K[0, 0]
     y = ((np.arange(SAMPLES * h) + 0.5) / SAMPLES - camera.K[1, 2]) / camera.K[1, 1]
@@ -218,7 +236,9 @@ def trace(shapes: Sequence[Shape], light: Light, camera: Camera) -> np.ndarray:
         index = index[closer]
         nearest[index] = depth[closer]
         out[index, :3], out[index, 3] = color[closer], 1
-    return out.reshape(h, SAMPLES, w, SAMPLES, 4).mean(3).mean(1)
+    middle = nearest.reshape(h, SAMPLES, w, SAMPLES)[:, SAMPLES // 2, :, SAMPLES // 2]
+    depth = np.where(np.isfinite(middle), middle, 0).astype(np.float32)
+    return out.reshape(h, SAMPLES, w, SAMPLES, 4).mean(3).mean(1), depth
 
 
 def _intersect(shape: Shape, light: Light, eye: np.ndarray, rays: np.ndarray, squares: np.ndarray) -> tuple:

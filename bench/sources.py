@@ -48,8 +48,11 @@ def _rows() -> Iterator[tuple[str, ...]]:
         ("fuzz.json", "fuzzing", "python -m bench.fuzz"),
     ):
         yield what, file, f"`{command}`", _commits(_entries(file)), "-"
-    points = json.loads((RESULTS / "points.json").read_text())
-    yield "sparse points", "points.json", "`python -m bench.sparse_points`", _commits(list(points.values())), "-"
+    for file, what, module in (
+        ("points.json", "sparse points", "sparse_points"),
+        ("depth.json", "depth images", "depth"),
+    ):
+        yield what, file, f"`python -m bench.{module}`", _commits(_entries(file)), "-"
 
 
 def _entries(file: str) -> list[dict]:

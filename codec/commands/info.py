@@ -130,7 +130,8 @@ def _of_capture(path: Path, frame: int, sheet: Path | None, as_json: bool) -> No
     error, ratio = facts["epipolar_error"], facts["colour_ratio"]
     checked = "unknown" if error is None else f"{error:.2f} pixels from epipolar lines ({facts['matches']} matches)"
     colours = "unknown" if ratio is None else f"{ratio:.2f} from the darkest to the brightest camera"
-    stdout.print(f"{masks}, {points}; calibration: {checked}; colours: {colours}")
+    depth = f", depth images of {facts['depth']} cameras" if facts["depth"] else ""
+    stdout.print(f"{masks}, {points}{depth}; calibration: {checked}; colours: {colours}")
     for c in facts["cameras"]:
         stdout.print(f"  {_line(c)}")
     for sentence in (*facts["left_out"], *facts["missing"]):
@@ -143,6 +144,9 @@ def _line(c: dict) -> str:
     words.append(f"near {c['near']:g}, scene at {c['distance']:g}")
     if c["subject"] is not None:
         words.append(f"subject {c['subject']:.1%}")
+    if c["depth"] is not None and c["depth"]["known"]:
+        d = c["depth"]
+        words.append(f"depth {d['near']:g} to {d['far']:g} in {d['known']:.0%}")
     if c["epipolar_error"] is not None:
         words.append(f"{c['epipolar_error']:.2f} pixels off")
     if c["gain"]:

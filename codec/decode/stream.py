@@ -87,6 +87,11 @@ class Stream:
         g = self.groups[i]
         return bytes(self._data[g["offset"] : g["offset"] + g["size"]])
 
+    def sound(self, i: int) -> bytes:
+        """Samples of the sound that go with group `i`, one behind the other."""
+        offset, _, samples = self.groups[i].get("audio", (0, 0, []))
+        return bytes(self._data[offset : offset + sum(size for size, _ in samples)])
+
     def group(self, i: int):
         """Group `i`, decoded (`_native.DecodedGroup`).
 
@@ -194,13 +199,17 @@ def open_stream(path: str | Path, *, strict: bool = True, layers: int | None = N
 
     Raises:
         FileNotFoundError: nothing is there.
-        BitstreamError: it is not a .gsv file.
+        BitstreamError: it is not a .gsv file, or a folder.
     """
     path = Path(path)
+    if path.is_dir():
+        raise BitstreamError(f"{path}: a folder, expected a .gsv file")
     with open(path, "rb") as f:
         if path.stat().st_size == 0:
             raise BitstreamError(f"{path}: the file is empty, expected a .gsv stream")
         data = mmap.mmap(f.fileno(), 0, access=mmap.ACCESS_READ)
+    if len(data) >= 8 and data[4:8] != b"ftyp":
+        raise BitstreamError(f"{path}: not a .gsv file, expected it to start with an ftyp box")
     try:
         return Stream(data, str(path), strict=strict, layers=layers)
     except BitstreamError as e:

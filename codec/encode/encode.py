@@ -145,6 +145,8 @@ def encode_groups(
         raise
     if writer.groups:
         writer.finish(keep_part=report.interrupted)
+    else:
+        writer.close()
     report.frames, report.groups = writer.frames, writer.groups
     report.bytes = Path(output.path).stat().st_size if writer.groups else 0
     return report

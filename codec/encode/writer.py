@@ -132,8 +132,10 @@ class StreamWriter:
             self._forget()
 
     def close(self) -> None:
-        """Leaves the .part as it is."""
+        """Leaves the .part as it is; without a group there is nothing to go on from."""
         self._file.close()
+        if not self.groups:
+            self._forget()
 
 
 def layer_ends(units: list[dict]) -> list[int]:

@@ -82,7 +82,7 @@ class FrameFit:
         if not self._all_move:
             free = {n: g * self._moving.view(-1, *[1] * (g.dim() - 1)) for n, g in grads.items()}
         self.own.step(free, s.rates.scaled(t.radius, decay * (s.first_round_rates if first else 1.0)))
-        return result.loss - t.settings.mask_lambda * result.mask
+        return result.image_loss
 
     def _step_nodes(self, pose: Pose, by_carried: tuple, rigidity: float, decay: float) -> None:
         """One step of the nodes along the gradients by where they carry the Gaussians, and along that of rigidity."""
