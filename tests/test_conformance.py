@@ -159,6 +159,20 @@ def test_some_tiles(name):
             assert len(theirs[i].positions) < VALID[name]["groups"][i]["gaussians"]
 
 
+def test_a_missing_leading_tile_says_who_needs_it():
+    """Tile 2 is asked for, and the bytes of tile 0, from which it starts, are not there."""
+    data = (VECTORS / VALID["tiles"]["file"]).read_bytes()
+    _, (sample,) = reference.read_container(data)
+    first = next(u for u in _native.units(sample.payload) if u["type"] == "tile")
+    start, end = first["offset"], first["offset"] + first["bytes"]
+    payload = sample.payload[:start] + bytes(end - start) + sample.payload[end:]
+    said = rf"byte {start}, unit 1 \(tile 0\): .* damaged; the tiles that were asked for start from it$"
+    with pytest.raises(errors.BitstreamError, match=said):
+        _native.DecodedGroup(payload, 1, tiles=[[t == 2 for t in range(9)]])
+    with pytest.raises(reference.BitstreamError, match="unit 1: wrong CRC"):
+        reference.decode_group(payload, 1, tiles=lambda k, t: t == 2)
+
+
 def test_reference_command(tmp_path):
     name = "several_groups"
     command = [

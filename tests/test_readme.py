@@ -84,6 +84,15 @@ def test_table_of_the_player():
         assert all(map(agrees, (f.replace(",", "") for f in figures), values)), (name, figures, values)
 
 
+def test_table_of_bd_rates():
+    found = {(r["sequence"], r["anchor"]): r["percent"] for r in result("rd")["bd_rate"]}
+    table = rows("peer | what it is given")
+    assert {name for name, *_ in table} == {peer for _, peer in found}
+    for name, _, *figures in table:
+        values = [found.get((sequence, name)) for sequence in ("statue", "lumberjack")]
+        assert all(agrees(f.removesuffix(" %"), v) for f, v in zip(figures, values, strict=True)), (name, values)
+
+
 def test_bytes_before_the_first_picture():
     found = result("first_picture")["streams"]["demo, preset fast"]
     for name, text in (("after", "has received {} kB"), ("before", "({} before that")):
