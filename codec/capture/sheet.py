@@ -34,7 +34,7 @@ def contact_sheet(capture: Capture, frame: int = 0) -> np.ndarray:
     """
     cameras = [capture.camera(i, frame) for i in range(len(capture.cameras))]
     aspect = max(c.height / c.width for c in cameras)
-    columns = _columns(len(cameras), aspect)
+    columns = _columns(len(cameras), 2 * aspect if capture.has_depth else aspect)
     width = min((WIDTH - GAP) // columns - GAP, THUMBNAIL)
     height = round(width * aspect)
     shown = [_thumbnail(capture.view(i, frame), width, height) for i in range(len(cameras))]

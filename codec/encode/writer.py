@@ -132,8 +132,12 @@ class StreamWriter:
             self._forget()
 
     def close(self) -> None:
-        """Leaves the .part as it is; without a group there is nothing to go on from."""
+        """Leaves the .part as it is."""
         self._file.close()
+
+    def abandon(self) -> None:
+        """After a failure: leaves the .part, from which a later run goes on, but removes it where it has no group."""
+        self.close()
         if not self.groups:
             self._forget()
 
