@@ -67,7 +67,7 @@ def write_maps(stream: Stream, folder: Path) -> int:
                     own[f"{k} {name}"] = low
         tiles = [[t["gaussians"] for t in tiles] for tiles in decoded.tiles()]
         groups.append({"sync": g["sync"], "tiles": tiles, "planes": own} | _facts(q))
-    config = {k: v for k, v in stream.config.items() if k != "audio"}  # maps have no sound
+    config = {k: v for k, v in stream.config.items() if k not in ("audio", "track", "placement")}  # maps have none
     facts = {"format": FORMAT, "config": _plain(config), "groups": groups}
     part = folder / "maps.json.part"
     part.write_text(json.dumps(facts, indent=1))

@@ -33,13 +33,14 @@ fn config() -> Config {
         sh_frame: 1,
         cameras: vec![camera.clone(), camera],
         audio: None,
+        ..Config::default()
     }
 }
 
 /// A finished file of three groups, and the entries of its samples.
 fn file() -> (Vec<u8>, Vec<Entry>) {
     let config = config();
-    let init = init_segment(&config).unwrap();
+    let init = init_segment(std::slice::from_ref(&config)).unwrap();
     let groups = [
         (vec![1u8; 100], 20, true),
         (vec![2; 0], 1, false),
@@ -57,7 +58,7 @@ fn file() -> (Vec<u8>, Vec<Entry>) {
         fragments.extend(f);
         start += u64::from(*frames);
     }
-    let mut out = finish(&init, &config, &index).unwrap();
+    let mut out = finish(&init, &[(&config, index.clone())]).unwrap();
     let (mut end, mut start, mut entries) = (out.len() as u64, 0, Vec::new());
     for ((payload, frames, sync), r) in groups.iter().zip(&index) {
         end += r.size;
@@ -130,7 +131,7 @@ fn a_cut_file_keeps_its_whole_groups() {
 #[test]
 fn a_growing_file_has_no_index() {
     let config = config();
-    let init = init_segment(&config).unwrap();
+    let init = init_segment(std::slice::from_ref(&config)).unwrap();
     let f = fragment(b"group", 1, 40, 20, true, &config, None).unwrap();
     let d = parsed(&[&init, &f]);
     assert_eq!(d.groups().len(), 1);
@@ -165,7 +166,7 @@ fn other_files_are_named() {
     mp4[16..20].copy_from_slice(b"isom");
     assert!(message(&mp4).contains("gsv1"));
     let (bytes, _) = file();
-    let init = init_segment(&config()).unwrap();
+    let init = init_segment(&[config()]).unwrap();
     assert!(message(&[&bytes[..28], &bytes[init.len()..]].concat()).contains("moov"));
 }
 
@@ -218,7 +219,7 @@ fn frame_rates() {
 #[test]
 fn a_sample_needs_its_mdat() {
     let config = config();
-    let init = init_segment(&config).unwrap();
+    let init = init_segment(std::slice::from_ref(&config)).unwrap();
     let sound = fragment(&[7; 50], 1, 0, 20, true, &config, None).unwrap();
     let mut other = sound.clone();
     let mdat = other.len() - 54;
@@ -236,7 +237,7 @@ fn a_sample_needs_its_mdat() {
 #[test]
 fn layers_can_be_found() {
     let config = config();
-    let init = init_segment(&config).unwrap();
+    let init = init_segment(std::slice::from_ref(&config)).unwrap();
     let group = |size: u64, layers: &[u64]| Reference {
         size,
         frames: 1,
@@ -245,7 +246,7 @@ fn layers_can_be_found() {
     };
     let large = (1 << 25) + 5;
     let groups = [group(900, &[300, 300, 900]), group(50, &[]), group(large, &[7, large])];
-    let head = finish(&init, &config, &groups).unwrap();
+    let head = finish(&init, &[(&config, groups.to_vec())]).unwrap();
     let read = |head: &[u8]| {
         let mut d = Demuxer::default();
         d.push(head).unwrap();
@@ -263,7 +264,7 @@ fn layers_can_be_found() {
         d.push(&bad).unwrap();
         assert_eq!(d.index().len(), 3);
     }
-    let plain = finish(&init, &config, &groups[1..2]).unwrap();
+    let plain = finish(&init, &[(&config, groups[1..2].to_vec())]).unwrap();
     assert!(!plain.windows(4).any(|w| w == b"ssix"));
 }
 
@@ -287,7 +288,7 @@ fn sounding() -> (Vec<u8>, AudioRun) {
         samples: &samples,
         data: b"abcdefgh",
     };
-    let init = init_segment(&config).unwrap();
+    let init = init_segment(std::slice::from_ref(&config)).unwrap();
     let first = fragment(&[1; 40], 1, 0, 20, true, &config, Some(sound)).unwrap();
     let second = fragment(&[2; 10], 2, 20, 1, true, &config, None).unwrap();
     let run = AudioRun {
