@@ -8,8 +8,10 @@ use gsv::container::audio::{AudioRun, AudioTrack};
 use gsv::container::config::{Camera, Config, rate};
 use gsv::container::demux::Demuxer;
 use gsv::container::entry::Entry;
+use gsv::container::placement::{Key, Placement};
 use gsv::container::whole;
 use gsv::container::write::{Reference, Sound, finish, fragment, init_segment};
+use gsv::pose::Pose;
 use proptest::prelude::*;
 
 fn config() -> Config {
@@ -341,6 +343,116 @@ fn damaged_sound_is_named() {
                 for run in d.groups().iter().filter_map(|g| g.audio.as_ref()) {
                     assert!(run.offset + run.size() <= bytes.len() as u64);
                 }
+            }
+        }
+    }
+}
+
+/// Three tracks of two groups each, the second one placed; and the number of bytes in front of the fragments.
+fn scene() -> (Vec<u8>, usize) {
+    let pose = Pose {
+        rotation: [0.8, 0.0, 0.6, 0.0],
+        translation: [1.0, 2.0, 3.0],
+        scale: 0.5,
+    };
+    let placement = Placement {
+        name: "männlein".into(),
+        offset: -40,
+        repeats: 3,
+        keys: vec![Key { time: -7, pose }, Key { time: 9, pose }],
+        ..Placement::default()
+    };
+    let configs: Vec<Config> = (0..3)
+        .map(|track| Config {
+            track,
+            placement: if track == 1 {
+                placement.clone()
+            } else {
+                Placement::default()
+            },
+            ..config()
+        })
+        .collect();
+    let (mut fragments, mut tracks) = (Vec::new(), Vec::new());
+    for config in &configs {
+        let mut index = Vec::new();
+        for i in 0..2 {
+            let f = fragment(&[7; 60], 1, 20 * i, 20, i == 0, config, None).unwrap();
+            index.push(Reference {
+                size: f.len() as u64,
+                frames: 20,
+                sync: i == 0,
+                layers: vec![f.len() as u64 - 5, f.len() as u64],
+            });
+            fragments.extend(f);
+        }
+        tracks.push((config, index));
+    }
+    let head = finish(&init_segment(&configs).unwrap(), &tracks).unwrap();
+    ([head.as_slice(), &fragments].concat(), head.len())
+}
+
+/// Spec 2.2, 2.5 and 2.8: each track has its own groups, index, layers and placement, however the bytes come.
+#[test]
+fn tracks_are_found_apart() {
+    let (bytes, head) = scene();
+    assert_eq!(whole::tracks(&bytes[..head]).unwrap(), 3);
+    for track in 0..3 {
+        for piece in [1, bytes.len()] {
+            let mut d = Demuxer::of_track(track);
+            bytes.chunks(piece).for_each(|b| d.push(b).unwrap());
+            let fragments: Vec<u64> = d.index().iter().map(|e| e.offset + e.size).collect();
+            let ends: Vec<u64> = d.groups().iter().map(|g| g.offset + g.size).collect();
+            assert_eq!(ends, fragments);
+            assert_eq!((d.layers().len(), d.tracks(), d.complete()), (2, 3, true));
+            let placement = &d.config().unwrap().placement;
+            assert_eq!(
+                (placement.keys.len(), placement.repeats),
+                if track == 1 { (2, 3) } else { (0, 1) }
+            );
+        }
+    }
+    assert!(Demuxer::of_track(3).push(&bytes).is_err());
+}
+
+proptest! {
+    /// Damage behind the index costs no track but that in whose bytes it is.
+    #[test]
+    fn damage_stays_in_its_track(seed in any::<u64>()) {
+        let (bytes, head) = scene();
+        let mut r = Random(seed);
+        let mut bad = bytes.clone();
+        let at = head + r.below((bytes.len() - head) as u64) as usize;
+        bad[at] ^= 1 + r.below(255) as u8;
+        let mut hurt = 0;
+        for track in 0..3 {
+            let (whole, _) = whole::read(&bytes, true, track).unwrap();
+            let (saved, damage) = whole::read(&bad, false, track).unwrap();
+            let last = whole.groups().last().unwrap();
+            let first = whole.index()[0].offset as usize;
+            if !(first..(last.offset + last.size) as usize).contains(&at) {
+                prop_assert_eq!(saved.groups(), whole.groups());
+                prop_assert!(damage.is_empty());
+            } else {
+                hurt += 1;
+            }
+        }
+        prop_assert_eq!(hurt, 1);
+    }
+
+    /// No byte of moov or of an index makes a panic, in whichever track one looks.
+    #[test]
+    fn damaged_heads_never_panic(seed in any::<u64>()) {
+        let (mut bytes, head) = scene();
+        let mut r = Random(seed);
+        for _ in 0..1 + r.below(4) {
+            let at = r.below(head as u64) as usize;
+            bytes[at] = r.next() as u8;
+        }
+        for track in 0..3 {
+            if let Ok((d, _)) = whole::read(&bytes, false, track) {
+                let pose = d.config().map_or(Pose::default(), |c| c.placement.pose(r.below(99) as f64 - 50.0));
+                prop_assert!(pose.scale > 0.0 && pose.rotation.iter().all(|v| v.is_finite()));
             }
         }
     }
