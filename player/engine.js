@@ -11,6 +11,7 @@ import { ALL, AUTO, Native, load } from "./native.js";
 import { LayerChoice } from "./layers.js";
 import { Renderer } from "./renderer.js";
 import { Source } from "./source.js";
+import { Scene, placed } from "./tracks.js";
 import { joined, order, share, sharing } from "./tiles.js";
 
 const AHEAD = 10; // seconds of payloads to fetch ahead
@@ -42,21 +43,25 @@ export class Engine extends EventTarget {
   #asked = new Map(); // id -> {resolve, reject} of a request
   #requests = 0;
 
-  // canvas: null if nothing is to be drawn
-  constructor(canvas, src) {
+  scene = null; // of the tracks of a file that has several, or a placed one
+
+  // canvas: null if nothing is to be drawn; track: which one of the file; host: the engine of the first one, which draws this
+  // one, too
+  constructor(canvas, src, { track = 0, host = null } = {}) {
     super();
-    this.source = /\.mpd($|[?#])/.test(src) ? new AdaptiveSource(src) : new Source(src);
+    this.host = host;
+    this.source = /\.mpd($|[?#])/.test(src) ? new AdaptiveSource(src) : new Source(src, track);
     this.source.addEventListener("received", ({ detail: { bytes, ms } }) => {
       if (bytes > 20_000) this.stats.link = (8e-3 * bytes) / ms;
     });
     const cores = navigator.hardwareConcurrency || 2;
     const count = canvas ? Math.min(Math.max(cores - 1, 2), RASTER_WORKERS_MAX) : 0;
-    this.#rasters = Array.from({ length: count }, () => start());
+    this.#rasters = host ? host.#rasters : Array.from({ length: count }, () => start());
     this.shares = Math.min(cores, SHARES_MAX);
     this.#sets.forEach((set) => set.push(start()));
     const divide = (load) => this.source.native.divide(load, count);
     const say = (type, detail) => this.#say(type, detail);
-    this.renderer = new Renderer(canvas, { rasters: count, stats: this.stats, divide, say });
+    this.renderer = host?.renderer ?? new Renderer(canvas, { rasters: count, stats: this.stats, divide, say });
   }
 
   #say(type, detail) {
@@ -65,14 +70,18 @@ export class Engine extends EventTarget {
 
   // Resolves when the config and the first groups are known.
   async open() {
-    const module = load(new URL("./native.wasm.gz", import.meta.url)); // while the first bytes of the file are on their way
-    module.then((m) => this.closed || this.#connect(m), () => {});
-    await this.source.open(async () => Native.create(await module));
+    this.loading = this.host?.loading ?? load(new URL("./native.wasm.gz", import.meta.url)); // while the first bytes of the file are on their way
+    this.loading.then((m) => this.closed || this.#connect(m), () => {});
+    await this.source.open(async () => Native.create(await this.loading));
+    if (this.#rasters.length && !this.host && (this.source.tracks > 1 || placed(this.source.config))) {
+      this.scene = new Scene(this, (track) => new Engine(null, this.source.url, { track, host: this }));
+      await this.scene.open((type, detail) => this.#say(type, detail));
+    }
   }
 
   #connect(module) {
     this.#module = module;
-    this.#rasters.forEach((worker) => {
+    (this.host ? [] : this.#rasters).forEach((worker) => {
       worker.onmessage = ({ data }) => this.renderer.onRaster(worker, data);
       worker.onerror = (e) => this.#dead(e);
       worker.postMessage({ role: "raster", module });
@@ -98,8 +107,10 @@ export class Engine extends EventTarget {
     this.closed = true;
     this.source.close();
     for (const g of this.groups.values()) g.abort?.abort();
-    for (const w of [...this.#sets.flat(), ...this.#rasters]) w.terminate();
+    for (const w of [...this.#sets.flat(), ...(this.host ? [] : this.#rasters)]) w.terminate();
     for (const { reject } of this.#asked.values()) reject(new Error("the stream was closed"));
+    if (this.host) return;
+    this.scene?.close();
     this.renderer.close();
   }
 
@@ -118,9 +129,17 @@ export class Engine extends EventTarget {
 
   // Requests the image of frame t, whose group is decoded.
   draw(t, view) {
-    const { header, pieces } = this.groups.get(this.groupOf(t));
-    const how = this.renderer.begin({ t, view, gaussians: header.gaussians, pieces }, this.source.config.background);
-    this.#post(t, (piece) => ({ ...how, view, piece, pieces }));
+    const parts = this.scene?.parts(t) ?? [{ engine: this, t }];
+    const shown = parts.map((part) => part.engine.groups.get(part.engine.groupOf(part.t)));
+    const pieces = shown.reduce((n, group) => n + group.pieces, 0);
+    const gaussians = shown.reduce((n, group) => n + group.header.gaussians, 0);
+    const how = this.renderer.begin({ t, view, gaussians, pieces }, this.source.config.background);
+    let first = 0;
+    parts.forEach(({ engine, t: own, pose }, i) => {
+      const from = first;
+      engine.#post(own, (piece) => ({ ...how, view, pose, piece: from + piece, pieces }));
+      first += shown[i].pieces;
+    });
   }
 
   // Resolves with the answer of the workers that have the group of frame t, which is decoded.
@@ -185,6 +204,7 @@ export class Engine extends EventTarget {
   show(layers) {
     if (layers === this.layers) return;
     this.layers = layers;
+    this.scene?.show(layers);
     this.forget();
   }
 

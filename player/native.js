@@ -69,6 +69,17 @@ export class Native {
     return JSON.parse(this.text());
   }
 
+  // Reads track `number` of the file from now on.
+  track(number) {
+    this.x.track(number);
+  }
+
+  // The transform of the track at time u of the scene, in units of its timescale: rotation (wxyz), translation, scale.
+  pose(u) {
+    this.x.pose(u);
+    return Array.from(this.floats());
+  }
+
   // Groups
 
   // reference: the slot of the reference of a predicted group; layers: number to decode; wanted: flags of the tiles to decode,
@@ -101,6 +112,12 @@ export class Native {
 
   frame(slot, t) {
     this.check(this.x.frame(slot, t));
+  }
+
+  // Places the evaluated frame by a transform; with a scale of 0 nothing is shown.
+  place(pose) {
+    this.#floats(pose);
+    this.x.place();
   }
 
   // An attribute of the evaluated frame: 0 means, 1 quats, 2 log scales, 3 logit opacities, 4 sh0, 5 shN.

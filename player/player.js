@@ -108,7 +108,7 @@ export class GsvPlayer extends HTMLElement {
   }
 
   get frameCount() {
-    return this.engine?.source?.frameCount ?? 0;
+    return this.engine?.scene?.frameCount ?? this.engine?.source?.frameCount ?? 0;
   }
 
   get fps() {
@@ -153,7 +153,7 @@ export class GsvPlayer extends HTMLElement {
     this.$(".error").hidden = true;
     this.$(".notes").replaceChildren();
     this.$(".busy").hidden = false;
-    Object.assign(this, { camera: null, paused: true, shown: null });
+    Object.assign(this, { camera: null, header: null, paused: true, shown: null });
     [this.#position, this.#scale, this.#drawn] = [0, null, ""];
     const engine = (this.engine = new Engine(this.$("canvas"), this.getAttribute("src")));
     engine.layers = this.#layers;
@@ -173,6 +173,7 @@ export class GsvPlayer extends HTMLElement {
       this.#request = requestAnimationFrame(() => this.#tick());
       await engine.open();
       if (this.engine !== engine) return;
+      if (engine.scene && this.header) this.#begin(engine, this.header);
       if (source.config.audio) this.#hear(engine);
       if (source.missing) {
         const all = this.frameCount + source.missing;
@@ -210,7 +211,9 @@ export class GsvPlayer extends HTMLElement {
   // The first group is decoded.
   #begin(engine, header) {
     this.header = header;
-    if (this.camera) return;
+    const { scene } = engine;
+    if (this.camera || (scene && !scene.ready(0))) return;
+    this.#list(scene);
     const layers = this.$("[data-set=layers]");
     layers.hidden = header.layers < 2;
     const choices = Array.from({ length: header.layers - 1 }, (_, k) => new Option(`${k + 1} of ${header.layers} layers`, k + 1));
@@ -219,7 +222,7 @@ export class GsvPlayer extends HTMLElement {
     const { config } = engine.source;
     const color = /^#?([0-9a-f]{6})$/i.exec(this.getAttribute("background") ?? "")?.[1];
     if (color) config.background = [0, 2, 4].map((i) => parseInt(color.slice(i, i + 2), 16) / 255);
-    this.camera = new Camera(engine.bounds, config.up, config.cameras);
+    this.camera = new Camera(scene?.bounds(0) ?? engine.bounds, config.up, config.cameras);
     this.camera.use(config.cameras.findIndex((c) => c.name === this.getAttribute("camera")));
     const select = this.$("[data-set=view]");
     select.replaceChildren(new Option("Free view", "orbit"), ...config.cameras.map((c, i) => new Option(c.name, i)));
@@ -242,16 +245,18 @@ export class GsvPlayer extends HTMLElement {
     const passed = this.sound?.passed() ?? Math.min(now - this.#last, 250) / 1000;
     this.#last = now;
     if (!engine?.source?.groups.length || !this.$(".error").hidden) return;
+    const { scene } = engine;
     let group = engine.groupOf(this.frame);
-    if (engine.failed.has(group)) group = this.#passOver(group);
+    if (!scene && engine.failed.has(group)) group = this.#passOver(group);
     if (group === null) return;
-    engine.want(group, this.#loops);
-    const ready = engine.ready(group) && this.camera;
+    if (scene) scene.want(this.frame, this.#loops);
+    else engine.want(group, this.#loops);
+    const decoded = () => (scene ? scene.ready(this.frame) : engine.ready(engine.groupOf(this.frame)));
+    const ready = (scene ? decoded() : engine.ready(group)) && this.camera;
     if (ready && !this.paused) this.#advance(passed);
     this.sound?.follow(this.#position, ready && !this.paused, this.#loops);
-    const shown = engine.groupOf(this.frame);
-    if (ready && engine.ready(shown) && engine.renderer.free) this.#draw(now);
-    this.#wait(now, ready && engine.ready(shown));
+    if (ready && decoded() && engine.renderer.free) this.#draw(now);
+    this.#wait(now, ready && decoded());
     this.#follow(now);
   }
 
@@ -476,7 +481,24 @@ export class GsvPlayer extends HTMLElement {
 
   // Actions
 
-  #set({ dataset, value }) {
+  // The list of the tracks of a scene, which show and hide them.
+  #list(scene) {
+    this.$(".tracks").hidden = !(scene?.tracks.length > 1);
+    this.$(".tracks").replaceChildren(...(scene?.tracks ?? []).map(({ name, hidden }, i) => {
+      const [label, box] = [document.createElement("label"), document.createElement("input")];
+      Object.assign(box, { type: "checkbox", checked: !hidden });
+      box.dataset.track = i;
+      label.append(box, name);
+      return label;
+    }));
+  }
+
+  #set({ dataset, value, checked }) {
+    if (dataset.track) {
+      this.engine.scene.tracks[dataset.track].hidden = !checked;
+      [this.#drawn, this.#moved] = ["", performance.now()];
+      return this.#grown();
+    }
     if (dataset.set === "view") {
       if (value === "orbit") this.camera.reset();
       else this.camera.use(Number(value));

@@ -61,15 +61,18 @@ function groupWorker(native, { ports }) {
     return { type: "decoded", group, header, ms: performance.now() - start };
   }
 
-  function evaluate(group, t) {
-    if (shown === `${group} ${t}`) return;
+  // pose: of the track, see tracks.js; without one it is where it was made.
+  function evaluate(group, t, pose) {
+    const what = `${group} ${t} ${pose}`;
+    if (shown === what) return;
     native.frame(slots.get(group), t);
-    shown = `${group} ${t}`;
+    if (pose) native.place(pose);
+    shown = what;
   }
 
-  function draw({ id, group, t, view, background, ends, piece, pieces }) {
+  function draw({ id, group, t, pose, view, background, ends, piece, pieces }) {
     const start = performance.now();
-    evaluate(group, t);
+    evaluate(group, t, pose);
     const { bands, load } = native.project(view, ports.length, ({ i, bands, first, rows, splats }) => {
       let buffer = spare[i].pop();
       if (!buffer || buffer.byteLength < splats.length) buffer = new ArrayBuffer(Math.ceil(splats.length * 1.2));
@@ -80,9 +83,9 @@ function groupWorker(native, { ports }) {
     return { type: "projected", id, bands, load, ms: performance.now() - start };
   }
 
-  function pack({ id, group, t, view, origin, all, piece }) {
+  function pack({ id, group, t, pose, view, origin, all, piece }) {
     const start = performance.now();
-    evaluate(group, t);
+    evaluate(group, t, pose);
     const { buffer } = native.pack(view, origin, all).slice();
     self.postMessage({ type: "packed", id, piece, buffer, ms: performance.now() - start }, [buffer]);
   }

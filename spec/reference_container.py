@@ -156,6 +156,19 @@ class Config:
     track_id: int = 0
     defaults: dict = field(default_factory=dict)  # of trex: duration, size, flags
     audio: "Audio | None" = None
+    placement: "Placement" = field(default_factory=lambda: Placement())
+    tracks: int = 1  # gsv tracks of the file
+
+
+@dataclass
+class Placement:
+    """gsvT (clause 2.8)."""
+
+    hidden: bool = False
+    name: str = ""
+    offset: int = 0
+    repeats: int = 1
+    keys: list = field(default_factory=list)  # (time, rotation [4], translation [3], scale)
 
 
 @dataclass
@@ -180,8 +193,8 @@ class Sample:
     audio: tuple | None = None  # (media time, [(size, duration)], bytes)
 
 
-def read_container(data):
-    """Clause 2: bytes of a file -> (Config, [Sample])."""
+def read_container(data, track=0):
+    """Clause 2: bytes of a file -> (Config, [Sample]) of one of its gsv tracks."""
     config, pending, samples, first = None, [], [], True
     require(
         len(data) < 8 or data[4:8] == b"ftyp", f"the first box is {bytes(data[4:8])!r}, expected ftyp: not a gsv file"
@@ -192,7 +205,7 @@ def read_container(data):
             read_ftyp(data, body, end)
         elif kind == b"moov":
             require(config is None, f"second moov at byte {offset}")
-            config = read_moov(data, box)
+            config = read_moov(data, box, track)
         elif kind == b"moof":
             require(config is not None, f"moof at byte {offset} before moov")
             require(not pending, f"moof at byte {offset}: the mdat of the one before is missing")
@@ -225,16 +238,23 @@ def tracks(data, moov, handler):
             yield trak
 
 
-def read_moov(data, moov):
-    """Clause 2.2: the first track of handler `volv`, and the audio track."""
-    trak = next(tracks(data, moov, b"volv"), None)
-    require(trak is not None, "moov: no track with handler volv")
+def read_moov(data, moov, track):
+    """Clause 2.2: a track of handler `volv`, and with the first one the audio track."""
+    found = list(tracks(data, moov, b"volv"))
+    if len(found) > 64:
+        raise LimitError(f"moov: {len(found)} tracks, at most 64 are allowed")
+    require(track < len(found), f"moov: no track {track} with handler volv, found {len(found)}")
+    trak = found[track]
     track_id, timescale = read_timed(data, trak, [b"tkhd"]), read_timed(data, trak, [b"mdia", b"mdhd"])
     require(timescale > 0, "mdhd: timescale is 0")
     config = read_sample_entry(data, trak)
     config.track_id, config.timescale = track_id, timescale
     config.defaults = read_defaults(data, moov, track_id)
-    config.audio = read_audio_track(data, moov)
+    config.tracks = len(found)
+    for other in found:
+        own = read_timed(data, other, [b"tkhd"]) if other is not trak and find_box(data, other, [b"tkhd"]) else None
+        require(own != track_id, f"tkhd: two tracks have the track_ID {track_id}")
+    config.audio = read_audio_track(data, moov) if track == 0 else None
     return config
 
 
@@ -287,7 +307,29 @@ def read_sample_entry(data, trak):
     require(entry is not None, "stsd: no sample entry gsv1")
     Reader(data, entry[2], entry[3], "gsv1").take(40)
     kind, offset, body, end = entry
-    return read_gsvc(open_box(data, (kind, offset, body + 40, end), [b"gsvC"]))
+    inside = (kind, offset, body + 40, end)
+    config = read_gsvc(open_box(data, inside, [b"gsvC"]))
+    if find_box(data, inside, [b"gsvT"]):
+        config.placement = read_gsvt(open_box(data, inside, [b"gsvT"]))
+    return config
+
+
+def read_gsvt(r):
+    """Clause 2.8."""
+    flags, name = r.u8(), r.take(r.u8())
+    try:
+        name = name.decode()
+    except UnicodeDecodeError:
+        raise BitstreamError(f"gsvT: track name {name!r} is not UTF-8, expected track names in UTF-8") from None
+    offset, repeats, keys = r.i32(), r.u32(), []
+    for _ in range(r.u16()):
+        time, rotation = r.i32(), np.array([r.f32("rotation") for _ in range(4)])
+        length = (rotation**2).sum()
+        require(0.998 <= length <= 1.002, f"gsvT: a rotation whose squared length is {length}, expected 0.998 to 1.002")
+        translation, scale = np.array([r.f32("translation") for _ in range(3)]), r.f32("scale", positive=True)
+        require(not keys or time > keys[-1][0], f"gsvT: time {time}, expected keys in the order of their times")
+        keys.append((time, rotation / np.sqrt(length), translation, scale))
+    return Placement(bool(flags & 1), name, offset, repeats, keys)
 
 
 def read_gsvc(r):

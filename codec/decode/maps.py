@@ -72,7 +72,7 @@ def write_maps(stream: Stream, folder: Path) -> int:
         _, time, samples = g.get("audio", (0, 0, []))
         sound = {"time": time, "samples": samples}
         groups.append({"sync": g["sync"], "tiles": tiles, "planes": own, "sound": sound} | _facts(q))
-    config = dict(stream.config)
+    config = {k: v for k, v in stream.config.items() if k not in ("track", "placement")}  # maps have none
     if audio := config.get("audio"):
         config["audio"] = audio | {"entry": audio["entry"].hex()}
         _write(folder / SOUND, b"".join(stream.sound(i) for i in range(len(stream.groups))))

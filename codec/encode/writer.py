@@ -124,7 +124,7 @@ class StreamWriter:
         os.truncate(self.part, self.bytes)  # Ctrl-C may have come in the middle of a fragment
         indexed = self.out.with_name(self.out.name + ".indexed")
         with open(self.part, "rb") as source, open(indexed, "wb") as target:
-            target.write(_native.finish(self.init, self.fragments))
+            target.write(_native.finish(self.init, [self.fragments]))
             source.seek(len(self.init))
             shutil.copyfileobj(source, target, 1 << 20)
         os.replace(indexed, self.out)

@@ -10,6 +10,7 @@ use gsv::group::Group;
 use gsv::header::Header;
 use gsv::levels::{LEVELS, Level};
 use gsv::parametric::Frame;
+use gsv::pose::Pose;
 use gsv::unit;
 use raster::{Background, Band, Bands, Projected, Rasterizer, Region, SimdLevel, Splats, Surface, View, band_ends};
 use std::fmt::Display;
@@ -151,6 +152,26 @@ impl Player {
             }
         }
         true
+    }
+
+    pub fn pose(&mut self, u: f64) {
+        let pose = self.demuxer.config().map_or(Pose::default(), |c| c.placement.pose(u));
+        let ([w, x, y, z], [a, b, c]) = (pose.rotation, pose.translation);
+        self.output = floats(&[w, x, y, z, a, b, c, pose.scale]);
+    }
+
+    pub fn place(&mut self) {
+        let [w, x, y, z, a, b, c, scale] = *numbers(&self.input).first_chunk().unwrap_or(&[0.0; 8]);
+        if scale > 0.0 {
+            let pose = Pose {
+                rotation: [w, x, y, z],
+                translation: [a, b, c],
+                scale,
+            };
+            pose.apply(self.frame.as_mut());
+        } else {
+            self.frame.logit_opacities.fill(f32::NEG_INFINITY); // the projection leaves them out
+        }
     }
 
     pub fn bounds(&mut self) {

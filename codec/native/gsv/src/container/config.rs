@@ -1,6 +1,7 @@
 //! gsvC (spec 2.3) and the frame rate: the configuration of the whole file.
 
 use super::audio::AudioTrack;
+use super::placement::Placement;
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader, Writer};
 use crate::levels::Level;
@@ -56,6 +57,10 @@ pub struct Config {
     pub cameras: Vec<Camera>,
     /// Not in gsvC: a track of its own (spec 2.7).
     pub audio: Option<AudioTrack>,
+    /// Which of the gsv tracks of the file this is. Not in gsvC.
+    pub track: usize,
+    /// gsvT.
+    pub placement: Placement,
 }
 
 impl Config {
@@ -127,18 +132,7 @@ fn choice<F: Fields>(f: &mut F, v: &mut u8, count: usize, what: &str) -> Result<
 }
 
 fn camera<F: Fields>(f: &mut F, c: &mut Camera) -> Result<()> {
-    let mut name = std::mem::take(&mut c.name).into_bytes();
-    let mut length = name.len() as u8;
-    f.must(usize::from(length) == name.len(), || {
-        "camera names of at most 255 bytes".into()
-    })?;
-    f.u8(&mut length)?;
-    name.resize(usize::from(length), 0);
-    f.bytes(&mut name)?;
-    match String::from_utf8(name) {
-        Ok(name) => c.name = name,
-        Err(_) => return f.fail("camera names in UTF-8".into()),
-    }
+    f.text(&mut c.name, "camera names")?;
     f.u32(&mut c.width)?;
     f.u32(&mut c.height)?;
     f.must(c.width > 0 && c.height > 0, || "cameras of at least one pixel".into())?;
