@@ -1,4 +1,4 @@
-"""The page with a scene of several tracks: the picture is that of the renderer, the list hides, damage stays in its track."""
+"""The page with a scene of several tracks: its picture is that of the renderer, the list hides, damage stays put."""
 
 import dataclasses
 

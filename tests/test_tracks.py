@@ -283,6 +283,10 @@ def test_sound_of_a_scene(parts, tmp_path):
         assert a["audio"][1:] == b["audio"][1:]
         assert before.bytes_at(a["audio"][0], 50) == after.bytes_at(b["audio"][0], 50)
     assert "that of loud is left out" in run("mux", parts / "man.gsv", tmp_path / "loud.gsv", "-o", tmp_path / "b.gsv")
+    assert "which is dropped" in run("edit", tmp_path / "a.gsv", "-o", tmp_path / "b.gsv", "--drop", "loud")
+    silent = run("edit", tmp_path / "loud.gsv", parts / "man.gsv", "-o", tmp_path / "b.gsv")
+    assert "which is left out" in silent
+    assert "audio" not in open_stream(tmp_path / "b.gsv").config
     run("edit", tmp_path / "a.gsv", "-o", tmp_path / "c.gsv", "--frames", "loud=15:30", "--frames", "man=0:4")
     (cut,) = open_scene(tmp_path / "c.gsv").tracks[0].stream.groups
     rate = after.config["audio"]["timescale"]

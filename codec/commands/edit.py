@@ -50,5 +50,10 @@ def edit(
     for i, own in ranges.items():
         plans[i] = plans[i].cut(own)
     dropped = {find(first.tracks, name) for name in drop or ()}
-    size = write_tracks(out, [p for i, p in enumerate(plans) if i not in dropped])
-    stdout.print(f"{out}: {len(plans) - len(dropped)} tracks, {size} bytes")
+    kept = [p for i, p in enumerate(plans) if i not in dropped]
+    size = write_tracks(out, kept)
+    if kept[0].has_sound and "audio" not in kept[0].config:
+        stdout.print("the files to join have sound of different forms, which is left out")
+    elif 0 in dropped and plans[0].has_sound:
+        stdout.print("the sound goes with the first track, which is dropped")
+    stdout.print(f"{out}: {len(kept)} tracks, {size} bytes")

@@ -37,9 +37,15 @@ def mux(
         if names.count(name) > 1:
             raise UsageError(f"two tracks are named {name!r}; name them: gscodec mux left=a.gsv right=b.gsv -o c.gsv")
     scene = place(Scene(tracks, str(out)), track)
-    dropped = [t.placement.name for t in scene.tracks[1:] if "audio" in t.stream.config]
-    if dropped:
-        stdout.print(f"a scene has the sound of its first track; that of {', '.join(dropped)} is left out")
-    size = write_tracks(out, [TrackPlan.of(t) for t in scene.tracks])
+    plans = [TrackPlan.of(t) for t in scene.tracks]
+    for plan in plans[1:]:
+        name, up = plan.placement.name, plan.config["up"]
+        if up != plans[0].config["up"]:
+            stdout.print(
+                f"up is {up} in {name} and {plans[0].config['up']} in the scene; --track {name}:turn=X,Y,Z turns it"
+            )
+        if plan.has_sound:
+            stdout.print(f"a scene has the sound of its first track; that of {name} is left out")
+    size = write_tracks(out, plans)
     names = [t.placement.name for t in scene.tracks]
     stdout.print(f"{out}: {', '.join(names)}; {scene.frame_count} frames, {size} bytes")

@@ -38,6 +38,11 @@ class TrackPlan:
     placement: Placement
     groups: Sequence[tuple[Stream, int]]
 
+    @property
+    def has_sound(self) -> bool:
+        """Whether sound comes with its groups."""
+        return any("audio" in stream.groups[i] for stream, i in self.groups)
+
     @staticmethod
     def of(track: Track) -> TrackPlan:
         """A track of a file as it is."""

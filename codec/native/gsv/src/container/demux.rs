@@ -150,6 +150,13 @@ impl Demuxer {
         self.groups.truncate(i);
     }
 
+    /// Drops what claims to be a group of the track, but lies among the fragments of others.
+    pub fn drop_strays(&mut self) {
+        if let (Some(first), Some(end), 2..) = (self.index.first(), self.end, self.tracks()) {
+            self.groups.retain(|g| (first.offset..end).contains(&g.offset));
+        }
+    }
+
     /// Continues at the fragment that starts at `position`, the offset of the next byte to `push`.
     pub fn seek(&mut self, position: u64) {
         self.state = State::Head;

@@ -24,6 +24,9 @@ pub fn read(data: &[u8], strict: bool, track: usize) -> Result<(Demuxer, Vec<(us
     let (mut at, mut tried, mut damage) = (0, None, Vec::new());
     loop {
         let walked = walk(&mut demuxer, data, at);
+        if !strict {
+            demuxer.drop_strays();
+        }
         if demuxer.config().is_none() {
             return Err(walked.err().unwrap_or_else(|| no_moov(data)));
         }
