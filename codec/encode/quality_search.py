@@ -2,9 +2,10 @@
 
 What counts is the error against the pictures of the capture, so that a clean capture gets finer steps than a noisy one:
 that of a try over that of the model before coding, or over that of very fine steps, whichever is smaller. Refinement by
-the pictures lowers the error of fine steps below the model's, and would hide what coarse ones cost. The excess of the
-squared error falls by 4 for `QUALITY_HALVES` points of quality, so that a few tries find it. A try is refined by a
-share of the pictures that the group will be refined by in the end, and the first group decides for all.
+the pictures lowers the error of fine steps below the model's, and would hide what coarse ones cost. The log of the
+excess falls with the quality: by that of 4 for `QUALITY_HALVES` points as a first guess (refined steps lose less), and
+between two tries on either side along their line. A try is refined by a share of the pictures that the group will be
+refined by in the end, and the first group decides for all.
 """
 
 from __future__ import annotations
@@ -27,21 +28,30 @@ def choose_quality(coder: GroupCoder, group: ParametricGroup, importance: Import
     Raises:
         CaptureError: a picture cannot be read.
     """
-    s, quality = coder.settings.quality_search, coder.settings.quality_search.start
+    s = coder.settings.quality_search
     wanted = 10 ** (coder.settings.loss / 10) - 1
-    tried: dict[float, float] = {}
     least = min(_errors(coder, group, importance, s.finest, first_frame))
-    while len(tried) < s.tries:
+    tried: dict[float, float] = {}  # quality -> log of the excess over the wanted one
+    quality = s.start
+    while len(tried) < s.tries and quality not in tried:
         model, decoded = _errors(coder, group, importance, quality, first_frame)
         excess = decoded / max(min(model, least), 1e-12) - 1
-        tried[quality] = abs(math.log(max(excess, 1e-6) / wanted))
-        if tried[quality] < s.tolerance:
+        tried[quality] = math.log(max(excess, s.excess_min) / wanted)
+        if abs(tried[quality]) < s.tolerance:
             break
-        step = QUALITY_HALVES * math.log(max(excess, s.excess_min) / wanted, 4)
-        quality = min(max(quality + step, s.lowest), s.highest)
-        if quality in tried:
-            break
-    return min(tried, key=lambda q: tried[q])
+        quality = min(max(_next(tried), s.lowest), s.highest)
+    return min(tried, key=lambda q: abs(tried[q]))
+
+
+def _next(tried: dict[float, float]) -> float:
+    """The quality to try next."""
+    coarse = max((q for q, log_excess in tried.items() if log_excess > 0), default=None)
+    fine = min((q for q, log_excess in tried.items() if log_excess <= 0), default=None)
+    if coarse is None or fine is None:
+        quality = fine if coarse is None else coarse
+        return quality + QUALITY_HALVES * tried[quality] / math.log(4)
+    share = tried[coarse] / (tried[coarse] - tried[fine])
+    return coarse + (fine - coarse) * share
 
 
 def _errors(
