@@ -4,19 +4,21 @@
 //                                                                 \--visible Gaussians--> GPU, on a canvas above
 //                                                                 \--an answer--> `ask`, for scenes of other programs
 //
-// A group of many tiles is shared by the workers of a set: each decodes and keeps its tiles alone, and nothing is copied.
+// A group of many tiles is shared by the workers of a set: each decodes and keeps its tiles alone, and nothing is copied. Of a
+// large group only the tiles in view are fetched and decoded, and others when the view comes to them (parts.js).
 
 import { AdaptiveSource } from "./abr.js";
 import { ALL, AUTO, Native, load } from "./native.js";
 import { LayerChoice } from "./layers.js";
 import { Renderer } from "./renderer.js";
 import { Source } from "./source.js";
-import { joined, order, share, sharing } from "./tiles.js";
+import { Whole, joined, order, sharing } from "./tiles.js";
 
 const AHEAD = 10; // seconds of payloads to fetch ahead
 const SETS = 2; // of group workers
 const SHARES_MAX = 4; // workers of a set; the others start when a group has tiles for them
 const RASTER_WORKERS_MAX = 8;
+const PIECES_MAX = 100; // of a group in a worker, see SLOTS of player.rs
 
 // A script from another origin cannot be a worker, but a worker may import it. Bundlers know a worker by these words, and
 // are to leave `script` alone.
@@ -30,8 +32,12 @@ function start(script = "./worker.js") {
 }
 
 export class Engine extends EventTarget {
-  groups = new Map(); // group -> {state: fetching | decoding | ready, set, pieces, left, header, layers, abort}
-  // set: workers that hold it; pieces: how many of them do; left: how many of these still decode; order: see tiles.js
+  // bytes of a group, or of the one that it is predicted from, above which only its tiles in view are fetched and decoded
+  static partly = 1 << 20;
+  groups = new Map(); // group -> {state: fetching | decoding | ready, set, pieces, left, header, layers, abort, content, flags}
+  // set: workers that hold it; pieces: how many of them do; left: what these have yet to decode; order: see tiles.js; content: a
+  // Whole or Parts; of Parts flags: tiles that were asked for, orders: how often
+  view = null; // () => what is to be seen: a view of the renderer, null for all; without it large groups are decoded whole, too
   failed = new Map(); // group -> message
   layers = AUTO; // number of layers of each group to fetch and draw
   choice = new LayerChoice();
@@ -118,8 +124,9 @@ export class Engine extends EventTarget {
 
   // Requests the image of frame t, whose group is decoded.
   draw(t, view) {
-    const { header, pieces } = this.groups.get(this.groupOf(t));
-    const how = this.renderer.begin({ t, view, gaussians: header.gaussians, pieces }, this.source.config.background);
+    const { header, pieces, flags } = this.groups.get(this.groupOf(t));
+    const image = { t, view, gaussians: header.gaussians, pieces, divided: pieces > 1 || flags !== null };
+    const how = this.renderer.begin(image, this.source.config.background);
     this.#post(t, (piece) => ({ ...how, view, piece, pieces }));
   }
 
@@ -164,6 +171,11 @@ export class Engine extends EventTarget {
     return this.groups.get(i)?.state === "ready";
   }
 
+  // Gaussians of group i that are there.
+  gaussians(i) {
+    return this.groups.get(i)?.header?.gaussians ?? 0;
+  }
+
   // Starts decoding group i, then the next one, then fetching those after it; releases all others.
   want(i, loop) {
     const { groups } = this.source;
@@ -173,6 +185,7 @@ export class Engine extends EventTarget {
     if (next !== null) decoded.push(next);
     for (const [k, g] of this.groups) {
       if (!decoded.includes(k)) this.#release(k, g);
+      else if (g.flags && g.state === "ready" && !g.left) this.#grow(k, g);
     }
     const busy = [...this.groups.values()].filter((g) => g.state !== "ready").length;
     if (!this.groups.has(i)) {
@@ -195,7 +208,7 @@ export class Engine extends EventTarget {
 
   // Gives a group up, unless it is being decoded.
   #release(k, g) {
-    if (g.state === "decoding") return;
+    if (g.state === "decoding" || g.left > 0) return;
     g.abort?.abort(new DOMException("not needed any more", "AbortError"));
     g.set?.forEach((worker) => worker.postMessage({ type: "release", group: k }));
     this.groups.delete(k);
@@ -230,48 +243,84 @@ export class Engine extends EventTarget {
     if (this.failed.has(i)) return;
     const abort = new AbortController();
     const layers = this.#layersOf(i);
-    const entry = { state: "fetching", layers, abort };
+    const entry = { state: "fetching", layers, abort, left: 0, flags: null };
     this.groups.set(i, entry);
     try {
-      const payload = await this.source.payload(i, abort.signal, layers);
-      const reference = await this.#reference(i, payload, abort.signal, layers);
+      const content = (entry.content = await this.#fetch(i, layers, abort.signal));
+      if (content.seen) {
+        if (!this.bounds) this.#say("bounds", (this.bounds = content.bounds)); // who hears it knows the view
+        entry.flags = content.seen(this.view(), layers);
+        await content.fetch(entry.flags, layers, abort.signal);
+      }
       if (this.groups.get(i) !== entry) return;
       // the idle set, else the one that holds fewer groups
       const held = (set) => [...this.groups.values()].reduce((n, g) => n + (g.set !== set ? 0 : g.state === "ready" ? 1 : 9), 0);
       entry.set = this.#sets.reduce((a, b) => (held(b) < held(a) ? b : a));
       entry.state = "decoding";
-      this.#share(i, entry, payload, reference);
+      entry.pieces = sharing(content.index, layers, this.shares);
+      entry.order = order(content.index, layers, entry.pieces);
+      this.#share(i, entry, entry.flags);
     } catch (e) {
       if (this.groups.get(i) !== entry || abort.signal.aborted) return;
       this.#fail(i, e.message);
     }
   }
 
-  // Gives the tiles of group i to the workers of its set.
-  #share(i, entry, payload, reference) {
-    const { native } = this.source;
-    const { set, layers } = entry;
-    const index = native.index(payload, reference?.payload);
-    const n = (entry.pieces = entry.left = sharing(index, layers, this.shares));
-    entry.order = order(index, layers, n);
-    const before = reference && n > 1 ? native.index(reference.payload) : null;
+  // Gives the tiles of group i with flags, all if null, to the workers of its set; more: to those that have others already.
+  #share(i, entry, flags, more = false) {
+    const { set, layers, content, pieces: n } = entry;
     const [level, bounds] = [this.source.level(i), !this.bounds];
     for (let k = 0; k < n; k++) {
       if (!set[k]) this.#join((set[k] = start()));
-      const wanted = n > 1 ? share(index, k, n) : null;
-      const own = before ? { ...reference, key: `${reference.key}, ${k} of ${n}`, wanted: share(before, k, n) } : reference;
-      set[k].postMessage({ type: "decode", group: i, payload, level, layers, reference: own, wanted, bounds });
+      for (const order of content.orders(flags, layers, k, n, more)) {
+        set[k].postMessage({ type: "decode", group: i, level, layers, bounds, ...order });
+        entry.left++;
+      }
     }
+    entry.orders = (entry.orders ?? 0) + entry.left;
   }
 
-  // {key, payload} of the reference of a predicted group; null if group i is independent.
-  async #reference(i, payload, signal, layers) {
-    const back = this.source.native.reference(payload);
-    if (!back) return null;
-    const r = i - back;
-    if (r < 0 || this.source.groups[i].sync) throw new Error("it refers to a group that is not in the file");
-    const bytes = await this.source.payload(r, signal, layers);
-    return { key: `${this.source.key(r)}, ${layers} layers`, payload: bytes };
+  // Fetches and decodes the tiles that have come into view.
+  async #grow(i, entry) {
+    const { content, flags, layers, abort } = entry;
+    if (entry.growing) return;
+    const more = content.seen(this.view(), layers).map((seen, j) => seen & ~flags[j]);
+    if (!more.includes(1)) return;
+    if (entry.orders > PIECES_MAX * entry.pieces) return this.#release(i, entry); // decoded anew, in one piece
+    entry.growing = true;
+    try {
+      await content.fetch(more, layers, abort.signal);
+      if (this.groups.get(i) !== entry) return;
+      more.forEach((flag, j) => (flags[j] |= flag));
+      this.#share(i, entry, more, true);
+    } catch (e) {
+      if (this.groups.get(i) === entry && !abort.signal.aborted) this.#fail(i, e.message);
+    }
+    entry.growing = false;
+  }
+
+  // Group i, and what it is predicted from: whole, or described, to be fetched by its parts.
+  async #fetch(i, layers, signal) {
+    const { source } = this;
+    const { native } = source;
+    const partly = this.view && source.ranged && this.#bytes(i, layers) > Engine.partly;
+    const one = (k) => (partly ? source.parts(k, signal) : source.payload(k, signal, layers));
+    const own = await one(i);
+    const back = native.reference(own.head ?? own);
+    if (back && (back > i || source.groups[i].sync)) throw new Error("it refers to a group that is not in the file");
+    const before = back ? await one(i - back) : null;
+    const key = `${source.key(i - back)}, ${layers} layers`;
+    if (!partly) return new Whole(native, own, before && { key, payload: before });
+    own.describe(native, before, key);
+    return own;
+  }
+
+  // Bytes of the layers of group i, or of the sync group before it, if they are more.
+  #bytes(i, layers) {
+    const { groups } = this.source;
+    let start = i;
+    while (start > 0 && !groups[start].sync) start--;
+    return Math.max(...[i, start].map((k) => groups[k].ends?.[layers - 1] ?? groups[k].size));
   }
 
   // Payloads of the next seconds, one at a time.
@@ -281,7 +330,9 @@ export class Engine extends EventTarget {
     try {
       let seconds = 0;
       for (let k = this.#after(i, loop); k !== null && k > i && seconds < AHEAD; k = this.#after(k, false)) {
-        await this.source.payload(k, undefined, this.#layersOf(k));
+        const layers = this.#layersOf(k);
+        const content = await this.#fetch(k, layers);
+        await content.fetch?.(content.seen(this.view(), layers), layers);
         seconds += this.source.groups[k].frames / this.fps;
       }
     } catch {
@@ -293,7 +344,7 @@ export class Engine extends EventTarget {
   #fail(i, message) {
     if (this.failed.has(i)) return; // another worker has told already
     const entry = this.groups.get(i);
-    if (entry) this.#release(i, { ...entry, state: "failed" });
+    if (entry) this.#release(i, { ...entry, state: "failed", left: 0 });
     this.failed.set(i, message);
     const g = this.source.groups[i];
     const frames = `${g.start_frame}–${g.start_frame + g.frames - 1}`;
@@ -308,9 +359,9 @@ export class Engine extends EventTarget {
   #onDecoded(entry, m) {
     const { header, group } = m;
     entry.ms = Math.max(entry.ms ?? 0, m.ms);
-    (entry.means ??= []).push(header.means);
+    if (header.means) (entry.means ??= []).push(header.means);
     entry.header = { ...header, gaussians: header.gaussians + (entry.header?.gaussians ?? 0), means: undefined };
-    if (--entry.left) return;
+    if (--entry.left || entry.state === "ready") return;
     this.stats.decode = entry.ms / header.frames;
     this.source.decoded?.(group, this.stats.decode);
     this.bounds ??= this.source.native.bounds(...entry.means);

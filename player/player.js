@@ -153,15 +153,17 @@ export class GsvPlayer extends HTMLElement {
     this.$(".error").hidden = true;
     this.$(".notes").replaceChildren();
     this.$(".busy").hidden = false;
-    Object.assign(this, { camera: null, paused: true, shown: null });
+    Object.assign(this, { camera: null, header: null, paused: true, shown: null });
     [this.#position, this.#scale, this.#drawn] = [0, null, ""];
     const engine = (this.engine = new Engine(this.$("canvas"), this.getAttribute("src")));
     engine.layers = this.#layers;
+    engine.view = () => (engine.gpu?.head || !this.camera ? null : this.#view(true));
     const { source } = engine;
     const on = (target, type, f) => target.addEventListener(type, (e) => this.engine === engine && f(e.detail));
     on(engine, "damaged", (d) => this.#damaged(d));
     on(engine, "nogpu", (why) => this.#note("gpu", `The GPU cannot be used (${why}): the CPU draws.`));
     on(engine, "fatal", (message) => this.#fail("The player has stopped", `${message}.`));
+    on(engine, "bounds", () => this.#look(engine));
     on(engine, "decoded", ({ header }) => this.#begin(engine, header));
     on(engine, "picture", (detail) => this.#pictured(detail));
     on(engine, "silent", (why) => this.#note("sound", `The sound cannot be played (${why}).`));
@@ -207,15 +209,23 @@ export class GsvPlayer extends HTMLElement {
     this.#note("live", source.complete ? null : unfinished);
   }
 
-  // The first group is decoded.
+  // A group is decoded.
   #begin(engine, header) {
+    const first = !this.header;
     this.header = header;
-    if (this.camera) return;
+    if (!first) return;
+    if (!this.camera) this.#look(engine);
     const layers = this.$("[data-set=layers]");
     layers.hidden = header.layers < 2;
     const choices = Array.from({ length: header.layers - 1 }, (_, k) => new Option(`${k + 1} of ${header.layers} layers`, k + 1));
     layers.replaceChildren(new Option("Auto layers", "auto"), new Option("All layers", "all"), ...choices);
     layers.value = { [ALL]: "all", [AUTO]: "auto" }[this.#layers] ?? String(Math.min(this.#layers, header.layers - 1));
+    if (this.hasAttribute("autoplay")) this.play();
+    this.dispatchEvent(new CustomEvent("ready"));
+  }
+
+  // The size of the scene is known.
+  #look(engine) {
     const { config } = engine.source;
     const color = /^#?([0-9a-f]{6})$/i.exec(this.getAttribute("background") ?? "")?.[1];
     if (color) config.background = [0, 2, 4].map((i) => parseInt(color.slice(i, i + 2), 16) / 255);
@@ -225,8 +235,6 @@ export class GsvPlayer extends HTMLElement {
     select.replaceChildren(new Option("Free view", "orbit"), ...config.cameras.map((c, i) => new Option(c.name, i)));
     select.hidden = !config.cameras.length;
     select.value = this.camera.reference ? String(config.cameras.indexOf(this.camera.reference)) : "orbit";
-    if (this.hasAttribute("autoplay")) this.play();
-    this.dispatchEvent(new CustomEvent("ready"));
   }
 
   // The clock
@@ -314,10 +322,11 @@ export class GsvPlayer extends HTMLElement {
 
   #draw(now) {
     const view = this.#view(this.paused && now - this.#moved > STILL);
-    const what = `${this.frame} ${view} ${this.engine.layers} ${this.engine.onGpu}`;
+    const { engine } = this;
+    const what = `${this.frame} ${view} ${engine.layers} ${engine.onGpu} ${engine.gaussians(engine.groupOf(this.frame))}`;
     if (what === this.#drawn) return;
     this.#drawn = what;
-    this.engine.draw(this.frame, view);
+    engine.draw(this.frame, view);
   }
 
   #pictured(detail) {

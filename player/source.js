@@ -1,5 +1,5 @@
 // A .gsv file behind a URL: the places of its groups, and their bytes by HTTP Range, sound included. With an index of layers
-// (ssix) only the requested layers are fetched.
+// (ssix) only the requested layers are fetched, and of groups in parts only what is asked for (parts.js).
 //
 // A finished file has an index (sidx), so one small request finds all groups; without it the headers of the fragments are
 // walked, and a growing file is polled. A server that ignores Range sends the whole file, which is then kept. All request
@@ -31,7 +31,7 @@ export class Source extends EventTarget {
   complete = false; // no more groups will come
   settled = false; // not complete, but it has not grown for a while
   received = 0;
-  #cache = new Map(); // group -> {bytes, size, sound}
+  #cache = new Map(); // group -> {bytes, size, sound} or {parts, sound}
   #head = new Uint8Array(); // first bytes of a finished file
   #whole = null; // all bytes so far, from a server without Range
   #closing = new AbortController();
@@ -93,8 +93,7 @@ export class Source extends EventTarget {
     const size = g.ends?.[layers - 1] ?? g.size;
     const kept = this.#cache.get(i);
     if (kept && kept.size >= size) {
-      this.#cache.delete(i);
-      this.#cache.set(i, kept); // least recently used ones are dropped first
+      this.#keep(i, kept);
       return kept.bytes;
     }
     const at = g.audio?.offset ?? g.offset;
@@ -107,6 +106,27 @@ export class Source extends EventTarget {
     return bytes;
   }
 
+  // Whether the server answers ranges.
+  get ranged() {
+    return !this.#whole;
+  }
+
+  // Group i, of which parts are fetched.
+  async parts(i, signal) {
+    const g = this.groups[i];
+    let { parts, sound } = this.#cache.get(i) ?? {};
+    if (!parts) {
+      const { FIRST, Parts } = await import("./parts.js");
+      const bytes = await this.#read(g.offset, g.offset + Math.min(FIRST, g.size), signal);
+      const { audio, offset } = g.indexed ? this.#inside(g, bytes) : g;
+      sound = audio && { ...audio, bytes: await this.#read(audio.offset, offset, signal) };
+      const read = (start, end, until) => this.#read(offset + start, offset + end, until);
+      parts = await Parts.open(read, bytes.subarray(offset - g.offset), signal);
+    }
+    this.#keep(i, { parts, sound });
+    return parts;
+  }
+
   // {time, samples: [size, duration] of each, bytes}: the sound that came with group i.
   sound(i) {
     return this.#cache.get(i)?.sound;
@@ -116,15 +136,17 @@ export class Source extends EventTarget {
     this.dispatchEvent(new CustomEvent(type, { detail }));
   }
 
+  // Least recently used groups are dropped first.
   #keep(i, entry) {
     this.#cache.delete(i);
     this.#cache.set(i, entry);
+    const held = ({ bytes, parts }) => (bytes ?? parts).length;
     let size = 0;
-    for (const { bytes } of this.#cache.values()) size += bytes.length;
-    for (const [k, { bytes }] of this.#cache) {
+    for (const entry of this.#cache.values()) size += held(entry);
+    for (const [k, entry] of this.#cache) {
       if (size <= CACHE || k === i) break;
       this.#cache.delete(k);
-      size -= bytes.length;
+      size -= held(entry);
     }
   }
 
@@ -277,7 +299,7 @@ export class Source extends EventTarget {
     }
     const range = /bytes (\d+)-(\d+)\/(\d+|\*)/.exec(response.headers.get("content-range") ?? "");
     if (range && range[3] !== "*") this.total = Number(range[3]);
-    const chunks = [];
+    const [chunks, before] = [[], this.received];
     const reader = response.body.getReader();
     for (;;) {
       const { done, value } = await reader.read();
@@ -288,7 +310,7 @@ export class Source extends EventTarget {
       else chunks.push(value);
     }
     const bytes = Number(response.headers.get("content-length") ?? 0);
-    this.#say("received", { bytes, ms: performance.now() - began });
+    this.#say("received", { bytes: this.received - before, ms: performance.now() - began }); // with what came beside it
     // another origin hides Content-Range, but not Content-Length
     if (status === 206 && !range && bytes && bytes < end - start) {
       this.total = start + bytes;

@@ -17,7 +17,14 @@ use std::fmt::Display;
 /// Most pixels of an image, 4096 x 4096: a failed allocation would end the instance.
 const MAX_PIXELS: usize = 1 << 24;
 /// Slots for decoded groups and parts of them.
-const SLOTS: usize = 32;
+const SLOTS: usize = 255;
+
+/// A group, and the frame of it that was evaluated last.
+struct Slot {
+    group: Evaluator,
+    frame: Frame,
+    at: Option<u16>,
+}
 
 pub struct Player {
     pub demuxer: Demuxer,
@@ -25,9 +32,8 @@ pub struct Player {
     /// Which tiles `decode` decodes, one byte each, layer by layer; empty: all.
     pub wanted: Vec<u8>,
     pub output: Vec<u8>,
-    groups: [Option<Evaluator>; SLOTS],
-    frame: Frame,
-    sh_k: usize,
+    groups: Vec<Option<Slot>>,
+    shown: usize, // slot of the evaluated frame
     raster: Rasterizer,
     bands: Bands,
     splats: Vec<Projected>,
@@ -41,9 +47,8 @@ impl Default for Player {
             input: Vec::new(),
             wanted: Vec::new(),
             output: Vec::new(),
-            groups: Default::default(),
-            frame: Frame::default(),
-            sh_k: 0,
+            groups: (0..SLOTS).map(|_| None).collect(),
+            shown: 0,
             raster: Rasterizer::new(SimdLevel::best(), 0),
             bands: Bands::default(),
             splats: Vec::new(),
@@ -70,21 +75,23 @@ impl Player {
         self.output = text::describe(&self.demuxer, first).into_bytes();
     }
 
-    /// Decodes the input to `slot`. The reference of a predicted group is in the slot `reference`. `keep_leading`: as of
-    /// `Decoding`.
-    pub fn decode(&mut self, slot: usize, level: u8, reference: usize, layers: usize, keep_leading: bool) -> bool {
+    /// Decodes the input to `slot`. The reference of a predicted group is in the slot `reference`. `keep_leading`, `packed`: as
+    /// of `Decoding`.
+    pub fn decode(&mut self, slot: usize, how: [u8; 3], keep_leading: bool, packed: bool) -> bool {
+        let [level, reference, layers] = how;
         let wanted = std::mem::take(&mut self.wanted);
         let decoded = Level::get(level).and_then(|caps| {
             let mut how = Decoding {
                 level: &caps,
                 reference: self
                     .groups
-                    .get(reference)
+                    .get(usize::from(reference))
                     .and_then(Option::as_ref)
-                    .map(Evaluator::group),
-                layers,
+                    .map(|slot| slot.group.group()),
+                layers: usize::from(layers),
                 tiles: None,
                 keep_leading,
+                packed,
             };
             if wanted.is_empty() {
                 return decode_group(&self.input, &how);
@@ -102,7 +109,11 @@ impl Player {
             Err(e) => self.done(Err::<(), _>(e)),
             Ok(group) => {
                 self.output = text::header(&group.header, group.positions.len()).into_bytes();
-                *place = Some(Evaluator::new(group));
+                *place = Some(Slot {
+                    group: Evaluator::new(group),
+                    frame: Frame::default(),
+                    at: None,
+                });
                 true
             }
         }
@@ -134,18 +145,17 @@ impl Player {
     }
 
     pub fn frame(&mut self, slot: usize, t: u16) -> bool {
-        let Some(Some(group)) = self.groups.get(slot) else {
+        let Some(Some(Slot { group, frame, at })) = self.groups.get_mut(slot) else {
             self.output = b"no group in this slot".to_vec();
             return false;
         };
-        group.frame(t, &mut self.frame);
-        self.sh_k = sh_coefficients(group.group().header.sh_degree);
-        for (logit, shown) in self
-            .frame
-            .logit_opacities
-            .iter_mut()
-            .zip(group.visible(t).into_iter().flatten())
-        {
+        self.shown = slot;
+        if at.replace(t) == Some(t) {
+            return true;
+        }
+        group.frame(t, frame);
+        let visible = group.visible(t).into_iter().flatten();
+        for (logit, shown) in frame.logit_opacities.iter_mut().zip(visible) {
             if !shown {
                 *logit = f32::NEG_INFINITY; // the projection leaves it out
             }
@@ -171,7 +181,9 @@ impl Player {
     }
 
     pub fn attribute(&mut self, which: usize) {
-        let f = &self.frame;
+        let Some(Some(Slot { frame: f, .. })) = self.groups.get(self.shown) else {
+            return self.output.clear();
+        };
         self.output = floats(match which {
             0 => f.means.as_flattened(),
             1 => f.quats.as_flattened(),
@@ -183,11 +195,11 @@ impl Player {
     }
 
     pub fn project(&mut self, bands: usize) -> usize {
-        let (f, input) = (&self.frame, numbers(&self.input));
-        let view = view(&input);
+        let input = numbers(&self.input);
+        let (view, shown) = (view(&input), self.groups.get(self.shown));
         let given: Vec<usize> = input.iter().skip(VIEW).map(|v| *v as usize).collect();
         let size = [view.width, view.height];
-        let drawn = self.raster.project(&splats(f, self.sh_k), &view);
+        let drawn = self.raster.project(&splats(shown), &view);
         let drawn = drawn.map(|projected| match given.is_empty() {
             true => self.bands.split(projected, size, bands).len(),
             false => self.bands.split_at(projected, size, &given).len(),
@@ -205,10 +217,14 @@ impl Player {
     }
 
     pub fn pack(&mut self, origin: [f32; 3], all: bool) -> bool {
-        let f = &self.frame;
+        let shown = self.groups.get(self.shown);
         self.output.clear();
-        let drawn = self.raster.project(&splats(f, self.sh_k), &view(&numbers(&self.input)));
-        let packed = drawn.map(|projected| pack::pack(f, projected, origin, all, &mut self.output));
+        let drawn = self.raster.project(&splats(shown), &view(&numbers(&self.input)));
+        let packed = drawn.map(|projected| {
+            if let Some(Some(slot)) = shown {
+                pack::pack(&slot.frame, projected, origin, all, &mut self.output);
+            }
+        });
         self.done(packed)
     }
 
@@ -258,7 +274,12 @@ fn describe_units(before: &[u8], own: &[u8]) -> Result<String, Error> {
     ))
 }
 
-fn splats(f: &Frame, sh_k: usize) -> Splats<'_> {
+/// The frame of a slot; none without one.
+fn splats(slot: Option<&Option<Slot>>) -> Splats<'_> {
+    let Some(Some(Slot { frame: f, group, .. })) = slot else {
+        return Splats::default();
+    };
+    let sh_k = sh_coefficients(group.group().header.sh_degree);
     Splats {
         means: f.means.as_flattened(),
         quats: f.quats.as_flattened(),
