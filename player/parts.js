@@ -10,8 +10,8 @@ import { share } from "./tiles.js";
 
 export const FIRST = 1 << 14; // bytes to fetch first: the header of a group of a million Gaussians is shorter
 const GAP = 1 << 11; // bytes between two units up to which they are fetched at once
-const [STILL, MOVING] = [0.05, 0.3]; // margin around the image, in shares of its sides
-const BATCH = 8; // tiles that a worker decodes at once while it draws
+const [STILL, MOVING] = [0.02, 0.3]; // margin around the image, in shares of its sides
+const BATCH = 4; // tiles that a worker decodes at once while it draws
 const EDGE = 0.05; // share of the Gaussians outside of the bounds on each side, at most
 const [COUNT, LEADING, OFFSET, SIZE, BOX] = [0, 1, 2, 3, 4]; // places in the description of a tile
 
