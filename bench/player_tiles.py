@@ -2,11 +2,12 @@
 
 usage: GSCODEC_DATA=... python -m bench.player_tiles FOLDER        writes bench/results/player_tiles.json
 
-The scene is that of bench.tiles: 13 copies of the statue in one group, and a camera that sees about a tenth of them. One
-page opens it as it is, with the tiles in view only, another is told to take all. Bytes are those received before the
-first picture, the first 64 kB of the file included. A time of decoding is from the request to when every worker has its
-tiles ready to be drawn, from bytes that are in the page; median of several runs, the two in turn. Then the camera moves
-over a third of the scene in four seconds: `move` has the bytes by then, and the longest time between two pictures.
+The scene is that of bench.tiles: 13 copies of the statue in one group, and a camera that sees about a tenth of
+them. One page opens it as it is, with the tiles in view only, another is told to take all. Bytes are those received
+before the first picture, the first 64 kB of the file included. A time of decoding is from the request to when every
+worker has its tiles ready to be drawn, from bytes that are in the page; median of several runs, the two in turn.
+Then the camera moves over a third of the scene in four seconds: `move` has the bytes by then, and the longest time
+between two pictures.
 """
 
 from __future__ import annotations

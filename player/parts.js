@@ -6,11 +6,10 @@
 // with its number, and the leading ones there. `index`: see text.rs.
 
 import { headerSize } from "./native.js";
-import { share } from "./tiles.js";
 
 export const FIRST = 1 << 14; // bytes to fetch first: the header of a group of a million Gaussians is shorter
 const GAP = 1 << 11; // bytes between two units up to which they are fetched at once
-const [STILL, MOVING] = [0.02, 0.3]; // margin around the image, in shares of its sides
+const [STILL, MOVING] = [0.01, 0.3]; // margin around the image, in shares of its sides
 const BATCH = 4; // tiles that a worker decodes at once while it draws
 const EDGE = 0.05; // share of the Gaussians outside of the bounds on each side, at most
 const [COUNT, LEADING, OFFSET, SIZE, BOX] = [0, 1, 2, 3, 4]; // places in the description of a tile
@@ -109,7 +108,8 @@ export class Parts {
 
   // What worker k of n decodes of the tiles with flags; more: pieces of it, of a few tiles each.
   orders(flags, layers, k, n, more) {
-    const own = share(this.index, k, n).map((mine, j) => mine & flags[j]);
+    let count = 0; // as many tiles for each
+    const own = flags.map((flag) => Number(flag && count++ % n === k));
     return (more ? batches(own) : [own]).map((wanted) => {
       const before = this.before && this.#survivors(wanted);
       const key = `${this.key}, tiles ${before}`;

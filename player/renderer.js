@@ -1,7 +1,5 @@
 // Images: drawn by raster workers in bands, and shown when the last band has arrived; or by the GPU, on a canvas above.
 
-import { Gpu, gpuName } from "./gpu.js";
-
 const IN_FLIGHT = 2; // images in progress: one is projected while the one before is blended
 const TILE = 16; // rows of a tile of the rasterizer
 
@@ -30,8 +28,10 @@ export class Renderer {
   // See Engine.use. `bounds`: box of the scene, 6 numbers.
   async use(how, bounds, background) {
     this.#how = how;
-    if (how === "cpu" || (how === "auto" && gpuName() === null)) return this.#leaveGpu();
-    if (this.gpu) return;
+    if (how === "cpu") return this.#leaveGpu();
+    const { Gpu, gpuName } = await import("./gpu.js"); // after the first picture
+    if (how === "auto" && gpuName() === null) return this.#leaveGpu();
+    if (this.gpu || this.#closed || this.#how !== how) return;
     const canvas = document.createElement("canvas");
     canvas.hidden = true;
     const [low, high] = [bounds.slice(0, 3), bounds.slice(3)];

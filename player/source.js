@@ -8,6 +8,7 @@
 import { ALL } from "./native.js";
 
 const HEAD = 1 << 16; // first request
+const SMALL = 1 << 18; // bytes of a file that is fetched as a whole
 const STEP = 1 << 12; // a moof and the header of its mdat
 const CACHE = 48 << 20; // bytes of payloads that are kept
 const SILENCE = 15_000; // ms without a byte after which a connection counts as broken
@@ -51,7 +52,7 @@ export class Source extends EventTarget {
 
   // Resolves when the first group is known.
   async open(create) {
-    const [native, head] = await Promise.all([create(), this.#read(0, HEAD)]);
+    const [native, head] = await Promise.all([create(), this.#start()]);
     this.native = native; // whose demuxer is used
     if (!head.length) throw new StreamError("The file is empty.");
     this.total ??= await this.#size();
@@ -68,6 +69,12 @@ export class Source extends EventTarget {
       this.#walk().catch((e) => this.#say("error", e));
       while (!this.groups.length && !this.complete) await new Promise((done) => this.addEventListener("groups", done, { once: true }));
     }
+  }
+
+  // The first bytes of the file, before the decoder is there to ask for more.
+  async #start() {
+    const head = await this.#read(0, HEAD);
+    return this.total > HEAD && this.total <= SMALL && !this.#whole ? this.#read(0, this.total, undefined, head) : head;
   }
 
   level() {
@@ -222,10 +229,10 @@ export class Source extends EventTarget {
     }
   }
 
-  // Bytes start .. end of the file, fewer where it ends.
-  async #read(start, end, signal) {
+  // Bytes start .. end of the file, fewer where it ends; head: its first bytes.
+  async #read(start, end, signal, head = this.#head) {
     if (this.#whole) return this.#whole.subarray(start, end);
-    const parts = [this.#head.subarray(start, end)];
+    const parts = [head.subarray(start, end)];
     let [at, since, wait] = [start + parts[0].length, performance.now(), 250];
     while (at < end && (this.total === null || at < this.total || start >= this.total)) {
       const before = at;
