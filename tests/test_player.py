@@ -102,7 +102,6 @@ def test_it_plays_loops_and_ends(browser, server):
 
 def test_keys_and_buttons(browser, server):
     load(browser, server.url, size="160x120", autoplay="off")
-    browser.eval(f"{part('.stage')}.focus()")
     frame = lambda: browser.eval(f"{PLAYER}.frame")  # noqa: E731
     show(browser, 7)
     browser.key("ArrowRight")
