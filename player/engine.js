@@ -36,7 +36,7 @@ export class Engine extends EventTarget {
   static partly = 1 << 20;
   groups = new Map(); // group -> {state: fetching | decoding | ready, set, pieces, left, header, layers, abort, content, flags}
   // set: workers that hold it; pieces: how many of them do; left: what these have yet to decode; order: see tiles.js; content: a
-  // Whole or Parts; of Parts flags: tiles that were asked for, orders: how often
+  // Whole or Parts; of Parts flags: tiles that were asked for, orders: how often; waiting: orders of each worker
   view = null; // () => what is to be seen: a view of the renderer, null for all; without it large groups are decoded whole, too
   failed = new Map(); // group -> message
   layers = AUTO; // number of layers of each group to fetch and draw
@@ -243,7 +243,7 @@ export class Engine extends EventTarget {
     if (this.failed.has(i)) return;
     const abort = new AbortController();
     const layers = this.#layersOf(i);
-    const entry = { state: "fetching", layers, abort, left: 0, flags: null };
+    const entry = { state: "fetching", layers, abort, left: 0, waiting: [], flags: null };
     this.groups.set(i, entry);
     try {
       const content = (entry.content = await this.#fetch(i, layers, abort.signal));
@@ -269,15 +269,19 @@ export class Engine extends EventTarget {
   // Gives the tiles of group i with flags, all if null, to the workers of its set; more: to those that have others already.
   #share(i, entry, flags, more = false) {
     const { set, layers, content, pieces: n } = entry;
-    const [level, bounds] = [this.source.level(i), !this.bounds];
     for (let k = 0; k < n; k++) {
       if (!set[k]) this.#join((set[k] = start()));
-      for (const order of content.orders(flags, layers, k, n, more)) {
-        set[k].postMessage({ type: "decode", group: i, level, layers, bounds, ...order });
-        entry.left++;
-      }
+      entry.waiting[k] = content.orders(flags, layers, k, n, more);
+      entry.left += entry.waiting[k].length;
+      this.#next(i, entry, k);
     }
     entry.orders = (entry.orders ?? 0) + entry.left;
+  }
+
+  // Gives worker k of a set what it is to decode next of group i: one order at a time, so that it can draw in between.
+  #next(i, { set, layers, waiting }, k) {
+    const order = waiting[k]?.shift();
+    if (order) set[k].postMessage({ type: "decode", group: i, level: this.source.level(i), layers, bounds: !this.bounds, ...order });
   }
 
   // Fetches and decodes the tiles that have come into view.
@@ -378,6 +382,7 @@ export class Engine extends EventTarget {
     const entry = this.groups.get(m.group);
     if (m.type === "decoded") {
       if (!entry?.left) return worker.postMessage({ type: "release", group: m.group });
+      this.#next(m.group, entry, entry.set.indexOf(worker));
       this.#onDecoded(entry, m);
     } else if (m.type === "projected") {
       this.renderer.onProjected(m);
