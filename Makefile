@@ -7,7 +7,16 @@ CARGO := cd codec/native && cargo
 DEMO := demo
 DIST := dist
 
-.PHONY: venv demo test lint format bench wheel player spark browser clean
+# What CI has besides: Ray, splat-transform, an emulator of the processors that have NEON.
+TOOLS := $(CURDIR)/build/tools
+CI_TESTS := $(if $(CI),ci)
+CI_ENV := $(if $(CI),PATH="$(TOOLS)/node_modules/.bin:$$PATH")
+NEON := aarch64-unknown-linux-gnu
+EMULATED := CARGO_PROFILE_RELEASE_LTO=off CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc \
+	CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER="qemu-aarch64 -L /usr/aarch64-linux-gnu"
+APT := apt-get update -qq >/dev/null && DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends
+
+.PHONY: venv demo test lint format bench wheel player spark browser ci tools neon fuzz clean
 venv: $(VENV)/.done
 
 # Once: the environment. Again: only when dependencies or the native code change.
@@ -30,12 +39,30 @@ demo: venv
 	@echo "  $(BIN)/gscodec render $(DEMO)/lumberjack.gsv out.mp4 --camera cam20  another view of it"
 	@echo "  $(BIN)/gscodec decode $(DEMO)/lumberjack.gsv plys/                   .ply frames for any splat viewer"
 
-test: venv lint browser
-ifdef CI
-	$(BIN)/python player/build.py --committed
-endif
+test: venv lint browser $(CI_TESTS)
 	$(CARGO) test --release --quiet --workspace --features bindings/wasm
-	$(BIN)/python -m pytest
+	$(CI_ENV) $(BIN)/python -m pytest
+
+# What `make test` does besides where CI is set; there a test that is skipped fails.
+ci: venv tools neon fuzz
+	$(BIN)/python player/build.py --committed
+
+# Programs that tests use, and that a developer may lack: their tests are skipped then.
+tools: venv
+	@command -v npm >/dev/null || $(APT) npm >/dev/null
+	@command -v qemu-aarch64 >/dev/null && command -v aarch64-linux-gnu-gcc >/dev/null \
+		|| $(APT) qemu-user gcc-aarch64-linux-gnu libc6-dev-arm64-cross >/dev/null
+	npm install --silent --no-audit --no-fund --prefix $(TOOLS) @playcanvas/splat-transform@3
+	$(BIN)/python -m pip install --quiet --editable '.[ray]'
+
+# The tests of the crates that have NEON or decode, on an emulated processor.
+neon:
+	rustup target add $(NEON)
+	$(CARGO:cargo=)$(EMULATED) cargo test --release --quiet --target $(NEON) -p raster -p gsv
+
+# A short run of each fuzz target.
+fuzz: venv
+	$(BIN)/python -m bench.fuzz --seconds 40 --dry
 
 lint: venv
 	$(BIN)/ruff check .
@@ -59,8 +86,7 @@ spark:
 # A Chromium for the tests of the player, which say that they are skipped where there is none (and fail if CI is set).
 browser:
 	@command -v chromium >/dev/null || command -v google-chrome >/dev/null || [ -n "$$CHROMIUM" ] \
-		|| { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq >/dev/null \
-			&& DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends chromium >/dev/null; } \
+		|| { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && $(APT) chromium >/dev/null; } \
 		|| echo "note: no Chromium, the player's browser tests will be skipped"
 
 # A wheel that installs where there is no Rust.

@@ -26,6 +26,8 @@ AMBIENT = 0.45
 OPENGL = np.diag([1.0, -1, -1, 1])  # OpenCV camera axes -> OpenGL's
 WAVES = 3  # sines of which the motion of a handheld camera is made
 PERIODS = (7.0, 30.0)  # frames, of these sines
+ROLL = 20  # frames, the period of an exposure that rolls
+EXPOSURES = 5  # moments of a picture whose shutter is open for some time
 
 
 @dataclass(frozen=True)
@@ -60,26 +62,33 @@ class Scene:
     """One capture.
 
     Attributes:
-        shapes: what is there at a frame.
+        shapes: what is there at a frame, or at a moment between two.
         light: at a frame.
         exposure: of the images of each training camera, a range (lowest, highest) of gains.
+        rolling: amplitude of a gain of each training camera that rises and falls over `ROLL` frames, each by its own
+            phase.
+        shutter: share of a frame's time for which the shutter is open: what moves is blurred.
         pose_noise: degrees and metres by which the calibration of each training camera is wrong.
         handheld: degrees and metres (root mean square) by which each camera shakes, each in its own way.
         orbit: degrees a frame by which all cameras go around the subject.
         masks: the views have alpha.
+        depth_noise: standard deviation of the noise of the depth images, a share of the depth; None: there are none.
     """
 
-    shapes: Callable[[int], list[Shape]]
-    light: Callable[[int], Light] = lambda t: Light()
-    frames: int = 12
+    shapes: Callable[[float], list[Shape]]
+    light: Callable[[float], Light] = lambda t: Light()
+    frames: int = 30
     train: int = 12
     test: int = 2
     size: int = 128
     exposure: tuple[float, float] = (1.0, 1.0)
+    rolling: float = 0.0
+    shutter: float = 0.0
     pose_noise: tuple[float, float] = (0.0, 0.0)
     handheld: tuple[float, float] = (0.0, 0.0)
     orbit: float = 0.0
     masks: bool = True
+    depth_noise: float | None = None
 
     def capture(self, name: str) -> Capture:
         """The scene as its cameras see it."""
@@ -88,6 +97,7 @@ class Scene:
         wrong = [_error(*self.pose_noise, rng) if c.split == "train" else np.eye(4) for c in rig]
         gains = np.where([c.split == "train" for c in rig], rng.uniform(*self.exposure, len(rig)), 1)
         shaken = [_shake(*self.handheld, np.random.default_rng([1, i])) for i in range(len(rig))]
+        phases = np.random.default_rng(2).uniform(0, 2 * np.pi, len(rig))
 
         @cache
         def true(camera: int, frame: int) -> Camera:
@@ -99,21 +109,37 @@ class Scene:
             there = true(camera, frame)
             return replace(there, viewmat=wrong[camera] @ there.viewmat)
 
+        def gain(camera: int, frame: int) -> float:
+            rolled = self.rolling * np.sin(2 * np.pi * frame / ROLL + phases[camera])
+            return gains[camera] * (1 + rolled if rig[camera].split == "train" else 1)
+
         @cache
         def read(camera: int, frame: int) -> View:
-            rgba = trace(self.shapes(frame), self.light(frame), true(camera, frame))
+            rgba, depth = self._exposed(true(camera, frame), frame)
             rgb, alpha = rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6), rgba[..., 3]
+            seed = np.random.default_rng([2, camera, frame])
+            depth = None if self.depth_noise is None else _sensed(depth, self.depth_noise, seed)
             if not self.masks:
-                return View(_u8(gains[camera] * rgba[..., :3]))
-            return View(_u8(gains[camera] * rgb), _u8(alpha))
+                return View(_u8(gain(camera, frame) * rgba[..., :3]), depth=depth)
+            return View(_u8(gain(camera, frame) * rgb), _u8(alpha), depth)
 
         poses = told if self.orbit or any(self.handheld) else None
         cameras = [told(i, 0) for i in range(len(rig))]
-        return Capture(name, 25.0, cameras, self.frames, self.masks, read, poses=poses)
+        has_depth = self.depth_noise is not None
+        return Capture(name, 25.0, cameras, self.frames, self.masks, read, has_depth=has_depth, poses=poses)
+
+    def _exposed(self, camera: Camera, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """[H, W, 4] f32, premultiplied, the mean over the time for which the shutter is open, and the depth [H, W] in
+        the middle of it."""
+        count = EXPOSURES if self.shutter else 1
+        times = frame + self.shutter * (np.arange(count) - (count - 1) / 2) / count
+        traced = [trace(self.shapes(t), self.light(t), camera) for t in times]
+        return np.mean([rgba for rgba, _ in traced], 0), traced[count // 2][1]
 
 
 def write_transforms(capture: Capture, folder: Path) -> None:
-    """Writes a capture as transforms.json and PNG files, with the pose and the intrinsics of each frame."""
+    """Writes a capture as transforms.json and PNG files, depth in millimetres, with the pose and the intrinsics of each
+    frame."""
     import cv2
 
     entries = []
@@ -125,6 +151,9 @@ def write_transforms(capture: Capture, folder: Path) -> None:
             (fl_x, _, cx), (_, fl_y, cy) = camera.K[:2].tolist()
             entry = {"file_path": name, "camera": camera.name, "frame": t, "split": camera.split}
             entry |= {"w": camera.width, "h": camera.height, "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
+            if view.depth is not None:
+                entry["depth_file_path"] = f"depth_{name}"
+                cv2.imwrite(str(folder / entry["depth_file_path"]), np.rint(1000 * view.depth).astype(np.uint16))
             pose = np.linalg.inv(camera.viewmat) @ OPENGL
             entries.append(entry | {"transform_matrix": pose.tolist()})
     (folder / "transforms.json").write_text(json.dumps({"fps": capture.fps, "frames": entries}))
@@ -132,6 +161,12 @@ def write_transforms(capture: Capture, folder: Path) -> None:
 
 def _u8(x: np.ndarray) -> np.ndarray:
     return np.rint(255 * x.clip(0, 1)).astype(np.uint8)
+
+
+def _sensed(depth: np.ndarray, noise: float, rng: np.random.Generator) -> np.ndarray:
+    """A depth image as a sensor gives it: noise that grows with the depth, in steps of a millimetre."""
+    noisy = depth * (1 + noise * rng.standard_normal(depth.shape))
+    return (np.rint(1000 * noisy) / 1000).astype(np.float32)
 
 
 def _rig(train: int, test: int, size: int) -> list[Camera]:
@@ -184,8 +219,9 @@ def rotation(axis: Sequence[float], angle: float) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
 
 
-def trace(shapes: Sequence[Shape], light: Light, camera: Camera) -> np.ndarray:
-    """[H, W, 4] f32, premultiplied, 0..1: the view of the camera, the mean of `SAMPLES`^2 rays per pixel."""
+def trace(shapes: Sequence[Shape], light: Light, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """The view of a camera: [H, W, 4] f32, premultiplied, 0..1, the mean of `SAMPLES`^2 rays per pixel; and [H, W] f32
+    depth along the optical axis of the middle ray, 0 where nothing is there."""
     w, h, R = camera.width, camera.height, camera.viewmat[:3, :3].astype(np.float32)
     x = ((np.arange(SAMPLES * w) + 0.5) / SAMPLES - camera.K[0, 2]) / camera.K[0, 0]
     y = ((np.arange(SAMPLES * h) + 0.5) / SAMPLES - camera.K[1, 2]) / camera.K[1, 1]
@@ -200,7 +236,9 @@ def trace(shapes: Sequence[Shape], light: Light, camera: Camera) -> np.ndarray:
         index = index[closer]
         nearest[index] = depth[closer]
         out[index, :3], out[index, 3] = color[closer], 1
-    return out.reshape(h, SAMPLES, w, SAMPLES, 4).mean(3).mean(1)
+    middle = nearest.reshape(h, SAMPLES, w, SAMPLES)[:, SAMPLES // 2, :, SAMPLES // 2]
+    depth = np.where(np.isfinite(middle), middle, 0).astype(np.float32)
+    return out.reshape(h, SAMPLES, w, SAMPLES, 4).mean(3).mean(1), depth
 
 
 def _intersect(shape: Shape, light: Light, eye: np.ndarray, rays: np.ndarray, squares: np.ndarray) -> tuple:

@@ -36,9 +36,10 @@ QUALITIES = (20, 30, 40, 50, 60, 70, 80, 90, 100)
 CODECS = (OURS, *BASELINES)
 DECODE_RUNS = 3
 EVERY = 5  # PSNR is measured on every 5th frame
-ANCHORS = {"videogs": (39, 45), "videogs-raw": (39, 45), "x265": (39, 52)}  # anchor -> range of PSNR of the BD-rate
+WITHIN = {"videogs": (39, 45), "videogs-raw": (39, 45)}  # peer -> range of PSNR of the BD-rate
+USUAL = (39, 52)  # of the others
 ONE_POINT = ("sog", "spz")
-VIDEO = ("videogs", "videogs-raw", "x265", "svt-av1", "gsav")  # SH degree 0 and more than one frame
+VIDEO = ("videogs", "videogs-raw", "x265", "svt-av1", "gsav", "webp")  # SH degree 0 and more than one frame
 Group = DenseGroup | ParametricGroup
 
 
@@ -183,18 +184,19 @@ def _place(e: dict) -> tuple:
 
 
 def bd_rates(entries: Sequence[dict]) -> list[dict]:
-    """BD-rates of gscodec against each anchor on each sequence, where the curves share a range of PSNR."""
-    found = []
+    """BD-rates against each peer on each sequence where the curves share a range of PSNR; the strongest peer first."""
+    found: list[dict] = []
     for name in dict.fromkeys(e["sequence"] for e in entries):
-        curves = {c: rising(_points(entries, name, c)) for c in (OURS, *ANCHORS)}
-        for anchor, within in ANCHORS.items():
+        curves = {c: rising(_points(entries, name, c)) for c in CODECS}
+        for anchor in BASELINES:
+            within = WITHIN.get(anchor, USUAL)
             try:
                 percent = bd_rate(curves[anchor], curves[OURS], within=within)
             except UsageError:
                 continue
             span = shared_psnr(curves[anchor], curves[OURS], within)
             found.append({"sequence": name, "anchor": anchor, "percent": round(percent, 2), "psnr": span})
-    return found
+    return sorted(found, key=lambda r: (r["sequence"], -r["percent"]))
 
 
 def shares(entries: Sequence[dict]) -> list[dict]:

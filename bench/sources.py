@@ -25,7 +25,6 @@ FILES = {  # what -> file, command
     "page, first picture": ("first_picture.json", "python -m bench.player FOLDER"),
     "rasterizer": ("raster.json", "gscodec bench raster"),
     "tiles": ("tiles.json", "python -m bench.tiles"),
-    "fuzzing": ("fuzz.json", "python -m bench.fuzz --seconds 600"),
 }
 
 
@@ -46,10 +45,14 @@ def _rows() -> Iterator[tuple[str, ...]]:
         ("rd.json", "other codecs", "gscodec bench rd"),
         ("ablation.json", "losses and tools", "gscodec bench ablation"),
         ("stress.json", "stress", "gscodec bench stress"),
+        ("fuzz.json", "fuzzing", "python -m bench.fuzz"),
     ):
         yield what, file, f"`{command}`", _commits(_entries(file)), "-"
-    points = json.loads((RESULTS / "points.json").read_text())
-    yield "sparse points", "points.json", "`python -m bench.sparse_points`", _commits(list(points.values())), "-"
+    for file, what, module in (
+        ("points.json", "sparse points", "sparse_points"),
+        ("depth.json", "depth images", "depth"),
+    ):
+        yield what, file, f"`python -m bench.{module}`", _commits(_entries(file)), "-"
 
 
 def _entries(file: str) -> list[dict]:

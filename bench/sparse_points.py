@@ -4,7 +4,6 @@ training cameras, and none (`python -m bench.sparse_points --help`)."""
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from gscodec.capture import Capture
 from gscodec.train.settings import InitializationSettings
 from gscodec.train.sparse_points import triangulated
 
+from .machine import update_entries
 from .train import CASES, every_frame_alone, held_out, part
 
 VALIDATION = {
@@ -29,11 +29,12 @@ def measure(capture: Capture, preset: str, frame: int) -> dict:
 
     settings, start = train_settings(preset), time.process_time()
     own = replace(settings.initialization, triangulate=False)  # those of `capture`, or none
-    models, seconds = every_frame_alone(capture, range(frame, frame + 1), replace(settings, initialization=own))
+    (alone,), seconds = every_frame_alone(capture, [frame], replace(settings, initialization=own))
+    model = alone.canonical
     cpu = round(time.process_time() - start, 1)
-    found = evaluate_capture(lambda _: models[0], part(capture, range(frame, frame + 1)), "test")
+    found = evaluate_capture(lambda _: model, part(capture, range(frame, frame + 1)), "test")
     quality = {k: round(found[k], 3) for k in ("psnr", "psnr_fg", "psnr_corrected", "ssim")}
-    return {**quality, "seconds": round(seconds, 1), "cpu_seconds": cpu, "gaussians": len(models[0])}
+    return {**quality, "seconds": round(seconds, 1), "cpu_seconds": cpu, "gaussians": len(model)}
 
 
 def main() -> None:
@@ -46,13 +47,13 @@ def main() -> None:
     a = p.parse_args()
     capture = held_out(CASES[a.case].open(a.data), VALIDATION[a.case])
     points = triangulated(capture, 0, InitializationSettings())
-    for name, own in (("none", None), ("points", points)):
-        found = measure(replace(capture, points=own), a.preset, a.frame)
-        key = f"{a.case}, frame {a.frame}, {a.preset}, {name}"
-        entries = json.loads(a.out.read_text()) if a.out.is_file() else {}
-        entries[key] = {"points": 0 if own is None else len(own), **found}
-        a.out.write_text(json.dumps(entries, indent=1) + "\n")
-        print(key, entries[key], flush=True)
+    head = {"case": a.case, "frame": a.frame, "preset": a.preset}
+    entries = (
+        {**head, "points": len(own or ()), **measure(replace(capture, points=own), a.preset, a.frame)}
+        for own in (None, points)
+    )
+    for entry in update_entries(a.out, entries, lambda e: (*(e[k] for k in head), e["points"] > 0)):
+        print(entry, flush=True)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -198,9 +198,8 @@ def _ours(capture: Capture, frames: range, settings, encoding) -> Iterator[tuple
 
 
 def _alone(capture: Capture, frames: range, settings, encoding) -> Iterator[tuple]:
-    models, seconds = every_frame_alone(capture, frames, settings)
-    yield "alone", seconds, None, models
-    alone = [ParametricGroup(1, g) for g in models]
+    alone, seconds = every_frame_alone(capture, frames, settings)
+    yield "alone", seconds, None, shown(alone)
     size, decoded, more, _ = coded(part(capture, frames), alone, settings, encoding)
     yield "alone-coded", seconds + more, size, decoded
 
@@ -265,8 +264,9 @@ def coded(
         return out.stat().st_size, [stream.frame(t) for t in range(stream.frame_count)], seconds, report
 
 
-def every_frame_alone(capture: Capture, frames: range, settings) -> tuple[list[Gaussians], float]:
-    """Trains a keyframe for each of `frames`; returns their Gaussians and the seconds."""
+def every_frame_alone(capture: Capture, frames: Sequence[int], settings) -> tuple[list[ParametricGroup], float]:
+    """Trains a keyframe for each of `frames`; returns them as groups, with the calibration that they have learned, and
+    the seconds."""
     import torch
 
     from gscodec.render.cpu import CpuBackend
@@ -276,14 +276,14 @@ def every_frame_alone(capture: Capture, frames: range, settings) -> tuple[list[G
     from gscodec.train.views import Views
 
     torch.set_num_threads(1)  # as the commands do
-    models, start = [], time.perf_counter()
+    groups, start = [], time.perf_counter()
     for frame in frames:
         views = Views(capture, settings, CpuBackend())
         budget = keyframe_budget(views, frame, settings)
         model, radius = initial_model(capture, frame, budget.points, settings)
         train_keyframe(model, views, frame, settings, steps=budget.steps, radius=radius)
-        models.append(model.gaussians())
-    return models, time.perf_counter() - start
+        groups.append(ParametricGroup(1, model.gaussians(), calibration=views.calibration()))
+    return groups, time.perf_counter() - start
 
 
 def part(capture: Capture, frames: range) -> Capture:

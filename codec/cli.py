@@ -17,10 +17,12 @@ from . import __version__
 from .commands.bench import bench
 from .commands.chart import chart
 from .commands.decode import decode
+from .commands.edit import edit
 from .commands.encode import encode
 from .commands.eval import evaluate
 from .commands.info import info
 from .commands.masks import masks
+from .commands.mux import mux
 from .commands.play import play
 from .commands.render import render
 from .commands.train import train
@@ -33,7 +35,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (encode, train, decode, render, play, info, masks):
+for command in (encode, train, decode, render, play, info, masks, mux, edit):
     app.command()(command)
 app.command(name="eval")(evaluate)
 app.add_typer(bench, name="bench")

@@ -23,6 +23,7 @@ export const MARKUP = `
     <div class="view"><canvas></canvas></div>
     <pre class="stats" hidden></pre>
     <div class="notes" role="status"></div>
+    <div class="tracks" role="group" aria-label="Tracks" hidden></div>
     <div class="busy" hidden></div>
     <div class="error" role="alert" hidden><div><h2></h2><p></p><button data-do="retry">Try again</button></div></div>
   </div>

@@ -13,6 +13,7 @@ import { LayerChoice } from "./layers.js";
 import { Renderer } from "./renderer.js";
 import { Source } from "./source.js";
 import { Whole, joined, order, sharing } from "./tiles.js";
+import { Scene, placed, unplaced } from "./tracks.js";
 
 const AHEAD = 10; // seconds of payloads to fetch ahead
 const SETS = 2; // of group workers
@@ -37,9 +38,11 @@ export class Engine extends EventTarget {
   groups = new Map(); // group -> {state: fetching | decoding | ready, set, pieces, left, header, layers, abort, content, flags}
   // set: workers that hold it; pieces: how many of them do; left: what these have yet to decode; order: see tiles.js; content: a
   // Whole or Parts; of Parts flags: tiles that were asked for, orders: how often; waiting: orders of each worker
-  view = null; // () => what is to be seen: a view of the renderer, null for all; without it large groups are decoded whole, too
+  view = null; // () => what is to be seen: a view of the renderer, null for all, undefined if it is not known yet; without it
+  // large groups are decoded whole, too; of the tracks of a scene the host has it
+  pose = null; // that of the track in a scene, see tracks.js
   failed = new Map(); // group -> message
-  layers = AUTO; // number of layers of each group to fetch and draw
+  layers; // number of layers of each group to fetch and draw
   choice = new LayerChoice();
   #chosen = new Map(); // sync group -> number of layers, of it and of the groups predicted from it
   stats = { decode: 0, project: 0, blend: 0, gaussians: 0, link: 0 };
@@ -48,21 +51,25 @@ export class Engine extends EventTarget {
   #asked = new Map(); // id -> {resolve, reject} of a request
   #requests = 0;
 
-  // canvas: null if nothing is to be drawn
-  constructor(canvas, src) {
+  scene = null; // of the tracks of a file that has several, or a placed one
+
+  // canvas: null if nothing is to be drawn; track: which one of the file; host: the engine of the first one, which draws this
+  // one, too
+  constructor(canvas, src, { track = 0, host = null } = {}) {
     super();
-    this.source = /\.mpd($|[?#])/.test(src) ? new AdaptiveSource(src) : new Source(src);
+    Object.assign(this, { host, layers: host?.layers ?? AUTO });
+    this.source = /\.mpd($|[?#])/.test(src) ? new AdaptiveSource(src) : new Source(src, track);
     this.source.addEventListener("received", ({ detail: { bytes, ms } }) => {
       if (bytes > 20_000) this.stats.link = (8e-3 * bytes) / ms;
     });
     const cores = navigator.hardwareConcurrency || 2;
     const count = canvas ? Math.min(Math.max(cores - 1, 2), RASTER_WORKERS_MAX) : 0;
-    this.#rasters = Array.from({ length: count }, () => start());
+    this.#rasters = host ? host.#rasters : Array.from({ length: count }, () => start());
     this.shares = Math.min(cores, SHARES_MAX);
     this.#sets.forEach((set) => set.push(start()));
     const divide = (load) => this.source.native.divide(load, count);
     const say = (type, detail) => this.#say(type, detail);
-    this.renderer = new Renderer(canvas, { rasters: count, stats: this.stats, divide, say });
+    this.renderer = host?.renderer ?? new Renderer(canvas, { rasters: count, stats: this.stats, divide, say });
   }
 
   #say(type, detail) {
@@ -71,14 +78,18 @@ export class Engine extends EventTarget {
 
   // Resolves when the config and the first groups are known.
   async open() {
-    const module = load(new URL("./native.wasm.gz", import.meta.url)); // while the first bytes of the file are on their way
-    module.then((m) => this.closed || this.#connect(m), () => {});
-    await this.source.open(async () => Native.create(await module));
+    this.loading = this.host?.loading ?? load(new URL("./native.wasm.gz", import.meta.url)); // while the first bytes of the file are on their way
+    this.loading.then((m) => this.closed || this.#connect(m), () => {});
+    await this.source.open(async () => Native.create(await this.loading));
+    if (this.#rasters.length && !this.host && (this.source.tracks > 1 || placed(this.source.config))) {
+      this.scene = new Scene(this, (track) => new Engine(null, this.source.url, { track, host: this }));
+      await this.scene.open((type, detail) => this.#say(type, detail));
+    }
   }
 
   #connect(module) {
     this.#module = module;
-    this.#rasters.forEach((worker) => {
+    (this.host ? [] : this.#rasters).forEach((worker) => {
       worker.onmessage = ({ data }) => this.renderer.onRaster(worker, data);
       worker.onerror = (e) => this.#dead(e);
       worker.postMessage({ role: "raster", module });
@@ -104,8 +115,10 @@ export class Engine extends EventTarget {
     this.closed = true;
     this.source.close();
     for (const g of this.groups.values()) g.abort?.abort();
-    for (const w of [...this.#sets.flat(), ...this.#rasters]) w.terminate();
+    for (const w of [...this.#sets.flat(), ...(this.host ? [] : this.#rasters)]) w.terminate();
     for (const { reject } of this.#asked.values()) reject(new Error("the stream was closed"));
+    if (this.host) return;
+    this.scene?.close();
     this.renderer.close();
   }
 
@@ -124,10 +137,17 @@ export class Engine extends EventTarget {
 
   // Requests the image of frame t, whose group is decoded.
   draw(t, view) {
-    const { header, pieces, flags } = this.groups.get(this.groupOf(t));
-    const image = { t, view, gaussians: header.gaussians, pieces, divided: pieces > 1 || flags !== null };
+    const parts = this.scene?.parts(t) ?? [{ engine: this, t }];
+    const shown = parts.map((part) => part.engine.groups.get(part.engine.groupOf(part.t)));
+    const pieces = shown.reduce((n, group) => n + group.pieces, 0);
+    const image = { t, view, gaussians: this.gaussians(t), pieces, divided: pieces > 1 || shown[0].flags !== null };
     const how = this.renderer.begin(image, this.source.config.background);
-    this.#post(t, (piece) => ({ ...how, view, piece, pieces }));
+    let first = 0;
+    parts.forEach(({ engine, t: own, pose }, i) => {
+      const from = first;
+      engine.#post(own, (piece) => ({ ...how, view, pose, piece: from + piece, pieces }));
+      first += shown[i].pieces;
+    });
   }
 
   // Resolves with the answer of the workers that have the group of frame t, which is decoded.
@@ -171,9 +191,25 @@ export class Engine extends EventTarget {
     return this.groups.get(i)?.state === "ready";
   }
 
-  // Gaussians of group i that are there.
-  gaussians(i) {
-    return this.groups.get(i)?.header?.gaussians ?? 0;
+  // Gaussians of frame t that are there.
+  gaussians(t) {
+    const parts = this.scene?.parts(t) ?? [{ engine: this, t }];
+    return parts.reduce((n, part) => n + (part.engine.groups.get(part.engine.groupOf(part.t))?.header?.gaussians ?? 0), 0);
+  }
+
+  // What is to be seen of this track, as of `view`, where it was made.
+  sight() {
+    const view = (this.host ?? this).view();
+    return view && this.pose ? unplaced(view, this.pose) : view;
+  }
+
+  // Flags of the tiles of a group that are to be seen, as soon as that is known.
+  async #seen(content, layers, signal) {
+    while (this.sight() === undefined && !this.closed) {
+      await new Promise(requestAnimationFrame);
+      signal?.throwIfAborted();
+    }
+    return content.seen(this.sight(), layers);
   }
 
   // Starts decoding group i, then the next one, then fetching those after it; releases all others.
@@ -198,6 +234,7 @@ export class Engine extends EventTarget {
   show(layers) {
     if (layers === this.layers) return;
     this.layers = layers;
+    this.scene?.show(layers);
     this.forget();
   }
 
@@ -249,7 +286,7 @@ export class Engine extends EventTarget {
       const content = (entry.content = await this.#fetch(i, layers, abort.signal));
       if (content.seen) {
         if (!this.bounds) this.#say("bounds", (this.bounds = content.bounds)); // who hears it knows the view
-        entry.flags = content.seen(this.view(), layers);
+        entry.flags = await this.#seen(content, layers, abort.signal);
         await content.fetch(entry.flags, layers, abort.signal);
       }
       if (this.groups.get(i) !== entry) return;
@@ -288,7 +325,7 @@ export class Engine extends EventTarget {
   async #grow(i, entry) {
     const { content, flags, layers, abort } = entry;
     if (entry.growing) return;
-    const more = content.seen(this.view(), layers).map((seen, j) => seen & ~flags[j]);
+    const more = content.seen(this.sight(), layers).map((seen, j) => seen & ~flags[j]);
     if (!more.includes(1)) return;
     if (entry.orders > PIECES_MAX * entry.pieces) return this.#release(i, entry); // decoded anew, in one piece
     entry.growing = true;
@@ -307,7 +344,7 @@ export class Engine extends EventTarget {
   async #fetch(i, layers, signal) {
     const { source } = this;
     const { native } = source;
-    const partly = this.view && source.ranged && this.#bytes(i, layers) > Engine.partly;
+    const partly = (this.host ?? this).view && source.ranged && this.#bytes(i, layers) > Engine.partly;
     const one = (k) => (partly ? source.parts(k, signal) : source.payload(k, signal, layers));
     const own = await one(i);
     const back = native.reference(own.head ?? own);
@@ -336,7 +373,7 @@ export class Engine extends EventTarget {
       for (let k = this.#after(i, loop); k !== null && k > i && seconds < AHEAD; k = this.#after(k, false)) {
         const layers = this.#layersOf(k);
         const content = await this.#fetch(k, layers);
-        await content.fetch?.(content.seen(this.view(), layers), layers);
+        await content.fetch?.(await this.#seen(content, layers), layers);
         seconds += this.source.groups[k].frames / this.fps;
       }
     } catch {

@@ -69,6 +69,17 @@ export class Native {
     return JSON.parse(this.text());
   }
 
+  // Reads track `number` of the file from now on.
+  track(number) {
+    this.x.track(number);
+  }
+
+  // The transform of the track at time u of the scene, in units of its timescale: rotation (wxyz), translation, scale.
+  pose(u) {
+    this.x.pose(u);
+    return Array.from(this.floats());
+  }
+
   // Groups
 
   // reference: the slot of the reference of a predicted group; layers: number to decode; wanted: flags of the tiles to decode,
@@ -101,7 +112,9 @@ export class Native {
     return JSON.parse(this.text());
   }
 
-  frame(slot, t) {
+  // pose: the transform that places the frame, with a scale of 0 nothing is shown; without one it is where it was made.
+  frame(slot, t, pose = []) {
+    this.#floats(pose);
     this.check(this.x.frame(slot, t));
   }
 

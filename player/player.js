@@ -29,6 +29,7 @@ export class GsvPlayer extends HTMLElement {
   #last = 0; // time of the last tick
   #moved = 0; // time of the last camera motion
   #drawn = ""; // the last request
+  #begun = false;
   #scale = null; // of a moving image per side, measured
   #adapted = 0;
   #times = []; // of the images of the last second
@@ -108,7 +109,7 @@ export class GsvPlayer extends HTMLElement {
   }
 
   get frameCount() {
-    return this.engine?.source?.frameCount ?? 0;
+    return this.engine?.scene?.frameCount ?? this.engine?.source?.frameCount ?? 0;
   }
 
   get fps() {
@@ -154,17 +155,17 @@ export class GsvPlayer extends HTMLElement {
     this.$(".notes").replaceChildren();
     this.$(".busy").hidden = false;
     Object.assign(this, { camera: null, header: null, paused: true, shown: null });
-    [this.#position, this.#scale, this.#drawn] = [0, null, ""];
+    [this.#position, this.#scale, this.#drawn, this.#begun] = [0, null, "", false];
     const engine = (this.engine = new Engine(this.$("canvas"), this.getAttribute("src")));
     engine.layers = this.#layers;
-    engine.view = () => (engine.gpu?.head || !this.camera ? null : this.#view(true));
+    engine.view = () => (engine.gpu?.head ? null : this.camera ? this.#view(true) : undefined);
     const { source } = engine;
     const on = (target, type, f) => target.addEventListener(type, (e) => this.engine === engine && f(e.detail));
     on(engine, "damaged", (d) => this.#damaged(d));
     on(engine, "nogpu", (why) => this.#note("gpu", `The GPU cannot be used (${why}): the CPU draws.`));
     on(engine, "fatal", (message) => this.#fail("The player has stopped", `${message}.`));
-    on(engine, "bounds", () => this.#look(engine));
-    on(engine, "decoded", ({ header }) => this.#begin(engine, header));
+    on(engine, "bounds", () => this.#begin(engine));
+    on(engine, "decoded", ({ header }) => ((this.header = header), this.#begin(engine)));
     on(engine, "picture", (detail) => this.#pictured(detail));
     on(engine, "silent", (why) => this.#note("sound", `The sound cannot be played (${why}).`));
     on(source, "retry", (why) => this.#note("link", `Connection lost (${why}). Trying again…`, true));
@@ -209,12 +210,14 @@ export class GsvPlayer extends HTMLElement {
     this.#note("live", source.complete ? null : unfinished);
   }
 
-  // A group is decoded.
-  #begin(engine, header) {
-    const first = !this.header;
-    this.header = header;
-    if (!first) return;
+  // Begins when what the first frame shows is decoded, and looks at it when its size is known.
+  #begin(engine) {
+    const { scene } = engine;
+    const { header } = this;
     if (!this.camera) this.#look(engine);
+    if (this.#begun || !header || (scene && !scene.ready(this.frame))) return;
+    this.#begun = true;
+    this.#list(scene);
     const layers = this.$("[data-set=layers]");
     layers.hidden = header.layers < 2;
     const choices = Array.from({ length: header.layers - 1 }, (_, k) => new Option(`${k + 1} of ${header.layers} layers`, k + 1));
@@ -224,12 +227,13 @@ export class GsvPlayer extends HTMLElement {
     this.dispatchEvent(new CustomEvent("ready"));
   }
 
-  // The size of the scene is known.
   #look(engine) {
     const { config } = engine.source;
+    const bounds = engine.scene ? engine.scene.bounds(this.frame) : engine.bounds;
+    if (!bounds) return;
     const color = /^#?([0-9a-f]{6})$/i.exec(this.getAttribute("background") ?? "")?.[1];
     if (color) config.background = [0, 2, 4].map((i) => parseInt(color.slice(i, i + 2), 16) / 255);
-    this.camera = new Camera(engine.bounds, config.up, config.cameras);
+    this.camera = new Camera(bounds, config.up, config.cameras);
     this.camera.use(config.cameras.findIndex((c) => c.name === this.getAttribute("camera")));
     const select = this.$("[data-set=view]");
     select.replaceChildren(new Option("Free view", "orbit"), ...config.cameras.map((c, i) => new Option(c.name, i)));
@@ -250,16 +254,19 @@ export class GsvPlayer extends HTMLElement {
     const passed = this.sound?.passed() ?? Math.min(now - this.#last, 250) / 1000;
     this.#last = now;
     if (!engine?.source?.groups.length || !this.$(".error").hidden) return;
+    const { scene } = engine;
     let group = engine.groupOf(this.frame);
-    if (engine.failed.has(group)) group = this.#passOver(group);
+    if (!scene && engine.failed.has(group)) group = this.#passOver(group);
     if (group === null) return;
-    engine.want(group, this.#loops);
-    const ready = engine.ready(group) && this.camera;
+    if (scene) scene.want(this.frame, this.#loops);
+    else engine.want(group, this.#loops);
+    if (!this.#begun) this.#begin(engine); // also when a track that it waited for is lost
+    const decoded = () => (scene ? scene.ready(this.frame) : engine.ready(engine.groupOf(this.frame)));
+    const ready = (scene ? decoded() : engine.ready(group)) && this.camera;
     if (ready && !this.paused) this.#advance(passed);
     this.sound?.follow(this.#position, ready && !this.paused, this.#loops);
-    const shown = engine.groupOf(this.frame);
-    if (ready && engine.ready(shown) && engine.renderer.free) this.#draw(now);
-    this.#wait(now, ready && engine.ready(shown));
+    if (ready && decoded() && engine.renderer.free) this.#draw(now);
+    this.#wait(now, ready && decoded());
     this.#follow(now);
   }
 
@@ -323,7 +330,7 @@ export class GsvPlayer extends HTMLElement {
   #draw(now) {
     const view = this.#view(this.paused && now - this.#moved > STILL);
     const { engine } = this;
-    const what = `${this.frame} ${view} ${engine.layers} ${engine.onGpu} ${engine.gaussians(engine.groupOf(this.frame))}`;
+    const what = `${this.frame} ${view} ${engine.layers} ${engine.onGpu} ${engine.gaussians(this.frame)}`;
     if (what === this.#drawn) return;
     this.#drawn = what;
     engine.draw(this.frame, view);
@@ -485,7 +492,24 @@ export class GsvPlayer extends HTMLElement {
 
   // Actions
 
-  #set({ dataset, value }) {
+  // The list of the tracks of a scene, which show and hide them.
+  #list(scene) {
+    this.$(".tracks").hidden = !(scene?.tracks.length > 1);
+    this.$(".tracks").replaceChildren(...(scene?.tracks ?? []).map(({ name, hidden }, i) => {
+      const [label, box] = [document.createElement("label"), document.createElement("input")];
+      Object.assign(box, { type: "checkbox", checked: !hidden });
+      box.dataset.track = i;
+      label.append(box, name);
+      return label;
+    }));
+  }
+
+  #set({ dataset, value, checked }) {
+    if (dataset.track) {
+      this.engine.scene.tracks[dataset.track].hidden = !checked;
+      [this.#drawn, this.#moved] = ["", performance.now()];
+      return this.#grown();
+    }
     if (dataset.set === "view") {
       if (value === "orbit") this.camera.reset();
       else this.camera.use(Number(value));

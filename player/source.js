@@ -37,8 +37,12 @@ export class Source extends EventTarget {
   #whole = null; // all bytes so far, from a server without Range
   #closing = new AbortController();
 
-  constructor(url) {
+  tracks = 1; // of the file
+
+  // track: which of them
+  constructor(url, track = 0) {
     super();
+    this.track = track;
     this.url = new URL(url, document.baseURI).href;
   }
 
@@ -54,13 +58,14 @@ export class Source extends EventTarget {
   async open(create) {
     const [native, head] = await Promise.all([create(), this.#start()]);
     this.native = native; // whose demuxer is used
+    native.track(this.track);
     if (!head.length) throw new StreamError("The file is empty.");
     this.total ??= await this.#size();
     this.native.push(head);
     let d = this.native.describe();
     while (!d.config && (await this.#more())) d = this.native.describe();
     if (!d.config) throw new StreamError("The file ends before its header does.");
-    this.config = d.config;
+    [this.config, this.tracks] = [d.config, d.tracks];
     if (d.index.length && !this.#whole) {
       this.#head = head;
       this.#useIndex(d.index, d.layers);

@@ -75,12 +75,13 @@ function groupWorker(native, { ports }) {
     Object.assign(band, { length, buffer });
   }
 
-  function draw({ id, group, t, view, background, ends, piece, pieces }) {
+  // pose: of the track, see tracks.js.
+  function draw({ id, group, t, pose, view, background, ends, piece, pieces }) {
     const start = performance.now();
     const places = [];
     let load = null;
     for (const slot of groups.get(group)) {
-      native.frame(slot, t);
+      native.frame(slot, t, pose);
       const drawn = native.project(view, ports.length, ({ i, bands, first, rows, splats }) => {
         places[i] ??= { bands, first, rows, own: { piece, pieces, length: 0, buffer: null } };
         append(places[i].own, i, splats);
@@ -93,9 +94,9 @@ function groupWorker(native, { ports }) {
     self.postMessage({ type: "projected", id, load, ms: performance.now() - start }, [load.buffer]);
   }
 
-  function pack({ id, group, t, view, origin, all, piece }) {
+  function pack({ id, group, t, pose, view, origin, all, piece }) {
     const start = performance.now();
-    const parts = groups.get(group).map((slot) => (native.frame(slot, t), native.pack(view, origin, all).slice()));
+    const parts = groups.get(group).map((slot) => (native.frame(slot, t, pose), native.pack(view, origin, all).slice()));
     const { buffer } = parts.length === 1 ? parts[0] : joined(parts);
     self.postMessage({ type: "packed", id, piece, buffer, ms: performance.now() - start }, [buffer]);
   }

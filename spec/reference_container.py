@@ -81,7 +81,7 @@ PAIRS = {1: 2**26, 2: 2**28, 3: 2**30, 4: 2**32}  # clause 5: N M
 
 # ---- 2. Container ---------------------------------------------------------------------------------------------------
 
-HEADER_BOXES = (b"ftyp", b"moov", b"sidx", b"moof")  # of the top level
+HEADER_BOXES = (b"ftyp", b"moov", b"sidx", b"ssix", b"moof")  # of the top level
 
 
 def boxes(data, position, end, top_level=False):
@@ -101,6 +101,8 @@ def boxes(data, position, end, top_level=False):
         elif size == 0:
             require(kind == b"mdat" and top_level, f"box {kind!r} at byte {offset}: size 0 is for mdat only")
             size = 2**64  # to the end of the file, which may still grow
+        elif offset + size >= 2**64:
+            raise BitstreamError(f"box {kind!r} at byte {offset}: size {size}, expected an end below 2^64")
         require(size >= header, f"box {kind!r} at byte {offset}: size {size} is less than its header")
         if top_level and kind in HEADER_BOXES and size - header > 2**24:
             raise LimitError(f"box {kind!r} at byte {offset}: {size} bytes, at most 16 MiB are allowed")
@@ -119,6 +121,14 @@ def find_box(data, box, path):
         if box is None:
             return None
     return box
+
+
+def find_leniently(data, box, path):
+    """As `find_box`; None also where a box on the way is malformed: that of a track which readers ignore."""
+    try:
+        return find_box(data, box, path)
+    except BitstreamError:
+        return None
 
 
 def open_box(data, box, path):
@@ -146,6 +156,19 @@ class Config:
     track_id: int = 0
     defaults: dict = field(default_factory=dict)  # of trex: duration, size, flags
     audio: "Audio | None" = None
+    placement: "Placement" = field(default_factory=lambda: Placement())
+    tracks: int = 1  # gsv tracks of the file
+
+
+@dataclass
+class Placement:
+    """gsvT (clause 2.8)."""
+
+    hidden: bool = False
+    name: str = ""
+    offset: int = 0
+    repeats: int = 1
+    keys: list = field(default_factory=list)  # (time, rotation [4], translation [3], scale)
 
 
 @dataclass
@@ -170,17 +193,19 @@ class Sample:
     audio: tuple | None = None  # (media time, [(size, duration)], bytes)
 
 
-def read_container(data):
-    """Clause 2: bytes of a file -> (Config, [Sample])."""
+def read_container(data, track=0):
+    """Clause 2: bytes of a file -> (Config, [Sample]) of one of its gsv tracks."""
     config, pending, samples, first = None, [], [], True
+    require(
+        len(data) < 8 or data[4:8] == b"ftyp", f"the first box is {bytes(data[4:8])!r}, expected ftyp: not a gsv file"
+    )
     for box in boxes(data, 0, len(data), top_level=True):
         kind, offset, body, end = box
-        require(kind == b"ftyp" or not first, f"the first box is {kind!r}, expected ftyp: not a gsv file")
         if first:
             read_ftyp(data, body, end)
         elif kind == b"moov":
             require(config is None, f"second moov at byte {offset}")
-            config = read_moov(data, box)
+            config = read_moov(data, box, track)
         elif kind == b"moof":
             require(config is not None, f"moof at byte {offset} before moov")
             require(not pending, f"moof at byte {offset}: the mdat of the one before is missing")
@@ -208,21 +233,28 @@ def read_ftyp(data, body, end):
 def tracks(data, moov, handler):
     """The tracks of a handler."""
     for trak in list(boxes(data, moov[2], moov[3])):
-        hdlr = find_box(data, trak, [b"mdia", b"hdlr"]) if trak[0] == b"trak" else None
+        hdlr = find_leniently(data, trak, [b"mdia", b"hdlr"]) if trak[0] == b"trak" else None
         if hdlr is not None and data[hdlr[2] + 8 : min(hdlr[3], hdlr[2] + 12)] == handler:
             yield trak
 
 
-def read_moov(data, moov):
-    """Clause 2.2: the first track of handler `volv`, and the audio track."""
-    trak = next(tracks(data, moov, b"volv"), None)
-    require(trak is not None, "moov: no track with handler volv")
+def read_moov(data, moov, track):
+    """Clause 2.2: a track of handler `volv`, and with the first one the audio track."""
+    found = list(tracks(data, moov, b"volv"))
+    if len(found) > 64:
+        raise LimitError(f"moov: {len(found)} tracks, at most 64 are allowed")
+    require(track < len(found), f"moov: no track {track} with handler volv, found {len(found)}")
+    trak = found[track]
     track_id, timescale = read_timed(data, trak, [b"tkhd"]), read_timed(data, trak, [b"mdia", b"mdhd"])
     require(timescale > 0, "mdhd: timescale is 0")
     config = read_sample_entry(data, trak)
     config.track_id, config.timescale = track_id, timescale
     config.defaults = read_defaults(data, moov, track_id)
-    config.audio = read_audio_track(data, moov)
+    config.tracks = len(found)
+    for other in found:
+        own = read_timed(data, other, [b"tkhd"]) if other is not trak and find_box(data, other, [b"tkhd"]) else None
+        require(own != track_id, f"tkhd: two tracks have the track_ID {track_id}")
+    config.audio = read_audio_track(data, moov) if track == 0 else None
     return config
 
 
@@ -240,8 +272,8 @@ def read_defaults(data, moov, track_id):
 def read_audio_track(data, moov):
     """Clause 2.7, moov; None if there is none."""
     for trak in tracks(data, moov, b"soun"):
-        stsd = find_box(data, trak, [b"mdia", b"minf", b"stbl", b"stsd"])
-        entry = next(boxes(data, stsd[2] + 8, stsd[3]), None) if stsd else None
+        stsd = find_leniently(data, trak, [b"mdia", b"minf", b"stbl", b"stsd"])
+        entry = next(iter(list(boxes(data, stsd[2] + 8, stsd[3])) if stsd else ()), None)
         if entry is None or entry[0] not in (b"mp4a", b"Opus"):
             continue
         kind, offset, body, end = entry
@@ -271,11 +303,33 @@ def read_sample_entry(data, trak):
     """Clause 2.2: stsd with the entry gsv1, and in it gsvC."""
     reader = open_box(data, trak, [b"mdia", b"minf", b"stbl", b"stsd"])
     reader.take(8)  # version, flags, entry_count
-    entry = next((e for e in boxes(data, reader.position, reader.end) if e[0] == b"gsv1"), None)
+    entry = next((e for e in list(boxes(data, reader.position, reader.end)) if e[0] == b"gsv1"), None)
     require(entry is not None, "stsd: no sample entry gsv1")
     Reader(data, entry[2], entry[3], "gsv1").take(40)
     kind, offset, body, end = entry
-    return read_gsvc(open_box(data, (kind, offset, body + 40, end), [b"gsvC"]))
+    inside = (kind, offset, body + 40, end)
+    config = read_gsvc(open_box(data, inside, [b"gsvC"]))
+    if find_box(data, inside, [b"gsvT"]):
+        config.placement = read_gsvt(open_box(data, inside, [b"gsvT"]))
+    return config
+
+
+def read_gsvt(r):
+    """Clause 2.8."""
+    flags, name = r.u8(), r.take(r.u8())
+    try:
+        name = name.decode()
+    except UnicodeDecodeError:
+        raise BitstreamError(f"gsvT: track name {name!r} is not UTF-8, expected track names in UTF-8") from None
+    offset, repeats, keys = r.i32(), r.u32(), []
+    for _ in range(r.u16()):
+        time, rotation = r.i32(), np.array([r.f32("rotation") for _ in range(4)])
+        length = (rotation**2).sum()
+        require(0.998 <= length <= 1.002, f"gsvT: a rotation whose squared length is {length}, expected 0.998 to 1.002")
+        translation, scale = np.array([r.f32("translation") for _ in range(3)]), r.f32("scale", positive=True)
+        require(not keys or time > keys[-1][0], f"gsvT: time {time}, expected keys in the order of their times")
+        keys.append((time, rotation / np.sqrt(length), translation, scale))
+    return Placement(bool(flags & 1), name, offset, repeats, keys)
 
 
 def read_gsvc(r):
@@ -316,8 +370,8 @@ def read_gsvc(r):
     )
 
 
-def read_traf(data, moof, track_id, defaults):
-    """Clause 2.4: (base, defaults, time, trun) of the traf of a track; None if there is none."""
+def read_trafs(data, moof, track_id, defaults):
+    """Clause 2.4: yields (base, defaults, time, trun) of each traf of a track."""
     for traf in list(boxes(data, moof[2], moof[3])):
         if traf[0] != b"traf":
             continue
@@ -325,24 +379,23 @@ def read_traf(data, moof, track_id, defaults):
         flags, found = tfhd.u32() & 0xFFFFFF, tfhd.u32()
         if found != track_id:
             continue
-        defaults = dict(defaults)
+        own = dict(defaults)
         base = tfhd.u64() if flags & 0x01 else moof[1]
         if flags & 0x02:
             tfhd.u32()  # sample_description_index
         for bit, name in ((0x08, "duration"), (0x10, "size"), (0x20, "flags")):
             if flags & bit:
-                defaults[name] = tfhd.u32()
+                own[name] = tfhd.u32()
         tfdt = open_box(data, traf, [b"tfdt"])
         time = tfdt.u64() if tfdt.u32() >> 24 == 1 else tfdt.u32()
         truns = sum(box[0] == b"trun" for box in boxes(data, traf[2], traf[3]))
         require(truns <= 1, f"moof at byte {moof[1]}: {truns} trun of a track, expected one, of one sample or of sound")
-        return base, defaults, time, open_box(data, traf, [b"trun"])
-    return None
+        yield base, own, time, open_box(data, traf, [b"trun"])
 
 
 def read_moof(data, moof, config):
     """Clause 2.4: [(offset, size, start_frame, frames, sync, audio)] of the gsv track: none or one."""
-    found = read_traf(data, moof, config.track_id, config.defaults)
+    found = next(read_trafs(data, moof, config.track_id, config.defaults), None)
     if found is None:
         return []
     base, sample, time, trun = found
@@ -352,7 +405,7 @@ def read_moof(data, moof, config):
     if flags & 0x004:
         sample["flags"] = trun.u32()  # first_sample_flags
     for bit, name in ((0x100, "duration"), (0x200, "size"), (0x400, "flags")):
-        if flags & bit:
+        if flags & bit and not (name == "flags" and flags & 0x004):
             sample[name] = trun.u32()
     frames, rest = divmod(sample["duration"], config.frame_duration)
     require(
@@ -367,10 +420,18 @@ def read_moof(data, moof, config):
 
 def read_sound(data, moof, audio, group):
     """Clause 2.7: (media time, [(size, duration)]) of the samples in front of a group, None if there are none."""
-    found = read_traf(data, moof, audio.track_id, audio.defaults)
-    if found is None:
-        return None
-    base, defaults, time, trun = found
+    for base, defaults, time, trun in read_trafs(data, moof, audio.track_id, audio.defaults):
+        start, samples = read_run(trun, base, defaults)
+        end = start + sum(size for size, _ in samples)
+        fits = not samples or end == group
+        require(fits, f"moof at byte {moof[1]}: sound ends at byte {end}, expected where the group starts")
+        if samples:
+            return time, samples
+    return None
+
+
+def read_run(trun, base, defaults):
+    """Clause 2.7: offset of the first sample of a trun of sound, and [(size, duration)]."""
     flags, count = trun.u32() & 0xFFFFFF, trun.u32()
     if count > 65536:
         raise LimitError(f"traf of the audio track: {count} samples, at most 65536 are allowed")
@@ -381,9 +442,8 @@ def read_sound(data, moof, audio, group):
         duration = trun.u32() if flags & 0x100 else defaults["duration"]
         size = trun.u32() if flags & 0x200 else defaults["size"]
         trun.take(4 * (flags >> 10 & 3).bit_count())  # flags, composition offset
-        require(size > 0 and duration > 0, f"moof at byte {moof[1]}: {size} bytes, {duration} units, at least one byte")
+        require(
+            size > 0 and duration > 0, f"trun: a sample of {size} bytes, {duration} units, expected at least one byte"
+        )
         samples.append((size, duration))
-    end = start + sum(size for size, _ in samples)
-    fits = not samples or end == group
-    require(fits, f"moof at byte {moof[1]}: sound ends at byte {end}, expected where the group starts")
-    return (time, samples) if samples else None
+    return start, samples

@@ -6,6 +6,7 @@ entropy decoding works on Python integers, bin after bin. Strict: one damaged un
 
     reference_container.py  clauses 1, 2      reference_units.py     clauses 3 to 5
     reference_entropy.py    clause 6          reference_integers.py  clauses 7 to 12
+    reference_scene.py      clause 2.8
 
     python spec/reference_decoder.py FILE.gsv [--npz OUT.npz]     prints the conformance hash (clause 16) of each group
 """
@@ -402,9 +403,9 @@ def group_hash(group):
     return hash_arrays(group.header.frames, group.header.grid_bits, [array for _, array in arrays(group)])
 
 
-def decode(data):
-    """A whole file -> (Config, [(Sample, Group)])."""
-    config, samples = read_container(data)
+def decode(data, track=0):
+    """A whole file -> (Config, [(Sample, Group)]) of one of its tracks."""
+    config, samples = read_container(data, track)
     groups = []
     for i, sample in enumerate(samples):
         back = read_reference(sample.payload)

@@ -70,31 +70,6 @@ def covariances(g: Gaussians) -> np.ndarray:
     return M @ M.transpose(0, 2, 1)
 
 
-def to_npz(path, group: DenseGroup | ParametricGroup) -> None:
-    """A group in half precision; what holds over the group is stored once."""
-    frames = [group.frame(t) for t in range(len(group))]
-    np.savez_compressed(
-        path,
-        means=np.stack([f.means for f in frames]),
-        quats=np.stack([f.quats for f in frames]).astype(np.float16),
-        sh0=np.stack([f.sh0 for f in frames]).astype(np.float16),
-        log_scales=frames[0].log_scales.astype(np.float16),
-        logit_opacities=frames[0].logit_opacities.astype(np.float16),
-    )
-
-
-def from_npz(path) -> GaussianSequence:
-    """The mirror of `to_npz`."""
-    with np.load(path) as z:
-        a = {k: v.astype(np.float32) for k, v in z.items()}
-    frames = []
-    for means, quats, sh0 in zip(a["means"], a["quats"], a["sh0"], strict=True):
-        none = np.zeros((len(means), 0, 3), np.float32)
-        g = Gaussians(means, quats, a["log_scales"], a["logit_opacities"], sh0, none)
-        frames.append(g.validate(str(path)))
-    return GaussianSequence(30.0, [DenseGroup(frames)])
-
-
 def gaussians(n, k=0, seed=0):
     """`n` Gaussians without any order, with `k` harmonics."""
     rng = np.random.default_rng(seed)

@@ -123,6 +123,18 @@ def test_sound_that_starts_late_is_filled_up(folder, tmp_path):
     assert abs(told_time(samples[middle - 2000 : middle + 2000], rate) - 0.7) < 0.03
 
 
+def test_maps_keep_the_sound(folder, tmp_path):
+    tone_stream(tmp_path / "a.gsv", folder / "tone.m4a", groups=3)
+    done = run("decode", "--maps", tmp_path / "a.gsv", tmp_path / "maps")
+    assert done.returncode == 0, done.stderr
+    done = run("encode", "--from-maps", tmp_path / "maps", tmp_path / "b.gsv")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "b.gsv").read_bytes() == (tmp_path / "a.gsv").read_bytes()
+    sound = tmp_path / "maps" / "sound.bin"
+    sound.write_bytes(sound.read_bytes()[:-1])
+    fails(run("encode", "--from-maps", tmp_path / "maps", tmp_path / "c.gsv"), "sound.bin has")
+
+
 def test_a_file_of_another_codec_is_no_track():
     with pytest.raises(BitstreamError, match="AAC or Opus"):
         _native.read_audio(b"\0\0\0\x08moov")

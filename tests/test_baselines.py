@@ -20,7 +20,7 @@ from gscodec.splats import write_splat
 
 KEYS = {"sequence", "codec", "setting", "kb_per_frame", "codec_psnr", "encode_s_per_frame", "decode_ms_per_frame"}
 FINEST = {"videogs": "qp 8", "videogs-raw": "qp 8", "x265": "rp0", "svt-av1": "qp 4", "gsav": "snap 0"}
-FINEST |= {"zstd": "8 bit", "draco": "16/8 bit", "sog": "default", "spz": "default"}
+FINEST |= {"zstd": "8 bit", "webp": "8 bit", "draco": "16/8 bit", "sog": "default", "spz": "default"}
 
 
 @pytest.mark.parametrize("name", BASELINES)

@@ -293,7 +293,7 @@ def test_damage_anywhere_behind_the_index_costs_one_group_and_its_followers():
     config = {**CONFIG, "sh_degree": 3}
     fragments = [_native.fragment(p, i + 1, 8 * i, 8, i != 2, config) for i, p in enumerate(payloads)]
     index = [(len(f), 8, i != 2, []) for i, f in enumerate(fragments)]
-    head = _native.finish(_native.init_segment(config), index)
+    head = _native.finish(_native.init_segment(config), [index])
     data = head + b"".join(fragments)
     ends = len(head) + np.cumsum([len(f) for f in fragments])
     want = known.frame(3)["means"]
@@ -350,7 +350,7 @@ def make_file(frames=(20, 1, 7)):
         parts.append(_native.fragment(payload, number, start, n, number != 2, CONFIG))
         index.append((len(parts[-1]), n, number != 2, []))
         start += n
-    return _native.finish(init, index) + b"".join(parts), payload
+    return _native.finish(init, [index]) + b"".join(parts), payload
 
 
 def test_file_round_trip():

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 from drawn_wall import write_wall
+from rig_layouts import dynamic3dgs
 from test_cli import fails, run
-from test_layouts import dynamic3dgs
 
 from gscodec.capture.report import describe_capture
 from gscodec.capture.sheet import BORDER, COLOURS, WIDTH, contact_sheet

@@ -145,6 +145,14 @@ def test_wrong_paths_and_values(folder, tmp_path):
     fails(run("render", gsv, tmp_path / "o", "--size", "huge"), "WxH")
     fails(run("render", gsv, tmp_path / "o.avi"), ".mp4")
     fails(run("eval", gsv, folder), "neither a capture nor splats", "looked for")
+    cut = (folder / "plys" / "000000.ply").read_bytes()[:-9]
+    (tmp_path / "cut.ply").write_bytes(cut)
+    fails(run("encode", tmp_path / "cut.ply", tmp_path / "o.gsv"), "cut.ply: truncated")
+    (tmp_path / "cut.ply").unlink()
+    fails(run("encode", gsv, tmp_path / "o.gsv"), "a stream already, neither a capture nor splats")
+    fails(run("encode", tmp_path, tmp_path / "o.gsv"), "the folder is empty, neither a capture nor splats")
+    fails(run("render", folder, tmp_path / "o.mp4"), "a folder, expected a .gsv file")
+    fails(run("decode", folder / "report.json", tmp_path / "o"), "not a .gsv file")
     fails(run("encode"), "SEQ", code=2)
     assert not list(tmp_path.iterdir()), "nothing is left behind"
 

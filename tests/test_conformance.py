@@ -15,27 +15,35 @@ import pytest
 
 from gscodec import _native, errors
 from gscodec.decode import Stream
+from gscodec.decode.scene import read_scene
 
 SPEC = Path(__file__).resolve().parents[1] / "spec"
 VECTORS = SPEC / "vectors"
 sys.path[:0] = [str(SPEC), str(VECTORS)]
 import make  # noqa: E402
 import reference_decoder as reference  # noqa: E402
+from reference_scene import scene_frame  # noqa: E402
 
 MANIFEST = json.loads((VECTORS / "manifest.json").read_text())
 VALID = {Path(entry["file"]).stem: entry for entry in MANIFEST["valid"]}
 INVALID = {Path(entry["file"]).stem: entry for entry in MANIFEST["invalid"]}
 
 
-def native_groups(data):
-    """[(fragment, DecodedGroup)] of a file, by the package."""
-    stream = Stream(data)
+def native_groups(data, track=None):
+    """[(fragment, DecodedGroup)] of a track of a file, by the package."""
+    stream = Stream(data, track=track)
     return [(fragment, stream.group(i)) for i, fragment in enumerate(stream.groups)]
 
 
 def decode_all(data):
-    """Every group, by who knows both the file and the group, and so compares them."""
-    return [group for _, group in native_groups(data)]
+    """Every group of every track, by who knows both the file and the group, and so compares them."""
+    count = _native.track_count(data)
+    return [group for k in range(count) for _, group in native_groups(data, k or None)]
+
+
+def reference_decode_all(data):
+    first, _ = reference.decode(data)
+    return [reference.decode(data, k) for k in range(first.tracks)]
 
 
 def native_hash(group):
@@ -56,7 +64,8 @@ def assert_close(got, expected, name):
 
 def test_manifest_lists_the_cases():
     assert list(VALID) == list(make.VALID)
-    assert {name: entry["error"] for name, entry in INVALID.items()} == {n: c[0] for n, c in make.INVALID.items()}
+    reasons = {name: (entry["error"], entry["reason"]) for name, entry in INVALID.items()}
+    assert reasons == {name: case[:2] for name, case in make.INVALID.items()}
     files = {path.relative_to(VECTORS).as_posix() for path in VECTORS.glob("*valid/*")}
     assert files == {entry["file"] for entry in MANIFEST["valid"] + MANIFEST["invalid"]}
 
@@ -65,12 +74,18 @@ def test_manifest_lists_the_cases():
 def test_valid(name):
     entry = VALID[name]
     data = (VECTORS / entry["file"]).read_bytes()
-    _, decoded = reference.decode(data)
-    native = native_groups(data)
     assert len(data) < 30_000
     assert entry["frames"] == sum(group["frames"] for group in entry["groups"])
-    assert len(decoded) == len(native) == len(entry["groups"])
-    for (sample, group), (fragment, ours), facts in zip(decoded, native, entry["groups"], strict=True):
+    tracks = [entry["groups"], *entry.get("tracks", ())]
+    assert _native.track_count(data) == len(tracks)
+    for k, groups in enumerate(tracks):
+        compare(name, data, reference.decode(data, k)[1], native_groups(data, k or None), groups)
+
+
+def compare(name, data, decoded, native, groups):
+    """The groups of a track, by both decoders and as the manifest has them."""
+    assert len(decoded) == len(native) == len(groups)
+    for (sample, group), (fragment, ours), facts in zip(decoded, native, groups, strict=True):
         assert reference.group_hash(group) == native_hash(ours.quantized()) == facts["sha256"]
         assert ours.frames == fragment["frames"]
         for key in ("start_frame", "frames", "sync"):
@@ -86,6 +101,19 @@ def test_valid(name):
                 assert_close(frame[key], values, f"{name}, frame {t}, {key}")
 
 
+@pytest.mark.parametrize("name", [name for name in VALID if name.startswith("track")])
+def test_scene(name):
+    """Frames of a scene, placed and behind one another, by both decoders."""
+    data = (VECTORS / VALID[name]["file"]).read_bytes()
+    scene = read_scene(data)
+    assert scene.frame_count > 1
+    for t in range(scene.frame_count):
+        expected, frame = scene_frame(data, t), scene.frame(t)
+        assert len(frame) == len(expected.get("means", ()))
+        for key, values in expected.items():
+            assert_close(getattr(frame, key), values, f"{name}, frame {t}, {key}")
+
+
 @pytest.mark.parametrize("name", VALID)
 def test_encoder_still_makes_these_integers(name):
     """The encoder may write other bytes than it did when the vectors were made, but they must mean the same."""
@@ -99,7 +127,7 @@ def test_invalid(name):
     data = (VECTORS / INVALID[name]["file"]).read_bytes()
     assert message
     with pytest.raises(getattr(reference, error)) as theirs:
-        reference.decode(data)
+        reference_decode_all(data)
     assert message.lower() in str(theirs.value).lower()
     with pytest.raises(getattr(errors, error)) as caught:
         decode_all(data)
@@ -156,6 +184,20 @@ def test_some_tiles(name):
             told = [sum(place[1] for place in own if place) for own in theirs[i].tiles]
             assert ours[i].layers == told == [sum(t["gaussians"] for t in own) for own in ours[i].tiles()]
             assert len(theirs[i].positions) < VALID[name]["groups"][i]["gaussians"]
+
+
+def test_a_missing_leading_tile_says_who_needs_it():
+    """Tile 2 is asked for, and the bytes of tile 0, from which it starts, are not there."""
+    data = (VECTORS / VALID["tiles"]["file"]).read_bytes()
+    _, (sample,) = reference.read_container(data)
+    first = next(u for u in _native.units(sample.payload) if u["type"] == "tile")
+    start, end = first["offset"], first["offset"] + first["bytes"]
+    payload = sample.payload[:start] + bytes(end - start) + sample.payload[end:]
+    said = rf"byte {start}, unit 1 \(tile 0\): .* damaged; the tiles that were asked for start from it$"
+    with pytest.raises(errors.BitstreamError, match=said):
+        _native.DecodedGroup(payload, 1, tiles=[[t == 2 for t in range(9)]])
+    with pytest.raises(reference.BitstreamError, match="unit 1: wrong CRC"):
+        reference.decode_group(payload, 1, tiles=lambda k, t: t == 2)
 
 
 def test_reference_command(tmp_path):

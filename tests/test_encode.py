@@ -16,12 +16,14 @@ from gscodec.decode import Stream, open_stream
 from gscodec.encode.axis_order import sorted_axes
 from gscodec.encode.coder import CoderState, GroupCoder
 from gscodec.encode.encode import StreamOutput, encode_groups, stream_config
+from gscodec.encode.measure import measure_group
 from gscodec.encode.rdo import coded_layers
 from gscodec.encode.rotation_residuals import EXPONENT_UNIT, fit_scale_exponents, quantize_rotations, step_factors
-from gscodec.encode.settings import EncodeSettings, RdoSettings, ScaleExponentSettings
+from gscodec.encode.settings import EncodeSettings, PlanSettings, RdoSettings, ScaleExponentSettings
 from gscodec.encode.writer import StreamWriter
 from gscodec.errors import BitstreamError, CaptureError, UsageError
 from gscodec.fit import fit_groups
+from gscodec.model.camera import Camera, look_at
 from gscodec.model.gaussian_sequence import DenseGroup
 from gscodec.model.gaussians import Gaussians
 from gscodec.model.parametric_group import NodeMotion, ParametricGroup
@@ -181,6 +183,24 @@ def test_lifetimes_survive(tmp_path):
     stream = open_stream(tmp_path / "a.gsv")
     for t in range(6):
         assert len(stream.frame(t)) == len(sequence.frame(t))
+
+
+def test_what_lives_in_one_frame_of_a_room_is_measured_there():
+    """Within an opaque shell, which hides it from all views but those of the capture."""
+    frames, each, rng = 20, 4, np.random.default_rng(0)
+    shell, inside = (rng.normal(size=(n, 3)) for n in (3000, frames * each))
+    shell *= 3 / np.linalg.norm(shell, axis=1, keepdims=True)
+    n = len(shell) + len(inside)
+    size = np.where(np.arange(n) < len(shell), 0.3, 0.1)[:, None].repeat(3, 1)
+    arrays = (np.concatenate([shell, 0.2 * inside]), np.tile([1.0, 0, 0, 0], (n, 1)), np.log(size), np.full(n, 6.0))
+    g = Gaussians(*(a.astype(np.float32) for a in (*arrays, np.zeros((n, 3)), np.zeros((n, 0, 3)))))
+    t = np.arange(frames * each) // each
+    lifetimes = np.concatenate([np.tile([0, frames], (len(shell), 1)), np.stack([t, t + 1], 1)]).astype(np.int32)
+    K = np.array([[60, 0, 32], [0, 60, 32], [0, 0, 1.0]])
+    eyes = 1.5 * np.array([[1, 0, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])
+    cameras = [Camera(str(i), K, look_at(eye, (0, 0, 0), (0, 1, 0)), 64, 64) for i, eye in enumerate(eyes)]
+    removal = measure_group(ParametricGroup(frames, g, None, {}, lifetimes), cameras, PlanSettings()).removal
+    assert removal[len(shell) :].reshape(frames, each).max(1).min() > 1e-2 * removal[len(shell) :].max()
 
 
 def test_a_trainers_nodes_carry_newcomers_from_where_these_rest():

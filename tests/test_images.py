@@ -6,6 +6,7 @@ from test_capture import write_image
 
 from gscodec.capture import View, composite
 from gscodec.capture.images import read_image, resize_area
+from gscodec.errors import CaptureError
 
 
 @pytest.mark.parametrize(
@@ -27,6 +28,14 @@ def test_exr_is_linear_and_premultiplied(tmp_path):
     view = read_image(tmp_path / "a.exr")
     np.testing.assert_array_equal(view.rgb[0, 0], [188, 124, 25])
     assert view.alpha[0, 0] == 128
+
+
+def test_a_truncated_image_is_named_in_one_line(tmp_path):
+    path = tmp_path / "a.png"
+    write_image(path, np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8))
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(CaptureError, match=r"^.*a.png: damaged image \(.+\), expected a whole file; copy it again$"):
+        read_image(path)
 
 
 def test_grey_image(tmp_path):

@@ -12,6 +12,8 @@ from synthetic import encode_sequence, turning
 from gscodec.splats import write_sequence
 
 ROOT = Path(__file__).parent.parent
+# Without what would put another gscodec in front of the wheel's.
+OUTSIDE = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
 
 
 @pytest.fixture(scope="module")
@@ -23,8 +25,8 @@ def player(tmp_path_factory):
     subprocess.run(["make", "-s", "wheel", f"PYTHON={sys.executable}", f"DIST={path}"], cwd=ROOT, check=True)
     venv.create(path / "env", with_pip=True)
     wheel = next(path.glob("gscodec-*.whl"))
-    no_rust = {"PATH": f"{path}/env/bin:/usr/bin:/bin", "HOME": os.environ.get("HOME", "/")}
-    subprocess.run([path / "env/bin/python", "-m", "pip", "install", "-q", wheel], check=True, env=os.environ | no_rust)
+    no_rust = OUTSIDE | {"PATH": f"{path}/env/bin:/usr/bin:/bin"}
+    subprocess.run([path / "env/bin/python", "-m", "pip", "install", "-q", wheel], check=True, env=no_rust)
     sequence = turning(100, frames=3)
     write_sequence(sequence, path / "plys")
     encode_sequence(sequence, path / "a.gsv", stream_config(fps=25, sh_degree=0, gaussians=100, frames=6))
@@ -32,14 +34,17 @@ def player(tmp_path_factory):
 
 
 def run(player, *args):
-    env = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-    return subprocess.run([player / "env/bin/gscodec", *args], cwd=player, capture_output=True, text=True, env=env)
+    """Runs the program of the wheel."""
+    return subprocess.run([player / "env/bin/gscodec", *args], cwd=player, capture_output=True, text=True, env=OUTSIDE)
+
+
+def python(player, *args):
+    """Runs the interpreter that has the wheel."""
+    return subprocess.run([player / "env/bin/python", *args], cwd=player, capture_output=True, text=True, env=OUTSIDE)
 
 
 def test_the_environment_has_none_of_the_extra(player):
-    listed = subprocess.run(
-        [player / "env/bin/python", "-m", "pip", "list"], capture_output=True, text=True
-    ).stdout.lower()
+    listed = python(player, "-m", "pip", "list").stdout.lower()
     for name in ("torch", "opencv", "openimageio", "scikit-image", "dracopy", "imageio", "scipy"):
         assert name not in listed
 
@@ -66,7 +71,7 @@ for name in (*FILES, "stream.gsv"):
     r = c.getresponse()
     assert r.status == 200 and r.read(), name
 """
-    done = subprocess.run([player / "env/bin/python", "-c", code], cwd=player, capture_output=True, text=True)
+    done = python(player, "-c", code)
     assert done.returncode == 0, done.stderr
 
 

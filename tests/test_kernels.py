@@ -197,14 +197,19 @@ def test_trajectory_step_is_that_of_torch():
     shifted = torch.from_numpy(np.stack([noise[k : k + 150].reshape(50, 3) for k in range(3)]))
     bits = laplace_bits(leaf + shifted, log_scales)
     loss = (torch.from_numpy(at)[:, None, None] * leaf * torch.from_numpy(grad)).sum() + 0.2 * bits.sum()
-    optimizer = torch.optim.Adam([leaf], lr=0.1, betas=(0.9, 0.99), eps=1e-8)
     loss.backward()
-    optimizer.step()
+    first, second = leaf.grad.numpy(), at[:, None, None] * grad  # gradients of two steps, the second without a price
+    variance = np.array([(g * g).mean(0) for g in (first, second)])  # of the three coefficients together
+    wanted = coefficients - 0.1 * first / np.sqrt(variance[0])
     adam = TrajectoryAdam(CpuBackend(), AdamSettings(eps=1e-8))
     of_each = adam.step("means", coefficients, grad, at, (0.2, scales, noise), 0.1)
-    np.testing.assert_allclose(coefficients, leaf.detach().numpy(), atol=1e-4)
+    np.testing.assert_allclose(coefficients, wanted, atol=1e-4)
     np.testing.assert_allclose(of_each[:, 0], bits.sum((1, 2)).detach().numpy(), rtol=1e-4)
     np.testing.assert_allclose(0.2 * of_each[:, 1], log_scales.grad.flatten().numpy(), rtol=1e-3, atol=1e-3)
+    adam.step("means", coefficients, grad, at, None, 0.1)
+    moment = (0.09 * first + 0.1 * second) / (1 - 0.9**2)
+    variance = (0.0099 * variance[0] + 0.01 * variance[1]) / (1 - 0.99**2)
+    np.testing.assert_allclose(coefficients, wanted - 0.1 * moment / np.sqrt(variance), atol=1e-4)
 
 
 def test_offset_of_a_camera_is_added_to_the_light_of_the_gaussians():

@@ -15,6 +15,7 @@ from gscodec.capture.points import Points
 from gscodec.encode.settings import EncodeSettings
 from gscodec.model.camera import meeting_point
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.model.gaussians import PARAMETERS
 from gscodec.render.cpu import CpuBackend
 from gscodec.render.image import render_image, render_rgba
 from gscodec.train.calibration import Extrinsics
@@ -84,6 +85,33 @@ def test_matched_features_of_a_wall_lie_on_it():
     assert (np.abs(points.means[:, 1]) < 0.22).mean() > 0.9, "as near as those of the plane sweep"
     narrow = dataclasses.replace(TINY.initialization, parallax_min=90.0)
     assert not len(triangulated(capture, 0, narrow)), "no two neighbours see it from sides so far apart"
+
+
+def test_each_picture_is_decoded_once_for_the_initial_points():
+    wall, cameras, read = splat_wall(), [dataclasses.replace(c, split="train") for c in arc()], []
+
+    def look(camera, _):
+        read.append(camera)
+        return View(render_image(wall, cameras[camera], (0, 0, 0)), None)
+
+    initial_model(Capture("wall", 25.0, cameras, 1, False, look), 0, 300, TINY)
+    assert sorted(read) == list(range(len(cameras)))
+
+
+def test_a_keyframe_starts_from_depth_images():
+    """They take the place of the plane sweep, and cameras without them are no obstacle."""
+    wall, cameras = splat_wall(), [dataclasses.replace(c, split="train") for c in arc()]
+    params = {name: getattr(wall, name) for name in PARAMETERS}
+
+    def read(camera, _):
+        depth = None if camera == 0 else CpuBackend().render_depth(params, cameras[camera])
+        return View(render_image(wall, cameras[camera], (0, 0, 0)), None, depth)
+
+    capture = Capture("wall", 25.0, cameras, 1, False, read, has_depth=True)
+    no_shell = dataclasses.replace(TINY, plane_sweep=dataclasses.replace(TINY.plane_sweep, shell_points=0))
+    found = initial_model(capture, 0, 300, no_shell)[0].params["means"].numpy()
+    assert len(found) == 300
+    assert np.abs(found[:, 1]).max() < 0.3, "on the wall"
 
 
 @pytest.mark.parametrize("masks", [True, False])

@@ -5,9 +5,9 @@ import json
 import cv2
 import numpy as np
 import pytest
+from rig_layouts import LAYOUTS, zju_mocap
 from test_capture import GL, write_image
 from test_cli import fails, run
-from test_layouts import LAYOUTS, zju_mocap
 
 from gscodec.capture import open_capture
 from gscodec.capture.masks import make_masks
@@ -28,12 +28,13 @@ def truth(t):
     return (x - 35 - 14 * t) ** 2 + (y - 60) ** 2 < 22**2
 
 
-def picture(camera, t, light=1.0, shadow=False):
+def picture(camera, t, light=1.0, shadow=False, alike=False):
     seen = background(camera) * light
     if shadow:
         seen[95:110, 20:140] *= 0.7
     y, x = np.mgrid[:H, :W]
     disc = np.dstack([200 + 40 * np.sin((x - 14 * t) / 3), 40 + 30 * np.sin(y / 4), np.full((H, W), 30)]) * light
+    disc = np.roll(background(camera + 7), 14 * t, 1) if alike else disc
     noise = np.random.default_rng(99 + t).normal(0, 1.5, (H, W, 3))
     return (np.where(truth(t)[..., None], disc, seen) + noise).clip(0, 255).astype(np.uint8)
 
@@ -79,6 +80,16 @@ def test_what_moves_is_the_subject_and_light_is_not(tmp_path):
     make_masks(open_capture(tmp_path))
     assert overlaps(tmp_path).min() > 0.75
     assert overlaps(tmp_path).mean() > 0.85
+
+
+@pytest.mark.filterwarnings("ignore:.*nothing is found")
+def test_a_subject_of_the_colours_of_the_background_is_seen_where_other_frames_show_that(tmp_path):
+    write_scene(tmp_path, alike=True, frames=20)  # it leaves the picture after ten
+    make_masks(open_capture(tmp_path))
+    capture = open_capture(tmp_path)
+    seen = np.stack([capture.view(0, t).alpha > 127 for t in range(20)])
+    true = np.stack([truth(t) for t in range(20)])
+    assert (seen & true).sum() > 0.75 * (seen | true).sum()
 
 
 @pytest.mark.parametrize("layout", sorted(LAYOUTS))

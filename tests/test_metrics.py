@@ -308,7 +308,7 @@ def test_evaluate_splats():
     json.dumps(report, allow_nan=False)
     assert report["codec_psnr_fg"] == pytest.approx(psnr(grey(0), grey(10)))
     assert report["codec_psnr"] == pytest.approx(psnr(grey(0), grey(10)) + 10 * np.log10(4))
-    assert (report["frames"], report["kb_per_frame"], report["bits_per_gaussian_frame"]) == (3, 1.0, 80)
+    assert (report["frames"], report["kb_per_frame"], report["bits_per_gaussian_frame"]) == (3, 1.0, 40)
     assert [r["frame"] for r in report["per_frame"]] == [0, 2]
     assert report["psnr"] is None
 

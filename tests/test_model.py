@@ -196,58 +196,73 @@ def test_shapes_that_do_not_match_are_named(change, message):
         change(random_group()).frame(0)
 
 
-# ---- Blend of rigid motions -----------------------------------------------------------------------------------------
+# ---- Rigid motions of nodes -----------------------------------------------------------------------------------------
 
 
-def random_blend(n, m, k, flipped, seed=0):
-    """Poses [M, 16], rest [N, 3], neighbors [N, k], weights [N, k]; quaternions near each other up to their signs."""
+def f32(*arrays):
+    return tuple(np.ascontiguousarray(a, np.float32) for a in arrays)
+
+
+def random_nodes(n, m, k, flipped, seed=0):
+    """Positions at rest [M, 3], rotations [M, 4] near each other up to their signs, positions [M, 3]; and rest [N, 3],
+    neighbors [N, k], weights [N, k]."""
     rng = np.random.default_rng(seed)
     q = unit([1, 0, 0, 0] + 0.2 * rng.normal(size=(m, 4)))
     if flipped:
         q *= np.where(np.arange(m) % 2, -1, 1)[:, None]
-    poses = np.concatenate([rng.normal(size=(m, 12)), q], 1).astype(np.float32)
+    nodes = f32(rng.normal(size=(m, 3)), q, rng.normal(size=(m, 3)))
     neighbors = rng.permuted(np.tile(np.arange(m, dtype=np.uint32), (n, 1)), axis=1)[:, :k]
-    weights = rng.dirichlet(np.ones(k), n).astype(np.float32)
-    return poses, rng.normal(size=(n, 3)).astype(np.float32), np.ascontiguousarray(neighbors), weights
+    x, weights = f32(rng.normal(size=(n, 3)), rng.dirichlet(np.ones(k), n))
+    return nodes, (x, np.ascontiguousarray(neighbors), weights)
 
 
+@pytest.mark.parametrize("angle", [0, 1e-3, 0.3, 2.0])
 @pytest.mark.parametrize("flipped", [False, True], ids=["aligned", "flipped"])
 @pytest.mark.parametrize(("n", "k"), [(60, 3), (3000, 4)])
-def test_gradient_of_the_blend_is_that_of_finite_differences(n, k, flipped):
-    poses, *rest = random_blend(n, 5, k, flipped)
+def test_gradients_of_the_nodes_are_those_of_the_formulas(n, k, flipped, angle):
+    """Spec 13.3, and the as-rigid-as-possible term (Sorkine and Alexa 2007), differentiated by torch in f64."""
+    torch = pytest.importorskip("torch")
+    (rest, base, positions), (x, neighbors, weights) = random_nodes(n, 5, k, flipped)
     rng = np.random.default_rng(1)
-    by_means, by_rotations = (rng.normal(size=(n, c)).astype(np.float32) for c in (3, 4))
+    by_means, by_rotations, turns = f32(*(rng.normal(size=s) for s in ((n, 3), (n, 4), (5, 3))))
+    edges, lengths = rng.permuted(np.tile(np.arange(5, dtype=np.uint32), (5, 1)), axis=1)[:, :3].copy(), rng.random(15)
+    lengths, strength, turns = *f32(lengths.reshape(5, 3)), 5.0, turns * np.float32(angle)
 
-    def loss(p):
-        means, turns = _native.blend_rigid(p, *rest)
-        return (by_means * means.astype(float)).sum() + (by_rotations * turns.astype(float)).sum()
+    t = lambda a: torch.from_numpy(a.astype(np.float64))  # noqa: E731
+    turn, shift = t(turns).requires_grad_(), torch.zeros(5, 3, dtype=torch.float64, requires_grad=True)
+    q = rotations.quat_normalize(rotations.quat_multiply(rotations.rotvec_to_quat(turn), t(base)))
+    R, p, near, w = rotations.quat_to_matrix(q), t(positions) + shift, neighbors.astype(int), t(weights)[..., None]
+    moved = (R[near] @ (t(x)[:, None] - t(rest)[near])[..., None])[..., 0] + p[near]
+    signs = torch.where((q[near] * q[near[:, :1]]).sum(2, keepdim=True) < 0, -1.0, 1.0)
+    means, turned = (w * moved).sum(1), rotations.quat_normalize((w * signs * q[near]).sum(1))
+    ends = edges.astype(int)
+    missed = (R[:, None] @ (t(rest)[ends] - t(rest)[:, None])[..., None])[..., 0] - (p[ends] - p[:, None])
+    rigidity = ((t(lengths)[..., None] * missed).square().sum(2) + 1e-12).sqrt().mean()
+    ((means * t(by_means)).sum() + (turned * t(by_rotations)).sum() + strength * rigidity).backward()
 
-    got = _native.blend_rigid_backward(poses, *rest, by_means, by_rotations)
-    want, step = np.zeros(poses.shape), np.float32(2**-8)
-    for at in np.ndindex(poses.shape):
-        above, below = poses.copy(), poses.copy()
-        above[at] += step
-        below[at] -= step
-        want[at] = (loss(above) - loss(below)) / float(above[at] - below[at])
-    assert got.shape == poses.shape
-    np.testing.assert_allclose(got, want, atol=1e-3 * np.abs(want).max())
+    nodes = f32(rest, q.detach().numpy(), positions)
+    for got, want in zip(_native.blend_rigid(nodes, x, neighbors, weights), (means, turned), strict=True):
+        np.testing.assert_allclose(got, want.detach().numpy(), atol=1e-5)
+    blend = (x, neighbors, weights)
+    got = _native.node_gradients(nodes, (turns, base), blend, (by_means, by_rotations), (edges, lengths, strength))
+    for g, want in zip(got, (turn.grad, shift.grad), strict=True):
+        np.testing.assert_allclose(g, want.numpy(), atol=1e-5 * want.abs().max().item())
 
 
-def test_poses_have_sixteen_numbers():
-    poses, *rest = random_blend(10, 5, 3, False)
-    with pytest.raises(ValueError, match=r"poses: expected shape \[M, 16\], got \[5, 15\]"):
-        _native.blend_rigid(np.ascontiguousarray(poses[:, :15]), *rest)
+def test_nodes_of_other_shapes_are_refused():
+    nodes, blend = random_nodes(10, 5, 3, False)
+    with pytest.raises(ValueError, match=r"rotations of nodes: expected shape \[5, 4\], got \[5, 3\]"):
+        _native.blend_rigid((nodes[0], nodes[0], nodes[2]), *blend)
     with pytest.raises(ValueError, match=r"neighbors and weights: expected shape \[10, k\]"):
-        _native.blend_rigid(poses, rest[0], rest[1], rest[2][:, :2].copy())
-
-
-def test_a_gradient_of_another_shape_is_refused():
-    poses, *rest = random_blend(10, 5, 3, False)
+        _native.blend_rigid(nodes, blend[0], blend[1], blend[2][:, :2].copy())
+    turned, edges = (nodes[2], nodes[1]), (np.zeros((5, 1), np.uint32), np.zeros((5, 1), "f4"), 1.0)
     by_means, by_rotations = np.zeros((10, 3), "f4"), np.zeros((10, 4), "f4")
     with pytest.raises(ValueError, match=r"by_means: expected shape \[10, 3\], got \[9, 3\]"):
-        _native.blend_rigid_backward(poses, *rest, by_means[1:], by_rotations)
+        _native.node_gradients(nodes, turned, blend, (by_means[1:], by_rotations), edges)
     with pytest.raises(ValueError, match=r"by_rotations: expected shape \[10, 4\], got \[10, 3\]"):
-        _native.blend_rigid_backward(poses, *rest, by_means, by_means)
+        _native.node_gradients(nodes, turned, blend, (by_means, by_means), edges)
+    with pytest.raises(ValueError, match="neighbors: expected indices of 5 nodes"):
+        _native.node_gradients(nodes, turned, blend, (by_means, by_rotations), (edges[0] + 5, *edges[1:]))
 
 
 def test_neighbours_of_a_context_are_the_nearest_before():
@@ -321,16 +336,6 @@ def test_normalized_quaternions_have_unit_length():
     np.testing.assert_allclose(length, np.arange(20) != 3, atol=1e-12)
 
 
-def test_poses_rotate_about_the_node():
-    rng = np.random.default_rng(0)
-    n, t, q = rng.normal(size=(6, 3)), rng.normal(size=(4, 6, 3)), random_quats(24).reshape(4, 6, 4)
-    poses = rotations.rigid_poses(n, q, t)
-    x = rng.normal(size=3)
-    moved = np.einsum("tmab,b->tma", poses[..., :9].reshape(4, 6, 3, 3), x) + poses[..., 9:12]
-    np.testing.assert_allclose(moved, rotations.rotate(q, x - n + 0 * t) + n + t, atol=1e-12)
-    np.testing.assert_array_equal(poses[..., 12:], q)
-
-
 TWICE = {
     "quat_multiply": ((30, 4), (30, 4)),
     "quat_conjugate": ((30, 4),),
@@ -340,7 +345,6 @@ TWICE = {
     "quat_to_rotvec": ((30, 4),),
     "quat_to_rotvec near": ((30, 4), (30, 3)),
     "quat_to_matrix": ((30, 4),),
-    "rigid_poses": ((30, 3), (2, 30, 4), (2, 30, 3)),
 }
 
 

@@ -12,11 +12,15 @@ from synthetic import encode_sequence
 from test_player import run_wasm
 
 from gscodec import _native
-from gscodec.decode import open_stream
+from gscodec.decode import open_scene, open_stream
+from gscodec.decode.scene import Track
 from gscodec.encode.encode import stream_config
 from gscodec.encode.settings import EncodeSettings
+from gscodec.encode.tracks import TrackPlan, write_tracks
 from gscodec.encode.writer import StreamWriter
 from gscodec.model.camera import Camera, look_at
+from gscodec.model.placement import Placement
+from gscodec.model.rotations import rotvec_to_quat
 from gscodec.render.image import render_image
 
 LEVEL, SIDE = 4, 4  # log2 of the side of a tile
@@ -85,11 +89,11 @@ def test_a_group_of_thousands_of_tiles(browser, server, other, tmp_path):
     assert "expected at most 4194304" in message
 
 
-# whether the tiles of a group that are in view are decoded
-ALL_THERE = f"""(({{ engine }}) => {{
+# whether the tiles of a group of each track that are in view are decoded
+ALL_THERE = f"""(({{ engine }}) => (engine.scene?.tracks ?? [{{ engine }}]).every(({{ engine }}) => {{
     const {{ content, flags, left, layers }} = engine.groups.get(GROUP);
-    return !left && content.seen(engine.view(), layers).every((seen, j) => !seen || flags[j]);
-}})({PLAYER})"""
+    return !left && content.seen(engine.sight(), layers).every((seen, j) => !seen || flags[j]);
+}}))({PLAYER})"""
 
 
 def open_partly(browser, server, url: str) -> None:
@@ -126,6 +130,23 @@ def test_only_the_tiles_in_view_are_decoded(browser, server, other, tiled):
     for t in (4 * LENGTH + 1, LENGTH + 2, 3 * LENGTH):  # predicted, predicted, independent
         some, more = (compare(browser, stream, t, view) for view in views)
         assert some < more <= len(stream.frame(t))
+    assert browser.errors == []
+
+
+def test_of_the_tracks_of_a_scene_only_the_tiles_in_view_are_decoded(browser, server, other, tiled, tmp_path):
+    """Each track comes in parts, by the view of where it is placed; the transform moves every piece of it."""
+    key = (0, tuple(rotvec_to_quat(np.array([0, 0.5, 0.3])).tolist()), (3.0, 0.5, 0.0), 0.5)
+    placements = Placement("one"), Placement("other", keys=(key, (60, (1.0, 0.0, 0.0, 0.0), (-3.0, 0.0, 1.0), 0.8)))
+    stream = open_scene(tiled).tracks[0].stream
+    write_tracks(tmp_path / "scene.gsv", [TrackPlan.of(Track(stream, placement)) for placement in placements])
+    scene, (url, _) = open_scene(tmp_path / "scene.gsv"), other((tmp_path / "scene.gsv").read_bytes())
+    open_partly(browser, server, url)
+    K = np.array([[900.0, 0, 80], [0, 900, 60], [0, 0, 1]])
+    for t in (4 * LENGTH + 1, LENGTH + 2, 3 * LENGTH):  # predicted, predicted, independent
+        means = scene.frame(t).means
+        ends = means[means[:, 0].argmin()], means[means[:, 0].argmax()]
+        some, more = (compare(browser, scene, t, Camera("", K, look_at(e - [0, 0, 5], e, UP), 160, 120)) for e in ends)
+        assert some < more <= len(means), t
     assert browser.errors == []
 
 

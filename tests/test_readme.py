@@ -84,6 +84,15 @@ def test_table_of_the_player():
         assert all(map(agrees, (f.replace(",", "") for f in figures), values)), (name, figures, values)
 
 
+def test_table_of_bd_rates():
+    found = {(r["sequence"], r["anchor"]): r["percent"] for r in result("rd")["bd_rate"]}
+    table = rows("peer | what it is given")
+    assert {name for name, *_ in table} == {peer for _, peer in found}
+    for name, _, *figures in table:
+        values = [found.get((sequence, name)) for sequence in ("statue", "lumberjack")]
+        assert all(agrees(f.removesuffix(" %"), v) for f, v in zip(figures, values, strict=True)), (name, values)
+
+
 def test_bytes_before_the_first_picture():
     found = result("first_picture")["streams"]["demo, preset fast"]
     for name, text in (("after", "has received {} kB"), ("before", "({} before that")):
@@ -91,10 +100,20 @@ def test_bytes_before_the_first_picture():
 
 
 def test_table_of_sparse_points():
-    found = result("points")
+    found = {(e["case"], e["frame"], e["points"] > 0): e for e in result("points")["entries"]}
     for name, *figures in rows("frame 0 of"):
-        none, points = (found[f"{name}, frame 0, fast, {k}"] for k in ("none", "points"))
+        none, points = found[name, 0, False], found[name, 0, True]
         values = [points["points"], none["psnr"], points["psnr"], none["ssim"], points["ssim"]]
+        assert all(map(agrees, figures, values)), (name, figures, values)
+
+
+def test_table_of_depth_images():
+    found = {(e["scene"], e["cameras"], e["variant"]): e for e in result("depth")["entries"]}
+    variants = ("without", "start", "loss", "both")
+    for name, *figures in rows("frame 3 of"):
+        scene, cameras = name.removesuffix(" cameras").rsplit(", ", 1)
+        entries = [found[scene, int(cameras), v] for v in variants]
+        values = [e[key] for key in ("psnr_fg", "depth_error") for e in entries]
         assert all(map(agrees, figures, values)), (name, figures, values)
 
 

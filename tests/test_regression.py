@@ -1,49 +1,74 @@
-"""Size against quality, kept from slipping: what was reached is recorded here, with a tolerance.
+"""Size against quality, kept from slipping: each figure that was reached is recorded, with a tolerance.
 
-`trained.npz` is 4 frames of a trained lumberjack (tests/make_trained.py); the bundled capture is encoded as users do.
+Two small trained groups are coded in several ways (trained.py); the bundled capture is encoded as users do. A figure of
+the codec that is better than its tolerance fails, too: record it anew (make_trained.py), or the gain may be lost again.
 """
 
 import json
-from pathlib import Path
+import math
 
-import numpy as np
 import pytest
-from synthetic import encode_sequence, from_npz
 from test_cli import run
+from trained import CASES, DATA, EXAMPLE, TOLERANCES, load_groups, measure
 
 from gscodec.decode import open_stream
-from gscodec.encode.encode import stream_config
-from gscodec.encode.settings import EncodeSettings
-from gscodec.metrics.evaluate import evaluate_splats
 
-HERE = Path(__file__).parent
-RECORDED = json.loads((HERE / "data" / "recorded.json").read_text())
+RECORDED = json.loads((DATA / "recorded.json").read_text())
+# A run on another machine differs from those recorded as one with another seed does: it is one more draw, which lies
+# with 99 % within STUDENT * deviation * sqrt(1 + 1 / seeds) of the mean (Student's t, 5 degrees of freedom).
+SEEDS, STUDENT = 6, 4.03
+LEAST = {"kb_per_frame": 0.02, "ssim": 0.001, "vmaf": 0.5, "flicker": 0.02, "haze": 0.02}  # of an interval; dB: 0.05
 
 
-@pytest.mark.parametrize("quality", [30, 50, 70])
-def test_codec_alone(tmp_path, quality):
+def test_the_groups_are_what_training_makes():
+    first, second = load_groups()
+    assert first.parents is None
+    assert (second.parents >= 0).mean() > 0.9
+    assert first.canonical.shN.shape[1] == 3
+    assert (first.lifetimes != [0, len(first)]).any()
+    assert first.nodes is not None
+    assert len(first.trajectories) == 5
+    assert first.calibration is not None
+    assert (DATA / "groups.npz").stat().st_size < 200_000
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_codec_alone(name, tmp_path):
     """Tight: the coder is deterministic, the renderer nearly so."""
-    sequence = from_npz(HERE / "data" / "trained.npz")
-    out = tmp_path / "a.gsv"
-    config = stream_config(fps=30, sh_degree=0, gaussians=4000, frames=4)
-    report = encode_sequence(sequence, out, config, EncodeSettings(quality=quality))
-    measured = evaluate_splats(open_stream(out).frame, sequence, frames=[0, 3], size=report.bytes)
-    recorded = RECORDED["codec"][str(quality)]
-    assert measured["kb_per_frame"] <= 1.02 * recorded["kb_per_frame"]
-    assert measured["codec_psnr"] >= recorded["codec_psnr"] - 0.1
+    found, recorded = measure(CASES[name], tmp_path / "a.gsv"), RECORDED["codec"][name]
+    assert set(found) == set(recorded)
+    for key, value in recorded.items():
+        tolerance = TOLERANCES[key] * (value if key == "kb_per_frame" else 1)
+        assert abs(found[key] - value) <= tolerance, f"{key} of {name}: {found[key]}, recorded {value}"
+
+
+def test_the_cases_are_what_their_names_say(tmp_path):
+    def groups(name):
+        CASES[name].stream(tmp_path / f"{name}.gsv")
+        return open_stream(tmp_path / f"{name}.gsv").groups
+
+    assert [g["sync"] for g in groups("predicted")] == [True, False]
+    assert len(groups("independent")) == 1
+    assert open_stream(tmp_path / "predicted.gsv").group(0).sh_degree == 1
+    groups("layers")
+    assert len(open_stream(tmp_path / "layers.gsv").group(0).layers) == 3
 
 
 def test_bundled_capture_from_end_to_end(tmp_path):
-    """Loose: training depends on the order of floating-point sums of each machine."""
-    capture = HERE.parent / "examples" / "lumberjack"
-    done = run("encode", capture, tmp_path / "a.gsv", "--preset", "fast", "--frames", "0:10")
-    assert done.returncode == 0, done.stderr
-    measured = json.loads(run("eval", tmp_path / "a.gsv", capture, "--json").stdout)
+    """As good as over seeds; see above."""
     recorded = RECORDED["capture"]
-    assert measured["psnr_fg"] >= recorded["psnr_fg"] - 0.7
-    assert measured["kb_per_frame"] <= 1.2 * recorded["kb_per_frame"]
-    assert measured["vmaf"] >= recorded["vmaf"] - 6
-    assert measured["haze"] <= recorded["haze"] + 0.5
-    worst = min(r["psnr_fg"] for r in measured["per_frame"])
-    assert worst >= recorded["worst_psnr_fg"] - 1.2, "no frame falls behind"
-    assert np.isfinite(measured["flicker"])
+    assert recorded["seeds"] == SEEDS
+    done = run("encode", EXAMPLE, tmp_path / "a.gsv", "--preset", "fast", "--frames", "0:8")
+    assert done.returncode == 0, done.stderr
+    measured = json.loads(run("eval", tmp_path / "a.gsv", EXAMPLE, "--json").stdout)
+    measured["worst_psnr_fg"] = min(r["psnr_fg"] for r in measured["per_frame"])
+    for key, figure in recorded["figures"].items():
+        worse = 1 if key in ("kb_per_frame", "haze", "flicker") else -1
+        least = LEAST.get(key, 0.05) * (figure["mean"] if key == "kb_per_frame" else 1)
+        interval = max(least, STUDENT * figure["deviation"] * math.sqrt(1 + 1 / SEEDS))
+        excess = worse * (measured[key] - figure["mean"])
+        assert excess <= interval, f"{key}: {measured[key]}, recorded {figure['mean']} +- {interval:.3f}"
+        if key in ("kb_per_frame", "psnr_fg"):
+            assert interval <= (0.1 * figure["mean"] if key == "kb_per_frame" else 0.4), (
+                f"{key}: the seeds are far apart"
+            )

@@ -71,6 +71,14 @@ def test_ctrl_c_leaves_a_file_that_plays(capture, tmp_path):
     same(capture, out)
 
 
+def test_ctrl_c_before_the_first_group_leaves_nothing(capture, tmp_path):
+    out = tmp_path / "new" / "a.gsv"
+    assert gscodec("encode", capture, out, *ENCODE, at=("fragment", 1), by=signal.SIGINT) == 130
+    assert not list(out.parent.iterdir())
+    assert gscodec("encode", capture, out, *ENCODE) == 0
+    same(capture, out)
+
+
 def test_sound_goes_on_too(capture, tmp_path):
     write_tone(tmp_path / "tone.wav", 0.2)
     out, whole, options = tmp_path / "a.gsv", tmp_path / "b.gsv", (*ENCODE, "--audio", tmp_path / "tone.wav")

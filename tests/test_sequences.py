@@ -245,6 +245,9 @@ def test_detect_input(tmp_path):
         detect_input(tmp_path)
     with pytest.raises(CaptureError, match="no such file or folder"):
         detect_input(tmp_path / "gone")
+    (tmp_path / "a.jpg").touch()
+    with pytest.raises(CaptureError, match="1 images, but no calibration"):
+        detect_input(tmp_path)
     write_splat(tmp_path / "a.ply", gaussians(2))
     assert detect_input(tmp_path) == detect_input(tmp_path / "a.ply") == "splats"
     (tmp_path / "transforms.json").write_text("{}")

@@ -12,7 +12,7 @@ from types import ModuleType
 
 from gscodec.model.gaussians import Gaussians
 
-from . import draco, gsav, sog, spz, svt_av1, videogs, x265_anchor, zstd
+from . import draco, gsav, sog, spz, svt_av1, videogs, webp, x265_anchor, zstd
 from .maps import order_of
 
 
@@ -47,6 +47,7 @@ BASELINES = {
     "x265": Baseline(x265_anchor, x265_anchor.SETTINGS, order_of),
     "svt-av1": Baseline(svt_av1, svt_av1.SETTINGS, order_of),
     "gsav": Baseline(gsav, gsav.SETTINGS),
+    "webp": Baseline(webp, webp.SETTINGS, order_of),
     "zstd": Baseline(zstd, zstd.SETTINGS),
     "draco": Baseline(draco, draco.SETTINGS, per_frame=True),
     "sog": Baseline(sog, sog.SETTINGS, per_frame=True),

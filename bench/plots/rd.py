@@ -16,6 +16,7 @@ LOOK = {  # codec -> (name on the chart, colour)
     "x265": ("MPEG-style anchor, x265", "#2e7d4f"),
     "svt-av1": ("same packing, SVT-AV1", "#8fbf9f"),
     "gsav": ("GSAV-like, VP9 lossless", "#8a5a00"),
+    "webp": ("WebP of all frames", "#c49a00"),
     "zstd": ("zstd of planes", "#7a7a7a"),
     "draco": ("Draco each frame", "#7d4f9e"),
     "sog": ("SOG each frame", "#111111"),
@@ -28,7 +29,7 @@ SEQUENCES = {
     "playbot": "playbot (SH 2)",
     "fruit": "fruit (SH 3)",
 }
-SAVED_AGAINST = {"videogs": "VideoGS", "x265": "x265"}
+SAVED_AGAINST = {"zstd": "zstd", "x265": "x265"}  # the strongest, and the anchor of MPEG
 PSNR_MIN = 35  # dB, the lowest quality shown
 LABEL_GAP = 0.062  # between two names, in heights of the axes
 

@@ -35,6 +35,7 @@ class Capture:
         cameras: undistorted pinhole cameras, as they are in frame 0; each has an image of every frame.
         frame_count: frames of this (possibly restricted) capture.
         has_alpha: views have an alpha channel (from the images or from masks).
+        has_depth: views of at least one camera have depth.
         read: (camera index, frame of the source) -> View at the source's size, undistorted; thread-safe.
         first_frame: source frame that is frame 0 here.
         poses: (camera index, frame of the source) -> the camera in that frame, of which K (at the source's size) and
@@ -50,6 +51,7 @@ class Capture:
     has_alpha: bool
     read: Callable[[int, int], View]
     first_frame: int = 0
+    has_depth: bool = False
     poses: Callable[[int, int], Camera] | None = None
     points: Points | None = None
     footage: Sequence[Feed] = ()
@@ -145,13 +147,14 @@ def differs(a: Camera, b: Camera, scale: float) -> bool:
 def cropped(view: View, camera: Camera) -> tuple[View, Camera]:
     """The part of a view with the subject and MARGIN pixels around it; the whole view without alpha or subject."""
     if view.alpha is None or not view.alpha.any():
-        return View(np.ascontiguousarray(view.rgb), view.alpha), camera
+        return replace(view, rgb=np.ascontiguousarray(view.rgb)), camera
     (height, width), alpha = view.alpha.shape, view.alpha
     rows, cols = np.flatnonzero(alpha.any(1)), np.flatnonzero(alpha.any(0))
     top, bottom = max(rows[0] - MARGIN, 0), min(rows[-1] + 1 + MARGIN, height)
     left, right = max(cols[0] - MARGIN, 0), min(cols[-1] + 1 + MARGIN, width)
     part = (slice(top, bottom), slice(left, right))
-    part_of = View(np.ascontiguousarray(view.rgb[part]), np.ascontiguousarray(alpha[part]))
+    depth = None if view.depth is None else np.ascontiguousarray(view.depth[part])
+    part_of = View(np.ascontiguousarray(view.rgb[part]), np.ascontiguousarray(alpha[part]), depth)
     return part_of, camera.cropped(left, top, right - left, bottom - top)
 
 

@@ -1,7 +1,8 @@
 """EasyVolcap and EasyMocap -> Capture: intri.yml and extri.yml (OpenCV's), images/CAMERA/* or videos/CAMERA.mp4.
 
 Cameras that stand still are the names of one pair of files in the folder. Cameras that move have a pair each in
-cameras/CAMERA/, whose names are the frames. Masks are masks/CAMERA/*.
+cameras/CAMERA/, whose names are the frames. Masks are masks/CAMERA/*. Depth images are depths/CAMERA/*, in world units
+along the ray of a pixel, as EasyVolcap's own loader takes them by default (`use_z_depth: False`).
 
 World-to-camera, OpenCV axes: K_name [3, 3] in pixels with pixel centres at integers, D_name or dist_name as in OpenCV,
 Rot_name [3, 3] or R_name (a rotation vector), T_name; W_name and H_name where the calibration was of another size.
@@ -17,6 +18,8 @@ import numpy as np
 from ..errors import CaptureError, require
 from ..model.camera import Camera
 from .capture import Capture
+from .depth import SUFFIXES as DEPTHS
+from .depth import DepthImages
 from .rig import Feed, Track, assemble, by_number, feed_of, find_video, numbered, pinhole, rigid, usable
 from .video import Video
 
@@ -82,7 +85,9 @@ def open_easyvolcap(root: Path, calibration: Path) -> Capture:
 
     def feed(name: str) -> Feed:
         images = numbered(root / "images" / name)
-        return feed_of(images or Video(find_video([root / "videos"], name)), root / "masks" / name)
+        depths = numbered(root / "depths" / name, DEPTHS)
+        source = images or Video(find_video([root / "videos"], name))
+        return feed_of(source, root / "masks" / name, DepthImages(depths, along_ray=True) if depths else None)
 
     def moving(name: str, folder: Path) -> tuple[Track, Feed]:
         pair, footage = _pair(folder), feed(name)

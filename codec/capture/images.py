@@ -1,4 +1,5 @@
 """One image file -> View: 8-bit sRGB colour, not premultiplied, and alpha; resampling that weights colour by alpha.
+Depth images are read by depth.py.
 
 OpenImageIO reads every format. It is told not to premultiply by alpha; formats that are stored premultiplied (EXR)
 are divided by alpha here. Float images are linear light and get the sRGB curve, integer images are taken as sRGB.
@@ -20,10 +21,17 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr", ".tif", ".tiff")  # tried 
 
 @dataclass(frozen=True)
 class View:
-    """rgb: [H, W, 3] u8 sRGB, not premultiplied. alpha: [H, W] u8, or None where the image covers everything."""
+    """What a camera shows in one frame.
+
+    Attributes:
+        rgb: [H, W, 3] u8 sRGB, not premultiplied.
+        alpha: [H, W] u8, or None where the image covers everything.
+        depth: [H, W] f32, world units along the optical axis, 0 where it is unknown; None: there is no depth image.
+    """
 
     rgb: np.ndarray
     alpha: np.ndarray | None = None
+    depth: np.ndarray | None = None
 
 
 def _open(path: Path):
@@ -71,7 +79,7 @@ def read_image(path: Path) -> View:
     message = image.geterror()
     image.close()
     if pixels is None or message:
-        raise CaptureError(f"{path}: damaged image ({message or 'no pixels'})")
+        raise CaptureError(f"{path}: damaged image ({first_line(message)}), expected a whole file; copy it again")
     colour, a = _channels(spec.channelnames)
     pixels = pixels.reshape(spec.height, spec.width, -1)
     alpha = None if a is None else pixels[..., a]
@@ -82,6 +90,11 @@ def read_image(path: Path) -> View:
     if not integer:
         rgb = _srgb(rgb)
     return View(_u8(rgb), None if alpha is None else _u8(alpha))
+
+
+def first_line(message: str) -> str:
+    """What OpenImageIO says of a file without pixels, without the libraries below it that say it again."""
+    return message.splitlines()[0] if message else "no pixels"
 
 
 def read_mask(path: Path, *, labels: bool = False) -> np.ndarray:
@@ -110,14 +123,16 @@ def _divide(rgb: np.ndarray, alpha: np.ndarray, top: float) -> np.ndarray:
     return np.clip(out + (0.5 if top == 255 else 0), 0, top)
 
 
-def resample(view: View, op: Callable[[np.ndarray], np.ndarray]) -> View:
-    """Applies a linear filter `op` (on [H, W, C] f32) to premultiplied colour and alpha, and divides again."""
+def resample(view: View, op: Callable[[np.ndarray], np.ndarray], nearest: Callable[[np.ndarray], np.ndarray]) -> View:
+    """Applies a linear filter `op` (on [H, W, C] f32) to premultiplied colour and alpha, and divides again. `nearest`
+    picks depth, whose mean across an edge lies on neither side."""
+    depth = None if view.depth is None else nearest(view.depth)
     if view.alpha is None:
-        return View((np.clip(op(view.rgb.astype(np.float32)), 0, 255) + 0.5).astype(np.uint8))
+        return View((np.clip(op(view.rgb.astype(np.float32)), 0, 255) + 0.5).astype(np.uint8), depth=depth)
     a = view.alpha.astype(np.float32)
     out = op(np.dstack([view.rgb * (a / 255)[..., None], a]))
     rgb = _divide(out[..., :3], out[..., 3] / 255, 255)
-    return View(rgb.astype(np.uint8), (np.clip(out[..., 3], 0, 255) + 0.5).astype(np.uint8))
+    return View(rgb.astype(np.uint8), (np.clip(out[..., 3], 0, 255) + 0.5).astype(np.uint8), depth)
 
 
 def resize_area(view: View, width: int, height: int) -> View:
@@ -125,4 +140,8 @@ def resize_area(view: View, width: int, height: int) -> View:
     if view.rgb.shape[:2] == (height, width):
         return view
     cv2 = require("cv2", "scaling images")
-    return resample(view, lambda x: cv2.resize(x, (width, height), interpolation=cv2.INTER_AREA))
+
+    def resized(interpolation: int) -> Callable[[np.ndarray], np.ndarray]:
+        return lambda x: cv2.resize(x, (width, height), interpolation=interpolation)
+
+    return resample(view, resized(cv2.INTER_AREA), resized(cv2.INTER_NEAREST_EXACT))

@@ -6,6 +6,7 @@ left out (Hartley and Zisserman 2004, 11.4.3).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from ..errors import require
 from ..model.camera import Camera, meeting_point
 from .capture import Capture, blend
+from .images import View
 
 NEIGHBOURS = 2  # cameras that each one is compared with
 RATIO = 0.7  # of the best descriptor distance to the second best: a match is distinct (Lowe 2004)
@@ -38,12 +40,19 @@ class Matches:
 
 
 def matched_features(
-    capture: Capture, frame: int, cameras: list[int], *, neighbours: int = NEIGHBOURS, features: int = FEATURES
+    capture: Capture,
+    frame: int,
+    cameras: list[int],
+    look: Callable[[int], View] | None = None,
+    *,
+    neighbours: int = NEIGHBOURS,
+    features: int = FEATURES,
 ) -> list[Matches]:
     """Matches of each camera with the `neighbours` that see the scene from most nearly the same side.
 
     Args:
         cameras: indices of those that are compared.
+        look: camera -> its picture at `frame`, where it is decoded already; None: as the capture gives it.
         features: of one image at most.
 
     Raises:
@@ -53,7 +62,7 @@ def matched_features(
     known = [capture.camera(i, frame) for i in cameras]
     sift, found = cv2.SIFT_create(features), []
     for i in cameras:
-        view = capture.view(i, frame)
+        view = look(i) if look else capture.view(i, frame)
         grey = cv2.cvtColor(np.rint(blend(view, (0.5,) * 3)).astype(np.uint8), cv2.COLOR_RGB2GRAY)
         points, descriptors = sift.detectAndCompute(grey, None)
         found.append((np.array([p.pt for p in points], np.float64).reshape(-1, 2) + 0.5, descriptors))

@@ -30,8 +30,9 @@ def describe_capture(path: Path, frame: int = 0) -> tuple[Capture, dict]:
 
     Returns:
         The capture, and its facts (JSON-able): name, layout, fps, frames, moves, masks (None, "alpha" or "files"),
-        points (None: there are none), epipolar_error (pixels, None: too few matches), matches, colour_ratio (largest
-        to smallest gain of a camera), left_out and missing (sentences), cameras (a dictionary each).
+        points (None: there are none), depth (cameras that have depth images), epipolar_error (pixels, None: too few
+        matches), matches, colour_ratio (largest to smallest gain of a camera), left_out and missing (sentences),
+        cameras (a dictionary each).
 
     Raises:
         CaptureError, UsageError: as of `open_capture`.
@@ -42,10 +43,11 @@ def describe_capture(path: Path, frame: int = 0) -> tuple[Capture, dict]:
     every = list(range(len(capture.cameras)))
     matches = matched_features(capture, frame, every) if len(every) > 1 else []
     distances = np.concatenate([np.zeros(0), *(m.distances for m in matches)])
-    gains, shares = _looks(capture, frame, matches)
+    gains, shares, depths = _looks(capture, frame, matches)
     known = gains[np.isfinite(gains).all(1)]
     gain_of = lambda g: [round(float(x), 3) for x in np.exp(g)] if np.isfinite(g).all() else None  # noqa: E731
-    seen = [{"gain": gain_of(g), "subject": share} for g, share in zip(gains, shares, strict=True)]
+    looks = zip(gains, shares, depths, strict=True)
+    seen = [{"gain": gain_of(g), "subject": share, "depth": depth} for g, share, depth in looks]
     facts = {
         "name": capture.name,
         "path": str(path),
@@ -55,6 +57,7 @@ def describe_capture(path: Path, frame: int = 0) -> tuple[Capture, dict]:
         "moves": capture.moves,
         "masks": _masks(capture),
         "points": None if capture.points is None else len(capture.points),
+        "depth": sum(c["depth"] is not None for c in seen),
         "epipolar_error": round(float(np.median(distances)), 3) if len(distances) >= LEAST else None,
         "matches": len(distances),
         "colour_ratio": round(float(np.exp(np.ptp(known.mean(1)))), 3) if len(known) > 1 else None,
@@ -113,14 +116,17 @@ def colour_gains(count: int, matches: list[Matches], colours: list[tuple[np.ndar
     return gains
 
 
-def _looks(capture: Capture, frame: int, matches: list[Matches]) -> tuple[np.ndarray, list[float | None]]:
-    """`colour_gains`, and of each camera the share of its picture that its mask leaves; each picture is read once."""
+def _looks(capture: Capture, frame: int, matches: list[Matches]) -> tuple[np.ndarray, list, list]:
+    """`colour_gains`; of each camera the share of its picture that its mask leaves; and its nearest and farthest depth
+    (1st and 99th percentile) and the share where it is known. None where it has no mask or depth."""
     cv2 = require("cv2", "comparing colours")
     colours = [[np.zeros((0, 3))] * 2 for _ in matches]
     shares: list[float | None] = []
+    depths: list[dict | None] = []
     for i in range(len(capture.cameras)):
         view = capture.view(i, frame)
         shares.append(None if view.alpha is None else round(float((view.alpha > 0).mean()), 4))
+        depths.append(None if view.depth is None else _depth(view.depth))
         smooth = cv2.blur(view.rgb.astype(np.float32), (PATCH, PATCH))
         if view.alpha is not None:  # colours beyond the edge of the subject mean nothing
             smooth[cv2.erode(view.alpha, np.ones((PATCH, PATCH), np.uint8)) < 255] = 0
@@ -128,7 +134,14 @@ def _looks(capture: Capture, frame: int, matches: list[Matches]) -> tuple[np.nda
             for side, (camera, pixels) in enumerate(((m.first, m.p), (m.second, m.q))):
                 if camera == i:
                     pair[side] = _at(smooth, pixels)
-    return colour_gains(len(capture.cameras), matches, [tuple(pair) for pair in colours]), shares
+    return colour_gains(len(capture.cameras), matches, [tuple(pair) for pair in colours]), shares, depths
+
+
+def _depth(depth: np.ndarray) -> dict:
+    """What is known of the depth of a picture."""
+    known = depth[depth > 0]
+    near, far = (round(float(d), 4) for d in np.percentile(known, (1, 99))) if known.size else (None, None)
+    return {"near": near, "far": far, "known": round(known.size / depth.size, 4)}
 
 
 def _at(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -146,12 +159,19 @@ def _missing(capture: Capture, path: Path, facts: dict) -> list[str]:
         out.append(f"no masks: whole pictures are trained (gscodec masks makes some){more}")
     elif unmasked:
         out.append(f"no masks of {', '.join(unmasked)}: their whole pictures are trained")
+    start = "depth images" if facts["depth"] else "the visual hull" if facts["masks"] else "a plane sweep"
     if facts["points"] is None:
-        out.append(f"no sparse points: training starts from {'the visual hull' if facts['masks'] else 'a plane sweep'}")
+        out.append(f"no sparse points: training starts from {start}")
+    if 0 < facts["depth"] < len(facts["cameras"]):
+        out.append(f"depth images of {facts['depth']} of {len(facts['cameras'])} cameras only")
+    empty = [c["name"] for c in facts["cameras"] if c["depth"] and not c["depth"]["known"]]
+    if empty:
+        out.append(f"the depth images of {', '.join(empty)} are empty: 0 says that a depth is unknown")
     if not capture.indices("test"):
         out.append("no test cameras: quality can only be measured on pictures that were trained on")
     if trained < FEW:
-        out.append(f"{trained} training cameras: what lies between their views is hardly constrained")
+        count = "1 training camera: what its view does not show" if trained == 1 else None
+        out.append(f"{count or f'{trained} training cameras: what lies between their views'} is hardly constrained")
     error = facts["epipolar_error"]
     if error is None and len(capture.cameras) > 1:
         out.append(f"{facts['matches']} features match between neighbours, too few to check the calibration")

@@ -18,6 +18,7 @@ import numpy as np
 from ..errors import CaptureError
 from ..model.camera import NEAR, Camera, meeting_point
 from .capture import Capture, differs, extent
+from .depth import DepthImages, along_axis
 from .images import SUFFIXES, View, image_size, read_image, read_mask
 from .points import Points
 from .undistort import Undistortion
@@ -37,6 +38,7 @@ class Feed:
         masks: the mask file of each frame, or nothing; None for a frame that lacks its own.
         mask_files: for each frame where its mask is read from, or would be.
         labels: masks number what a pixel shows, 0 is the background.
+        depths: the depth images of the frames; None: the camera has none.
 
     Attributes:
         path: of the video or the first image.
@@ -45,7 +47,7 @@ class Feed:
         has_alpha: views have an alpha channel, of their own or from masks.
 
     Raises:
-        CaptureError: an image is missing or not readable, or only some frames have masks.
+        CaptureError: an image is missing or not readable, or only some frames have masks or depth images.
     """
 
     def __init__(
@@ -55,8 +57,9 @@ class Feed:
         mask_files: Sequence[Path] = (),
         *,
         labels: bool = False,
+        depths: DepthImages | None = None,
     ):
-        self._source, self._labels, self.mask_files = source, labels, mask_files
+        self._source, self._labels, self.mask_files, self.depths = source, labels, mask_files, depths
         if isinstance(source, Video):
             self.path, self.width, self.height, alpha = source.path, source.width, source.height, False
         else:
@@ -65,6 +68,8 @@ class Feed:
         there = [m for m in masks if m is not None]
         if there and len(there) < len(self):
             raise CaptureError(f"{there[0].parent}: {len(there)} masks for {len(self)} frames")
+        if depths and len(depths.files) != len(self):
+            raise CaptureError(f"{depths.files[0].parent}: {len(depths.files)} depth images for {len(self)} frames")
         self.masks = there
         self.has_alpha = alpha or bool(there)
 
@@ -77,14 +82,17 @@ class Feed:
         return self._source.fps if isinstance(self._source, Video) else FPS
 
     def view(self, t: int) -> View:
-        """Frame `t` as it was recorded, with its mask."""
+        """Frame `t` as it was recorded, with its mask and its depth, which may be distances along rays (`depths`)."""
         view = self.picture(t)
+        if self.depths:
+            height, width = view.rgb.shape[:2]
+            view = replace(view, depth=self.depths.read(t, width, height))
         if not self.masks:
             return view
         alpha = read_mask(self.masks[t], labels=self._labels)
         if alpha.shape != view.rgb.shape[:2]:
             raise CaptureError(f"{self.masks[t]}: mask is {_size(alpha.shape)}, its image {_size(view.rgb.shape)}")
-        return View(view.rgb, alpha)
+        return replace(view, alpha=alpha)
 
     def picture(self, t: int) -> View:
         """Frame `t` as it was recorded, without the mask of a file."""
@@ -95,7 +103,7 @@ class Feed:
         return self.path if isinstance(self._source, Video) else self._source[t]
 
 
-def feed_of(source: Video | Sequence[Path], masks: Path) -> Feed:
+def feed_of(source: Video | Sequence[Path], masks: Path, depths: DepthImages | None = None) -> Feed:
     """The footage of a camera whose masks are files in a folder of its own, in the order of their numbers.
 
     Raises:
@@ -106,7 +114,9 @@ def feed_of(source: Video | Sequence[Path], masks: Path) -> Feed:
     else:
         stems = [image.stem for image in source]
     there = numbered(masks)
-    return Feed(source, there, there if len(there) == len(stems) else [masks / f"{stem}.png" for stem in stems])
+    return Feed(
+        source, there, there if len(there) == len(stems) else [masks / f"{stem}.png" for stem in stems], depths=depths
+    )
 
 
 def assemble(
@@ -140,7 +150,10 @@ def assemble(
                 f"{feeds[index].name(frame)}: camera {camera.name}, frame {frame} is {_size(view.rgb.shape)}, "
                 f"expected {camera.width}x{camera.height} as the calibration says"
             )
-        return lenses[index].view(view, camera)
+        view, depths = lenses[index].view(view, camera), feeds[index].depths
+        if depths and depths.along_ray:
+            view = replace(view, depth=along_axis(view.depth, _at(pinholes[index], frame).K))
+        return view
 
     def poses(index: int, frame: int) -> Camera:
         return _at(pinholes[index], frame)
@@ -149,7 +162,9 @@ def assemble(
     moving = any(len(track) > 1 for track in tracks)
     cameras = [track[0] for track in pinholes]
     fps, poses_of = fps or feeds[0].fps, poses if moving else None
-    return Capture(name, fps, cameras, frame_count, alpha, read, poses=poses_of, points=points, footage=feeds)
+    depth = any(f.depths for f in feeds)
+    more = {"has_depth": depth, "poses": poses_of, "points": points, "footage": feeds}
+    return Capture(name, fps, cameras, frame_count, alpha, read, **more)
 
 
 def _with_near(tracks: Sequence[Track]) -> list[Track]:

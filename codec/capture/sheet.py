@@ -1,7 +1,8 @@
 """Contact sheet of a capture: the picture of each camera at one frame, and the rig from above and from the side.
 
-Masks are shown as they will be used: what they leave out is dark, and their border is drawn. Training cameras are blue,
-test cameras orange. The sparse points of the capture are drawn into the rig.
+Masks are shown as they will be used: what they leave out is dark, and their border is drawn. Depth images are shown
+below the pictures, near ones bright, on one scale for all cameras; black is unknown. Training cameras are blue, test
+cameras orange. The sparse points of the capture are drawn into the rig.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from ..errors import require
 from ..model.camera import Camera, meeting_point
 from .capture import Capture
+from .images import View
 
 WIDTH, PANEL, LINE, GAP = 1600, 620, 18, 6  # pixels
 THUMBNAIL = 400  # pixels, widest
@@ -32,15 +34,17 @@ def contact_sheet(capture: Capture, frame: int = 0) -> np.ndarray:
     """
     cameras = [capture.camera(i, frame) for i in range(len(capture.cameras))]
     aspect = max(c.height / c.width for c in cameras)
-    columns = _columns(len(cameras), aspect)
+    columns = _columns(len(cameras), 2 * aspect if capture.has_depth else aspect)
     width = min((WIDTH - GAP) // columns - GAP, THUMBNAIL)
     height = round(width * aspect)
+    shown = [_thumbnail(capture.view(i, frame), width, height) for i in range(len(cameras))]
+    shown = _with_depth(shown)
+    tallest = max(len(picture) for picture in shown)
     rows = -(-len(cameras) // columns)
-    top = GAP + rows * (height + LINE + GAP)
+    top = GAP + rows * (tallest + LINE + GAP)
     sheet = np.full((top + PANEL + GAP, WIDTH, 3), PAPER, np.uint8)
-    for i, camera in enumerate(cameras):
-        x, y = GAP + i % columns * (width + GAP), GAP + i // columns * (height + LINE + GAP)
-        picture = _thumbnail(capture, i, frame, width, height)
+    for i, (camera, picture) in enumerate(zip(cameras, shown, strict=True)):
+        x, y = GAP + i % columns * (width + GAP), GAP + i // columns * (tallest + LINE + GAP)
         sheet[y + LINE : y + LINE + picture.shape[0], x : x + picture.shape[1]] = picture
         _text(sheet, f"{camera.name}  {camera.width}x{camera.height}", (x, y + 13), COLOURS[camera.split])
     half = (WIDTH - 3 * GAP) // 2
@@ -59,19 +63,38 @@ def _columns(count: int, aspect: float) -> int:
     return int(max(min(count, least), min(wanted, count), 1))
 
 
-def _thumbnail(capture: Capture, index: int, frame: int, width: int, height: int) -> np.ndarray:
+Thumbnail = tuple[np.ndarray, np.ndarray | None]  # picture [h, w, 3] u8, depth [h, w] f32 or None
+
+
+def _with_depth(shown: list[Thumbnail]) -> list[np.ndarray]:
+    """The pictures, each with its depth image below: inverse depth in grey, on one scale for all."""
+    known = [depth[depth > 0] for _, depth in shown if depth is not None]
+    known = np.concatenate([*known, np.ones(1 if not sum(map(len, known)) else 0)])
+    far, near = np.percentile(1 / known, (1, 99))
+    out = []
+    for picture, depth in shown:
+        if depth is None:
+            out.append(picture)
+            continue
+        share = (1 / np.where(depth > 0, depth, 1) - far) / max(near - far, 1e-12)
+        grey = np.where(depth > 0, 40 + 215 * share.clip(0, 1), 0).astype(np.uint8)
+        out.append(np.concatenate([picture, np.repeat(grey[..., None], 3, 2)]))
+    return out
+
+
+def _thumbnail(view: View, width: int, height: int) -> Thumbnail:
     cv2 = require("cv2", "drawing contact sheets")
-    view = capture.view(index, frame)
     scale = min(width / view.rgb.shape[1], height / view.rgb.shape[0])
     size = max(1, int(scale * view.rgb.shape[1])), max(1, int(scale * view.rgb.shape[0]))
     picture = cv2.resize(view.rgb, size, interpolation=cv2.INTER_AREA)
+    depth = None if view.depth is None else cv2.resize(view.depth, size, interpolation=cv2.INTER_NEAREST)
     if view.alpha is None:
-        return picture
+        return picture, depth
     alpha = cv2.resize(view.alpha, size, interpolation=cv2.INTER_AREA)
     share = (alpha / 255)[..., None]
     picture = np.rint(picture * share + (0.35 * picture + 20) * (1 - share)).astype(np.uint8)
     lines, _ = cv2.findContours((alpha > 127).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    return cv2.drawContours(picture, lines, -1, BORDER, 1)
+    return cv2.drawContours(picture, lines, -1, BORDER, 1), depth
 
 
 @dataclass(frozen=True)

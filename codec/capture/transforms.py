@@ -4,7 +4,8 @@ The format lists images, a capture has cameras with all their frames: entries ar
 `frame` or `time`. Each entry has its own pose and may have its own intrinsics, so cameras may move (D-NeRF: one camera
 that is elsewhere in each frame). Poses are OpenGL camera-to-world (x right, y up, z back) and become OpenCV
 world-to-camera. `near`, in the head or in an entry, is a near plane in the units of the poses. `ply_file_path` names
-sparse points in the world of the poses.
+sparse points in the world of the poses; `depth_file_path` names the depth image of an entry, along the optical axis,
+whose values times `depth_unit_scale_factor` (0.001 where the file does not say it, as in nerfstudio) are world units.
 """
 
 from __future__ import annotations
@@ -15,19 +16,16 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-
 from ..errors import CaptureError
-from ..model.camera import NEAR, Camera
 from .capture import Capture
+from .depth import DepthImages
 from .images import SUFFIXES, image_size
 from .points import Points, read_ply_points
-from .rig import FPS, Feed, Track, assemble, pinhole, rigid, usable
+from .rig import FPS, Feed, Track, assemble, usable
+from .transforms_camera import FISHEYE, entry_camera
 
-DISTORTION = ("k1", "k2", "p1", "p2", "k3")  # OpenCV's order
-FISHEYE_DISTORTION = ("k1", "k2", "k3", "k4")
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
-FISHEYE = "OPENCV_FISHEYE"
+MILLIMETRES = 0.001  # world units of one step of a depth image, where the file does not say it
 
 
 @dataclass
@@ -69,7 +67,8 @@ def open_transforms(files: list[tuple[Path, str]]) -> Capture:
     def make(name: str, own: list[Entry]) -> tuple[Track, Feed]:
         of_camera = _at_times(own, times)
         files = [e.mask or _mask_file(source.parent, e.image, e.values) for e in of_camera]
-        return _track(name, of_camera), Feed([e.image for e in of_camera], [e.mask for e in of_camera], files)
+        images, masks, depths = [e.image for e in of_camera], [e.mask for e in of_camera], _depths(source, of_camera)
+        return _track(name, of_camera), Feed(images, masks, files, depths=depths)
 
     tracks, feeds = usable(source, _by_camera(entries), make)
     if not any(track[0].split == "train" for track in tracks):
@@ -198,6 +197,28 @@ def _mask_file(root: Path, image: Path, f: dict) -> Path:
     return (root / "masks").joinpath(*(parts[1:] or parts)).with_name(image.stem + ".png")
 
 
+def _depths(source: Path, entries: list[Entry]) -> DepthImages | None:
+    """The depth images of the entries of a camera; None where none has one.
+
+    Raises:
+        CaptureError: a name or the unit is wrong, or an image is missing.
+    """
+    names = [e.values["depth_file_path"] for e in entries if e.values.get("depth_file_path") is not None]
+    if not names:
+        return None
+    unit = entries[0].values.get("depth_unit_scale_factor", MILLIMETRES)
+    if not isinstance(unit, int | float) or not 0 < unit < math.inf:
+        raise CaptureError(f"depth_unit_scale_factor is {unit!r}, expected world units of one step, such as 0.001")
+    wrong = next((n for n in names if not isinstance(n, str)), None)
+    if wrong is not None:
+        raise CaptureError(f"depth_file_path is {wrong!r}, expected the name of a depth image")
+    files = [source.parent / n for n in names]
+    missing = next((f for f in files if not f.is_file()), None)
+    if missing is not None:
+        raise CaptureError(f"depth image {missing} is missing")
+    return DepthImages(files, float(unit))
+
+
 def _common_times(entries: list[Entry]) -> list[float]:
     """The frames that most cameras have, or those of a single training camera (D-NeRF); cameras that lack one of them
     are left out later."""
@@ -240,52 +261,10 @@ def _track(name: str, entries: list[Entry]) -> Track:
     track = []
     for e in entries:
         try:
-            camera = _camera(name, e, width, height)
+            camera = entry_camera(name, e.image, e.values, (width, height))
         except (TypeError, ValueError) as error:
             raise CaptureError(f"frame {e.time:g}: not a number ({error})") from error
         except CaptureError as error:
             raise CaptureError(f"frame {e.time:g}: {error}") from error
         track.append(replace(camera, split=entries[0].split))
     return track
-
-
-def _camera(name: str, e: Entry, width: int, height: int) -> Camera:
-    """The camera of one entry, whose image is `width` x `height` pixels."""
-    v = e.values
-    if (int(v.get("w", width)), int(v.get("h", height))) != (width, height):
-        raise CaptureError(f"image {e.image} is {width}x{height}, expected {v.get('w')}x{v.get('h')} (w, h)")
-    fisheye = v.get("camera_model") == FISHEYE or bool(v.get("is_fisheye"))
-    distortion = np.array([float(v.get(k, 0)) for k in (FISHEYE_DISTORTION if fisheye else DISTORTION)])
-    near = float(v.get("near", NEAR))
-    if not 0 < near < math.inf:
-        raise CaptureError(f"near plane at {near:g}, expected a distance above 0")
-    K = _intrinsics(v, width, height)
-    return Camera(name, K, _viewmat(v), width, height, distortion, near=near, fisheye=fisheye)
-
-
-def _intrinsics(v: dict, width: int, height: int) -> np.ndarray:
-    if "fl_x" in v:
-        fx, fy = float(v["fl_x"]), float(v.get("fl_y", v["fl_x"]))
-    elif "camera_angle_x" in v:
-        fx = 0.5 * width / math.tan(0.5 * float(v["camera_angle_x"]))
-        fy = 0.5 * height / math.tan(0.5 * float(v["camera_angle_y"])) if "camera_angle_y" in v else fx
-    else:
-        raise CaptureError("no focal length, expected fl_x (pixels) or camera_angle_x (radians)")
-    return pinhole(fx, fy, float(v.get("cx", width / 2)), float(v.get("cy", height / 2)))
-
-
-def _viewmat(v: dict) -> np.ndarray:
-    """[4, 4] world-to-camera, OpenCV axes, from the OpenGL camera-to-world matrix (a uniform scale is removed)."""
-    if "transform_matrix" not in v:
-        raise CaptureError("no pose, expected transform_matrix")
-    try:
-        m = np.array(v["transform_matrix"], np.float64)
-    except (TypeError, ValueError):
-        m = np.zeros(0)
-    if m.shape not in ((4, 4), (3, 4)) or not np.isfinite(m).all():
-        raise CaptureError("transform_matrix is not 4x4 finite numbers")
-    u, s, vt = np.linalg.svd(m[:3, :3])
-    if s[2] < 1e-6 or s[0] > 1.01 * s[2] or np.linalg.det(m[:3, :3]) < 0:
-        raise CaptureError("transform_matrix is singular, sheared or mirrored, expected a rotation")
-    R = (u @ vt) * [1, -1, -1]  # columns: OpenGL camera axes -> OpenCV
-    return rigid(R.T, -R.T @ m[:3, 3])

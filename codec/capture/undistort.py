@@ -7,6 +7,7 @@ are at half-integers in our K and at integers in OpenCV's; K is shifted here.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -55,7 +56,11 @@ class Undistortion:
         if not _bends(camera):
             return view
         cv2, maps = require("cv2", "undistorting images"), self._maps(_lens(camera))
-        return resample(view, lambda x: cv2.remap(x, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+        def warped(interpolation: int) -> Callable[[np.ndarray], np.ndarray]:
+            return lambda x: cv2.remap(x, *maps, interpolation, borderMode=cv2.BORDER_REPLICATE)
+
+        return resample(view, warped(cv2.INTER_LINEAR), warped(cv2.INTER_NEAREST))
 
 
 def _bends(camera: Camera) -> bool:

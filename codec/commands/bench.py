@@ -155,6 +155,7 @@ def ablation(
 @bench.command()
 def stress(
     case: Annotated[str | None, typer.Option(help="Comma-separated cases, see bench/stress_scenes.py.")] = None,
+    frames: Annotated[int | None, typer.Option(help="At most so many of each case.", show_default="all")] = None,
     out: Results = Path("bench/results/stress.json"),
     as_json: Json = False,
 ) -> None:
@@ -162,17 +163,18 @@ def stress(
     require_bench()
     require("torch", "measuring training")
     from bench.stress import measure
-    from bench.stress_scenes import SCENES
+    from bench.stress_scenes import CASES
 
     def line(e: dict) -> str:
         if "psnr_fg" not in e or e["psnr_fg"] is None:
-            return f"{e['case']:<20}{e['verdict']}"
+            return f"{e['case']:<24}{e['verdict']}"
         return (
-            f"{e['case']:<20}{e['psnr_fg']:6.2f} dB, alone {e['psnr_fg_alone']:6.2f}  {e['gaussians']:>5} Gaussians  "
+            f"{e['case']:<24}{e['psnr_fg']:6.2f} dB, alone {e['psnr_fg_alone']:6.2f}, worst frame "
+            f"{e['psnr_fg_worst']:6.2f}  {e['gaussians']:>5} Gaussians  "
             f"{e['kb_per_frame']:6.2f} kB/frame, alone {e['kb_per_frame_alone']:6.2f}  {e['verdict']}"
         )
 
-    entries = measure(_names("--case", case, SCENES) or list(SCENES), out)
+    entries = measure(_names("--case", case, CASES) or list(CASES), out, frames)
     if any(e["verdict"].startswith("fails") for e in _show_entries(entries, as_json, line)):
         raise typer.Exit(1)
 

@@ -11,9 +11,10 @@ from ..errors import UsageError
 from ..frame_range import frame_range
 from .inputs import open_stream_of_frames
 from .options import Frames, StreamPath, stdout
+from .tracks import Tracks
 
 if TYPE_CHECKING:
-    from ..decode import Stream
+    from ..decode import Scene, Stream
 
 FORMATS = ("ply", "spz", "glb", "drc")
 SPLATV_LEAST = 30.0  # dB to the stream, below which a .splatv does not show the same scene
@@ -26,6 +27,7 @@ def decode(
     form: Annotated[str, typer.Option("--format", help="Of each frame: ply, spz, glb or drc (points alone).")] = "ply",
     frames: Frames = None,
     maps: Annotated[bool, typer.Option("--maps", help="The attribute maps as 16-bit images, and maps.json.")] = False,
+    track: Tracks = None,
 ) -> None:
     """Stream to one standard 3DGS .ply (.spz, .glb) per frame, to one .splatv, or to attribute maps."""
     from ..splats import write_sequence, write_splat
@@ -35,15 +37,16 @@ def decode(
         raise UsageError(f"--format {form}: expected {', '.join(FORMATS)}; a .splatv is named as the output instead")
     if maps and (frames or form != "ply" or folder.suffix.lower() == ".splatv"):
         raise UsageError("--maps writes the whole stream as images into a folder; leave --format and --frames away")
-    s = open_stream_of_frames(stream)
+    s = open_stream_of_frames(stream, track)
     if maps:
         from ..decode.maps import write_maps
 
+        s = _one_track(s, "--maps")
         stdout.print(f"{folder}: {write_maps(s, folder)} images of {len(s.groups)} groups, maps.json")
         return
     chosen = frame_range(frames, s.frame_count)
     if folder.suffix.lower() == ".splatv":
-        stdout.print(_to_splatv(s, folder, chosen))
+        stdout.print(_to_splatv(_one_track(s, f"{folder}"), folder, chosen))
         return
     if form == "ply" and len(chosen) == s.frame_count:
         write_sequence(s.sequence(), folder)
@@ -52,6 +55,10 @@ def decode(
         for t in chosen:
             write_splat(folder / f"{t:06d}.{form}", s.frame(t), s.config["up"])
     stdout.print(f"{folder}: {len(chosen)} frames")
+
+
+def _one_track(s: Stream | Scene, purpose: str) -> Stream:
+    return s.alone(purpose) if hasattr(s, "alone") else s
 
 
 def _to_splatv(s: Stream, path: Path, chosen: range) -> str:

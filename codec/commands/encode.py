@@ -78,7 +78,8 @@ def encode(
     if report:
         report.write_text(json.dumps(result.to_json(), indent=1))
     if result.groups == 0:
-        raise UsageError("stopped before the first group was done; run the same command to go on")
+        print("stopped before the first group was done; nothing is left behind", file=sys.stderr)
+        raise typer.Exit(130)
     r = result.to_json()
     stdout.print(
         f"{out}: {r['frames']} frames, {r['gaussians']} Gaussians, {r['bytes']} bytes, "
@@ -160,7 +161,7 @@ def encode_input(
         refine_by_pictures=opened.refine_by_pictures,
         on_group=on_group,
     )
-    if not report.interrupted:
+    if not report.interrupted or not report.groups:  # without a group there is nothing to go on from
         opened.finish()
     return report
 

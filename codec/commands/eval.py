@@ -13,6 +13,7 @@ from ..frame_range import frame_range
 from ..progress import Bar
 from .inputs import open_frames, open_stream_of_frames
 from .options import Frames, Json, SequencePath, StreamPath, stdout
+from .tracks import Tracks
 
 
 def evaluate(
@@ -20,11 +21,12 @@ def evaluate(
     seq: SequencePath,
     split: Annotated[str, typer.Option(help="Cameras of a capture: test or train.")] = "test",
     frames: Frames = None,
+    track: Tracks = None,
     as_json: Json = False,
 ) -> None:
     """PSNR, SSIM, VMAF and temporal stability against a capture or the splats that were encoded."""
     with Bar() as bar:
-        result = evaluate_stream(stream, seq, split=split, frames=frames, bar=bar)
+        result = evaluate_stream(stream, seq, split=split, frames=frames, tracks=track, bar=bar)
     if as_json:
         print(json.dumps(result, indent=1))
         return
@@ -38,17 +40,19 @@ def evaluate(
         stdout.print(f"first {p['layers']} layers: {p['kb_per_frame']:.2f} kB/frame, {psnr:.2f} dB")
 
 
-def evaluate_stream(stream_path: Path, source: Path, *, split: str, frames: str | None, bar: Bar) -> dict:
+def evaluate_stream(
+    stream_path: Path, source: Path, *, split: str, frames: str | None, bar: Bar, tracks: list[str] | None = None
+) -> dict:
     """Measures a .gsv file against the capture or the splats that were encoded (keys: README, "Measures").
 
     A stream with layers also has `prefixes`, the same measures of its first layer, its first two layers and so on.
     """
-    from ..decode import open_stream
+    from ..decode import Scene, open_stream
     from ..decode.report import describe
     from ..metrics.evaluate import evaluate_capture, evaluate_splats
     from ..splats import detect_input, open_sequence
 
-    whole = open_stream_of_frames(stream_path)
+    whole = open_stream_of_frames(stream_path, tracks)
     on_progress = lambda done, total: bar.update("eval", done, total)  # noqa: E731
     splats = detect_input(source) == "splats"
     reference = open_sequence(source) if splats else open_frames(source, None)
@@ -65,8 +69,8 @@ def evaluate_stream(stream_path: Path, source: Path, *, split: str, frames: str 
         return evaluate_capture(stream.frame, reference.frames(chosen.start, chosen.stop), split=split, **options)
 
     result = measure(whole, whole.byte_count)
-    if splats:
-        result["gaussians_encoded"] = len(reference.frame(chosen.start))
+    if isinstance(whole, Scene):  # its tracks have layers of their own
+        return result
     later = [layer["bytes"] for layer in describe(whole)["layers"]][1:]
     if later:
         result["prefixes"] = []

@@ -11,6 +11,7 @@ import typer
 from ..errors import UsageError
 from .inputs import open_stream_warning
 from .options import Json, stdout
+from .tracks import Tracks
 
 CALIBRATIONS = (".json", ".qca.txt", ".npy", ".csv")
 SPLATS = (".ply", ".sog", ".drc", ".spz", ".splat", ".splatv", ".zip")
@@ -30,6 +31,7 @@ def info(
         Path | None, typer.Option(metavar="PNG", help="Of a capture: draw its cameras and its rig.")
     ] = None,
     frame: Annotated[int, typer.Option(min=0, help="Of a capture: whose pictures are looked at.")] = 0,
+    track: Tracks = None,
 ) -> None:
     """What is in a file: groups, bits by attribute and unit. Of splats the format, of a capture what was recognised."""
     kind = _kind(path)
@@ -43,7 +45,7 @@ def info(
     elif kind == "splats":
         _of_splats(path, as_json)
     else:
-        _of_stream(path, maps, as_json)
+        _of_stream(path, maps, track, as_json)
 
 
 def _kind(path: Path) -> str:
@@ -55,15 +57,21 @@ def _kind(path: Path) -> str:
     return "stream"
 
 
-def _of_stream(path: Path, maps: Path | None, as_json: bool) -> None:
+def _of_stream(path: Path, maps: Path | None, track: list[str] | None, as_json: bool) -> None:
+    from ..decode import Scene
     from ..decode.maps import draw_maps
-    from ..decode.report import describe
+    from ..decode.report import describe, describe_scene
 
     if maps and maps.suffix != ".png":
         raise UsageError(
             f"--maps {maps}: the picture must be named *.png; `gscodec decode --maps DIR` writes the planes"
         )
-    s = open_stream_warning(path)
+    s = open_stream_warning(path, track)
+    if isinstance(s, Scene):
+        if maps:
+            draw_maps(s.alone("--maps"), maps)
+        _print_scene(path, describe_scene(s), as_json)
+        return
     facts = describe(s)
     if maps and not s.groups:
         raise UsageError(f"{path}: no groups, so there are no maps to draw")
@@ -94,6 +102,23 @@ def _of_stream(path: Path, maps: Path | None, as_json: bool) -> None:
         per_gaussian = u["bits_per_gaussian"]  # None where there are none
         per_gaussian = "" if per_gaussian is None else f" {per_gaussian:>8.2f} bits/Gaussian/group"
         stdout.print(f"  {name:<32}{u['bytes']:>10} bytes {u['share']:>6.1%}{per_gaussian}")
+
+
+def _print_scene(path: Path, facts: dict, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(facts, indent=1))
+        return
+    stdout.print(f"{path}: {len(facts['tracks'])} tracks, {facts['frames']} frames at {facts['fps']:g} fps")
+    rate = "" if facts["kb_per_frame"] is None else f", {facts['kb_per_frame']:.2f} kB/frame"
+    stdout.print(f"{facts['bytes']} bytes{rate}")
+    for t in facts["tracks"]:
+        played = {0: ", without end", 1: ""}.get(t["repeats"], f", {t['repeats']} times")
+        moves = {0: "", 1: ", placed"}.get(t["keys"], f", {t['keys']} transforms")
+        hidden = ", hidden" if t["hidden"] else ""
+        stdout.print(
+            f"  {t['name'] or '(no name)'}: {t['frames']} frames at {t['fps']:g} fps from {t['offset']:g} s"
+            f"{played}{moves}{hidden}; {t['gaussians']} Gaussians, {t['bytes']} bytes"
+        )
 
 
 def _of_splats(path: Path, as_json: bool) -> None:
@@ -130,7 +155,8 @@ def _of_capture(path: Path, frame: int, sheet: Path | None, as_json: bool) -> No
     error, ratio = facts["epipolar_error"], facts["colour_ratio"]
     checked = "unknown" if error is None else f"{error:.2f} pixels from epipolar lines ({facts['matches']} matches)"
     colours = "unknown" if ratio is None else f"{ratio:.2f} from the darkest to the brightest camera"
-    stdout.print(f"{masks}, {points}; calibration: {checked}; colours: {colours}")
+    depth = f", depth images of {facts['depth']} cameras" if facts["depth"] else ""
+    stdout.print(f"{masks}, {points}{depth}; calibration: {checked}; colours: {colours}")
     for c in facts["cameras"]:
         stdout.print(f"  {_line(c)}")
     for sentence in (*facts["left_out"], *facts["missing"]):
@@ -143,6 +169,9 @@ def _line(c: dict) -> str:
     words.append(f"near {c['near']:g}, scene at {c['distance']:g}")
     if c["subject"] is not None:
         words.append(f"subject {c['subject']:.1%}")
+    if c["depth"] is not None and c["depth"]["known"]:
+        d = c["depth"]
+        words.append(f"depth {d['near']:g} to {d['far']:g} in {d['known']:.0%}")
     if c["epipolar_error"] is not None:
         words.append(f"{c['epipolar_error']:.2f} pixels off")
     if c["gain"]:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
 
+from .inputs import open_tracks
 from .options import StreamPath, stdout
+from .tracks import Tracks, place
 
 
 def play(
@@ -19,13 +22,25 @@ def play(
         Path | None,
         typer.Option(metavar="DIR", help="Do not serve: write the page and the stream to DIR, for any host."),
     ] = None,
+    track: Tracks = None,
 ) -> None:
     """Play a stream in the browser. Needs no GPU; Ctrl-C ends it."""
-    if export:
-        from gscodec.player.export import export_page
+    with TemporaryDirectory() as folder:
+        shown = _placed(stream, Path(folder), track) if track else stream
+        if export:
+            from gscodec.player.export import export_page
 
-        stdout.print(export_page(stream, export), markup=False)
-        return
-    from gscodec.player.play import play_stream
+            stdout.print(export_page(shown, export), markup=False)
+            return
+        from gscodec.player.play import play_stream
 
-    play_stream(stream, host=host, port=port, browser=not no_browser, say=stdout.print)
+        play_stream(shown, host=host, port=port, browser=not no_browser, say=stdout.print)
+
+
+def _placed(stream: Path, folder: Path, track: list[str]) -> Path:
+    """A copy of the stream in which its tracks are as the options say."""
+    from ..encode.tracks import TrackPlan, write_tracks
+
+    copy = folder / stream.name
+    write_tracks(copy, [TrackPlan.of(t) for t in place(open_tracks(stream), track).tracks])
+    return copy

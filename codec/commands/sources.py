@@ -194,6 +194,8 @@ def capture_source(path: Path, out: Path, settings: EncodeSettings, options: Tra
     recipe = train_settings(options.preset, settings.quality, motion=options.motion, gop=options.gop)
     settings = replace(settings, loss=LOSS[options.preset])
     work, trained = out.with_name(out.name + ".work"), capture.indices("train")
+    if len(trained) == 1:
+        bar.say(f"{path}: 1 training camera, from other sides the scene will be wrong; expected two or more")
     if options.cluster:
         groups = partial(_cluster_groups, path, settings, options, recipe, bar)
     else:

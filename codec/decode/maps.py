@@ -1,8 +1,9 @@
-"""Stream -> attribute maps: a picture of the planes with their tiles, or a folder of 16-bit images and maps.json, from
-which encode/from_maps.py makes the same bytes again.
+"""Stream -> attribute maps: a picture of the planes with their tiles, or a folder of 16-bit images, the sound and
+maps.json, from which encode/from_maps.py makes the same bytes again.
 
 A plane has one integer a Gaussian (spec 7.2). The image holds how much each is above the least one, which maps.json
-tells, and a second image the bits from 16 on where they are needed. Planes of zeros are left out.
+tells, and a second image the bits from 16 on where they are needed. Planes of zeros are left out. Sound is a file of
+all samples, one behind the other; maps.json has their sizes and durations by group, and the sample entry.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from ..bitstream.quantized_group import QuantizedGroup
 from ..render.png import write_png
 from .stream import Stream
 
-FORMAT = "gscodec maps 1"
+FORMAT = "gscodec maps 2"
+SOUND = "sound.bin"
 EMPTY, BORDER = (24, 28, 48), (255, 150, 30)  # colours of cells without a Gaussian, and between tiles
 MOST_COLUMNS = 9
 
@@ -49,7 +51,8 @@ def layouts(decoded) -> list[HilbertLayout]:
 
 
 def write_maps(stream: Stream, folder: Path) -> int:
-    """Writes all planes of all groups as 16-bit grey PNG images and, last, maps.json. Returns the number of images."""
+    """Writes all planes of all groups as 16-bit grey PNG images, the sound and, last, maps.json. Returns the number of
+    images."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     groups, count = [], 0
@@ -66,13 +69,22 @@ def write_maps(stream: Stream, folder: Path) -> int:
                     count += _write_plane(folder / file, layout.arrange(values - low))
                     own[f"{k} {name}"] = low
         tiles = [[t["gaussians"] for t in tiles] for tiles in decoded.tiles()]
-        groups.append({"sync": g["sync"], "tiles": tiles, "planes": own} | _facts(q))
-    config = {k: v for k, v in stream.config.items() if k != "audio"}  # maps have no sound
+        _, time, samples = g.get("audio", (0, 0, []))
+        sound = {"time": time, "samples": samples}
+        groups.append({"sync": g["sync"], "tiles": tiles, "planes": own, "sound": sound} | _facts(q))
+    config = {k: v for k, v in stream.config.items() if k not in ("track", "placement")}  # maps have none
+    if audio := config.get("audio"):
+        config["audio"] = audio | {"entry": audio["entry"].hex()}
+        _write(folder / SOUND, b"".join(stream.sound(i) for i in range(len(stream.groups))))
     facts = {"format": FORMAT, "config": _plain(config), "groups": groups}
-    part = folder / "maps.json.part"
-    part.write_text(json.dumps(facts, indent=1))
-    os.replace(part, folder / "maps.json")
+    _write(folder / "maps.json", json.dumps(facts, indent=1).encode())
     return count
+
+
+def _write(path: Path, data: bytes) -> None:
+    part = path.with_name(path.name + ".part")
+    part.write_bytes(data)
+    os.replace(part, path)
 
 
 def _write_plane(path: Path, plane: np.ndarray) -> int:

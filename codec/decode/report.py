@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from .scene import Scene
 from .stream import Stream
 
 
@@ -58,6 +59,25 @@ def describe(stream: Stream) -> dict:
         "units": {n: {"bytes": b, "share": b / total, "bits_per_gaussian": per[n]} for n, b in units.items()},
         "layers": [{"bytes": layers[k]} for k in sorted(layers)],
         "per_group": groups,
+    }
+
+
+def describe_scene(scene: Scene) -> dict:
+    """Facts of a file with tracks: those of `describe` of each, with name, hidden, offset (seconds), repeats and the
+    number of its keys."""
+    frames = scene.frame_count
+    tracks = []
+    for t in scene.tracks:
+        p = t.placement
+        place = {"name": p.name, "hidden": p.hidden, "offset": p.offset / t.rate[0]}
+        tracks.append(place | {"repeats": p.repeats, "keys": len(p.keys)} | describe(t.stream))
+    return {
+        "frames": frames,
+        "fps": scene.fps,
+        "bytes": scene.byte_count,
+        "kb_per_frame": scene.byte_count / frames / 1000 if frames else None,
+        "complete": scene.complete,
+        "tracks": tracks,
     }
 
 

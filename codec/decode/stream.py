@@ -21,13 +21,14 @@ from ..model.camera import Camera
 from ..model.gaussian_sequence import GaussianSequence
 from ..model.gaussians import Gaussians
 from ..model.parametric_group import ParametricGroup
+from ..model.placement import Pose
 from .parametric import parametric_group
 
 GROUPS_HELD = 3  # decoded groups in memory: the one that plays, the next, and the one to which they refer
 
 
 class Stream:
-    """Random access to the frames of a .gsv file (finished, growing or cut short).
+    """Random access to the frames of one track of a .gsv file (finished, growing or cut short); `Scene` has them all.
 
     Attributes:
         config: the config box: fps, level, sh_degree, up, background, cameras, ...
@@ -35,11 +36,20 @@ class Stream:
         complete: false if the file ends inside a group (that group is left out).
         strict: damage is an error; otherwise what is not damaged is decoded, and `damage` tells of the rest.
         layers: how many layers of each group are decoded; None: all.
+        track: which track of a scene, where damaged boxes cost their groups alone, even if strict. None: the first.
     """
 
-    def __init__(self, data, name: str = "stream", *, strict: bool = True, layers: int | None = None):
-        self.name, self._data, self.strict, self.layers = name, data, strict, layers
-        index = _native.demux(data, strict)
+    def __init__(
+        self,
+        data,
+        name: str = "stream",
+        *,
+        strict: bool = True,
+        layers: int | None = None,
+        track: int | None = None,
+    ):
+        self.name, self._data, self.strict, self.layers, self.track = name, data, strict, layers, track
+        index = _native.demux(data, strict and track is None, track or 0)
         self.config, self.groups, self.complete = index["config"], index["groups"], index["complete"]
         self._held: OrderedDict[int, object] = OrderedDict()
         blank = {"unit": None, "type": "fragment", "layer": 0, "tile": None}
@@ -71,6 +81,11 @@ class Stream:
 
     @property
     def byte_count(self) -> int:
+        """Size of the file, of a track of a scene that of its groups, in bytes."""
+        return self.file_size if self.track is None else sum(g["size"] for g in self.groups)
+
+    @property
+    def file_size(self) -> int:
         """Size of the file in bytes."""
         return len(self._data)
 
@@ -84,8 +99,12 @@ class Stream:
 
     def payload(self, i: int) -> bytes:
         """Bytes of group `i`."""
-        g = self.groups[i]
-        return bytes(self._data[g["offset"] : g["offset"] + g["size"]])
+        return self.bytes_at(self.groups[i]["offset"], self.groups[i]["size"])
+
+    def sound(self, i: int) -> bytes:
+        """Samples of the sound that go with group `i`, one behind the other."""
+        offset, _, samples = self.groups[i].get("audio", (0, 0, []))
+        return bytes(self._data[offset : offset + sum(size for size, _ in samples)])
 
     def group(self, i: int):
         """Group `i`, decoded (`_native.DecodedGroup`).
@@ -137,8 +156,12 @@ class Stream:
         g = self.groups[i]
         return f"{g['start_frame']}-{g['start_frame'] + g['frames'] - 1}"
 
-    def frame(self, t: int) -> Gaussians:
-        """Frame `t` as shown: the visible Gaussians.
+    def bytes_at(self, offset: int, size: int) -> bytes:
+        """Bytes of the file."""
+        return bytes(self._data[offset : offset + size])
+
+    def frame(self, t: int, pose: Pose | None = None) -> Gaussians:
+        """Frame `t` as shown: the visible Gaussians, placed by `pose`.
 
         Raises:
             IndexError: `t` is not in the file.
@@ -146,11 +169,11 @@ class Stream:
         if not 0 <= t < self.frame_count:
             raise IndexError(f"{self.name} has {self.frame_count} frames")
         i = bisect_right(self._ends, t)
-        return self._frame_of_group(i, t - self._ends[i] + self.groups[i]["frames"])
+        return self._frame_of_group(i, t - self._ends[i] + self.groups[i]["frames"], pose)
 
-    def _frame_of_group(self, i: int, t: int) -> Gaussians:
+    def _frame_of_group(self, i: int, t: int, pose: Pose | None) -> Gaussians:
         group = self.group(i)
-        frame = Gaussians(**group.frame(t))
+        frame = Gaussians(**group.frame(t, pose))
         visible = group.visible(t)
         return frame if visible is None else frame.take(visible)
 
@@ -185,8 +208,27 @@ class _Groups(Sequence):
         return parametric_group(self.stream.group(range(len(self))[i]))
 
 
+def open_bytes(path: str | Path) -> mmap.mmap:
+    """The bytes of a .gsv file.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        BitstreamError: a folder, an empty file, or one that is no ISO base media file.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise BitstreamError(f"{path}: a folder, expected a .gsv file")
+    with open(path, "rb") as f:
+        if path.stat().st_size == 0:
+            raise BitstreamError(f"{path}: the file is empty, expected a .gsv stream")
+        data = mmap.mmap(f.fileno(), 0, access=mmap.ACCESS_READ)
+    if len(data) >= 8 and data[4:8] != b"ftyp":
+        raise BitstreamError(f"{path}: not a .gsv file, expected it to start with an ftyp box")
+    return data
+
+
 def open_stream(path: str | Path, *, strict: bool = True, layers: int | None = None) -> Stream:
-    """Opens a .gsv file.
+    """Opens a .gsv file, of a scene its first track.
 
     Args:
         strict: damage is an error; otherwise what is not damaged is decoded, and `Stream.damage` tells of the rest.
@@ -194,13 +236,9 @@ def open_stream(path: str | Path, *, strict: bool = True, layers: int | None = N
 
     Raises:
         FileNotFoundError: nothing is there.
-        BitstreamError: it is not a .gsv file.
+        BitstreamError: it is not a .gsv file, or a folder.
     """
-    path = Path(path)
-    with open(path, "rb") as f:
-        if path.stat().st_size == 0:
-            raise BitstreamError(f"{path}: the file is empty, expected a .gsv stream")
-        data = mmap.mmap(f.fileno(), 0, access=mmap.ACCESS_READ)
+    data = open_bytes(path)
     try:
         return Stream(data, str(path), strict=strict, layers=layers)
     except BitstreamError as e:

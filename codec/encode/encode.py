@@ -141,10 +141,12 @@ def encode_groups(
     except KeyboardInterrupt:
         report.interrupted = True
     except BaseException:
-        writer.close()
+        writer.abandon()
         raise
     if writer.groups:
         writer.finish(keep_part=report.interrupted)
+    else:
+        writer.abandon()
     report.frames, report.groups = writer.frames, writer.groups
     report.bytes = Path(output.path).stat().st_size if writer.groups else 0
     return report

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +16,34 @@ from ..errors import UsageError, require
 from .audio import AudioTrack
 from .writer import StreamWriter
 
-FORMAT = "gscodec maps 1"  # that of decode/maps.py
+FORMAT, SOUND = "gscodec maps 2", "sound.bin"  # those of decode/maps.py
+
+
+@dataclass(frozen=True)
+class _Sound:
+    """The sound of maps, as `AudioTrack` without its times: each group has its own samples already.
+
+    Attributes:
+        config: as of `AudioTrack`.
+        runs: first frame of a group -> media time, (size, duration) of each sample, bytes.
+    """
+
+    config: dict
+    runs: dict[int, tuple[int, list[tuple[int, int]], bytes]]
+
+    @property
+    def digest(self) -> str:
+        return hashlib.sha256(repr((self.config, self.runs)).encode()).hexdigest()[:16]
+
+    def between(self, start: int, end: int, fps: tuple[int, int]) -> tuple[int, list[tuple[int, int]], bytes] | None:
+        return self.runs.get(start)
 
 
 def encode_maps(folder: Path, out: Path, audio: AudioTrack | None = None) -> tuple[int, int]:
-    """Codes the planes in `folder`, with sound. Returns frames and bytes.
+    """Codes the planes in `folder`, with their sound. Returns frames and bytes.
+
+    Args:
+        audio: sound in place of theirs.
 
     Raises:
         UsageError: maps.json or an image is missing, is no such file, or does not fit the others.
@@ -34,14 +59,33 @@ def encode_maps(folder: Path, out: Path, audio: AudioTrack | None = None) -> tup
         for camera in config["cameras"]:
             camera |= {name: np.array(camera[name]) for name in ("K", "viewmat")}
         syncs = [g["sync"] for g in facts["groups"]]
+        own = _sound(folder, config.pop("audio", None), facts["groups"])
     except (OSError, ValueError, KeyError, IndexError, TypeError) as e:
         reason = f"{type(e).__name__} {e}" if isinstance(e, KeyError) else str(e)
         raise UsageError(f"{folder}: no attribute maps as `gscodec decode --maps` writes them: {reason}") from None
-    writer = StreamWriter(out, config, {"maps": str(folder)}, audio)
-    for q, payload, sync in zip(groups, payloads, syncs, strict=True):
+    made_of = hashlib.sha256(b"".join(payloads)).hexdigest()[:16]
+    writer = StreamWriter(out, config, {"maps": made_of}, audio or own)
+    there = writer.groups  # of a run that was stopped
+    for q, payload, sync in zip(groups[there:], payloads[there:], syncs[there:], strict=True):
         writer.append(payload, q.frames, sync=sync)
     writer.finish()
     return sum(q.frames for q in groups), out.stat().st_size
+
+
+def _sound(folder: Path, config: dict | None, groups: list[dict]) -> _Sound | None:
+    """The sound beside the maps; None where there is none."""
+    if config is None:
+        return None
+    data, at, frame, runs = (folder / SOUND).read_bytes(), 0, 0, {}
+    for g in groups:
+        samples = [(int(size), int(duration)) for size, duration in g["sound"]["samples"]]
+        size = sum(s for s, _ in samples)
+        if samples:
+            runs[frame] = int(g["sound"]["time"]), samples, data[at : at + size]
+        at, frame = at + size, frame + g["frames"]
+    if at != len(data):
+        raise ValueError(f"{SOUND} has {len(data)} bytes, expected {at} as maps.json says")
+    return _Sound(config | {"entry": bytes.fromhex(config["entry"])}, runs)
 
 
 def _payloads(groups: list[QuantizedGroup]) -> list[bytes]:

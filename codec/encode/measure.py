@@ -14,12 +14,12 @@ from ..render.sensitivity import Importance, measure
 from .settings import PlanSettings
 
 HIDDEN = -30.0  # logit opacity that no view shows
-GOLDEN = (5**0.5 - 1) / 2  # steps of this share of a group visit its frames evenly, in no order that views have
+GOLDEN = (5**0.5 - 1) / 2  # steps of this share of a range visit it evenly, in an order of no other sequence of views
 
 
 def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanSettings) -> Importance:
-    """Importance of the N Gaussians, from the first, the middle and the last frame. Where Gaussians come and go, each
-    view shows another frame: three frames would miss some of them.
+    """Importance of the N Gaussians, from the first, the middle and the last frame. Where Gaussians come and go, every
+    frame is seen by a camera of the capture and by another one: what lives in one frame alone shows in few views.
 
     Args:
         cameras: from which the subject was captured, if it was.
@@ -33,9 +33,16 @@ def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanS
     around = np.concatenate([f.means for f in few])
     views = settings.more_views if frames == 1 or len(g) <= settings.few else settings.views
     if group.lifetimes is not None:
-        times = [int(frames * ((i + 0.5) * GOLDEN % 1)) for i in range(views)]
-        return measure(lambda i: _shown(group, times[i]), around, cameras, views)
+        times = _spread(frames, max(views, 2 * frames) // 2)
+        some = [cameras[i] for i in _spread(len(cameras), len(times))] if cameras else []
+        return measure(lambda i: _shown(group, times[i % len(times)]), around, some, 2 * len(times))
     return measure(lambda i: few[i % len(few)], around, cameras, views)
+
+
+def _spread(items: int, count: int) -> list[int]:
+    """`count` of so many items; each comes once before any comes again, where `count` is a multiple of `items`."""
+    order = np.argsort([(i + 0.5) * GOLDEN % 1 for i in range(items)]).tolist()
+    return [order[i % items] for i in range(count)]
 
 
 def _shown(group: ParametricGroup, t: int) -> Gaussians:

@@ -124,7 +124,7 @@ class StreamWriter:
         os.truncate(self.part, self.bytes)  # Ctrl-C may have come in the middle of a fragment
         indexed = self.out.with_name(self.out.name + ".indexed")
         with open(self.part, "rb") as source, open(indexed, "wb") as target:
-            target.write(_native.finish(self.init, self.fragments))
+            target.write(_native.finish(self.init, [self.fragments]))
             source.seek(len(self.init))
             shutil.copyfileobj(source, target, 1 << 20)
         os.replace(indexed, self.out)
@@ -134,6 +134,12 @@ class StreamWriter:
     def close(self) -> None:
         """Leaves the .part as it is."""
         self._file.close()
+
+    def abandon(self) -> None:
+        """After a failure: leaves the .part, from which a later run goes on, but removes it where it has no group."""
+        self.close()
+        if not self.groups:
+            self._forget()
 
 
 def layer_ends(units: list[dict]) -> list[int]:

@@ -16,7 +16,7 @@ from ..bitstream.quantization import trajectory_step
 from ..farthest_point_sampling import farthest_points
 from ..model.node_solve import solve_translations
 from ..model.parametric_group import NodeMotion
-from ..model.rotations import matrix_to_quat, quat_to_rotvec, rigid_poses, rotvec_to_quat
+from ..model.rotations import matrix_to_quat, quat_to_rotvec, rotvec_to_quat
 from ..model.temporal_transform import dct_basis
 from ..threads import each_frame
 
@@ -121,9 +121,10 @@ def _fit(lattice, x, means, places, settings) -> tuple[NodeMotion, np.ndarray]:
 
 def _carried(motion: NodeMotion, x: np.ndarray) -> np.ndarray:
     """[T, N, 3], where the nodes carry x [N, 3]."""
-    poses = rigid_poses(motion.positions, rotvec_to_quat(motion.rotations), motion.translations)
+    rotations, positions = rotvec_to_quat(motion.rotations), motion.positions + motion.translations
     rest, weights = x.astype(np.float32), (motion.neighbors.astype(np.uint32), motion.weights)
-    return np.stack([_native.blend_rigid(p, rest, *weights)[0] for p in poses])
+    at = [(motion.positions, *nodes) for nodes in zip(rotations, positions, strict=True)]
+    return np.stack([_native.blend_rigid(nodes, rest, *weights)[0] for nodes in at])
 
 
 def _fit_frame(transposed, mass, x, nodes, y) -> tuple[np.ndarray, np.ndarray]:

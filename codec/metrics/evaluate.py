@@ -33,22 +33,26 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def _report(frame_count: int, counts: list[int], size: int | None, rows: list[dict]) -> dict:
+def _report(
+    frame_count: int, counts: list[int], size: int | None, rows: list[dict], encoded: float | None = None
+) -> dict:
     """The keys of both evaluations; a key that does not apply is None.
 
     Args:
         frame_count: frames of the stream, whose bytes are `size`.
         counts: Gaussians of each measured frame.
         rows: measures of each measured frame.
+        encoded: Gaussians a frame that went in, by which the bits are divided; None: those that came out.
     """
     gaussians = float(np.mean(counts))
+    divisor = gaussians if encoded is None else encoded
     known = {k: _mean(r[k] for r in rows) for k in rows[0] if k != "frame"}
     return {
         "frames": frame_count,
         "gaussians": round(gaussians),
         "bytes": size,
         "kb_per_frame": None if size is None else size / 1000 / frame_count,
-        "bits_per_gaussian_frame": None if size is None or not gaussians else 8 * size / frame_count / gaussians,
+        "bits_per_gaussian_frame": None if size is None or not divisor else 8 * size / frame_count / divisor,
         **dict.fromkeys(("psnr", "psnr_fg", "ssim", "vmaf", "flicker", "codec_psnr", "codec_psnr_fg")),
         **known,
         "background": list(BACKGROUND),
@@ -144,7 +148,8 @@ def evaluate_splats(
         stream_frames: frames that the stream has; None: those of the sequence.
 
     Returns:
-        The keys of evaluate_capture with codec_psnr and codec_psnr_fg instead of psnr, psnr_fg, ssim, vmaf and flicker.
+        The keys of evaluate_capture with codec_psnr and codec_psnr_fg instead of psnr, psnr_fg, ssim, vmaf and flicker,
+        and gaussians_encoded, the mean of a frame of `sequence`, by which bits_per_gaussian_frame divides.
 
     Raises:
         UsageError: a frame is outside the sequence.
@@ -154,10 +159,11 @@ def evaluate_splats(
     if outside or not picked:
         raise UsageError(f"frames {outside or 'none'} to evaluate, the sequence has 0 to {sequence.frame_count - 1}")
     cameras = codec_cameras([sequence.frame(t) for t in sorted({picked[0], picked[len(picked) // 2], picked[-1]})])
-    rows, counts = [], []
+    rows, counts, given = [], [], []
     for i, t in enumerate(picked):
         reference, decoded = sequence.frame(t), frame_source(t)
         counts.append(len(decoded))
+        given.append(len(reference))
         images = []
         for n, camera in enumerate(cameras):
             expected, alpha = _draw(reference, camera)
@@ -168,7 +174,9 @@ def evaluate_splats(
             if progress:
                 progress(i * len(cameras) + n + 1, len(picked) * len(cameras))
         rows.append({"frame": t} | {k: _mean(x[k] for x in images) for k in images[0]})
-    return _report(stream_frames or sequence.frame_count, counts, size, rows)
+    encoded = float(np.mean(given))
+    report = _report(stream_frames or sequence.frame_count, counts, size, rows, encoded)
+    return report | {"gaussians_encoded": round(encoded)}
 
 
 def _draw(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

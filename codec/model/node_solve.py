@@ -6,7 +6,7 @@ import numpy as np
 
 from .. import _native
 from ..threads import each_frame
-from .rotations import rigid_poses, rotvec_to_quat
+from .rotations import rotvec_to_quat
 
 RIDGE = 1e-3  # pull of a translation towards where it starts, in shares of the node's mass
 
@@ -32,8 +32,9 @@ def solve_translations(
     x = rest.astype(np.float32)
 
     def left(t: int) -> np.ndarray:
-        poses = rigid_poses(positions, rotvec_to_quat(rotations[t]), start[t]).astype(np.float32)
-        return B.T @ (means[t] - _native.blend_rigid(poses, x, index, share)[0])
+        at = (positions, rotvec_to_quat(rotations[t]), positions + start[t])
+        nodes = tuple(np.ascontiguousarray(a, np.float32) for a in at)
+        return B.T @ (means[t] - _native.blend_rigid(nodes, x, index, share)[0])
 
     missing = np.stack(each_frame(left, frames), 1).astype(np.float64).reshape(m, frames * 3)
     normal = (B.T @ B).astype(np.float64)

@@ -88,12 +88,3 @@ def matrix_to_quat(R: np.ndarray) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]]
-
-
-def rigid_poses(positions, rotations, translations):
-    """Nodes at `positions` [M, 3], rotated about themselves by unit quaternions [..., M, 4] and moved by [..., M, 3] ->
-    [..., M, 16], the poses that `_native.blend_rigid` takes: rows of R, s of x -> R x + s, quaternion."""
-    xp = _namespace(positions)
-    R = quat_to_matrix(rotations)
-    shift = positions + translations - (R @ positions[..., None])[..., 0]
-    return xp.concatenate([R.reshape(*R.shape[:-2], 9), shift, rotations], -1)

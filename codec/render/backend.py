@@ -33,6 +33,7 @@ class Crop:
         exposure: gain and offset of this camera, 3 floats each, of the light of the Gaussians and not of the
             background.
         weight: [h, w] f32, weights of pixels in the image loss (a weighted mean).
+        target_depth: [h, w] f32, world units along the optical axis, 0 where it is unknown. None: no depth term.
         region: part of the image that is rendered; None: all of it.
     """
 
@@ -42,6 +43,7 @@ class Crop:
     background: Sequence[float] = (0.0, 0.0, 0.0)
     exposure: tuple[Sequence[float], Sequence[float]] | None = None
     weight: np.ndarray | None = None
+    target_depth: np.ndarray | None = None
     region: Region | None = None
 
     def part(self) -> Region:
@@ -54,8 +56,10 @@ class RenderLoss:
     """Loss of a batch of crops and its gradients. Arrays belong to the backend; its next call overwrites them.
 
     Attributes:
-        loss: (1 - ssim_lambda) * l1 + ssim_lambda * (1 - ssim) + mask_lambda * mask, summed over the crops.
-        l1, mse, ssim, mask: the terms; means over pixels (and channels) and crops. psnr = -10 log10(mse).
+        loss: image_loss + mask_lambda * mask + depth_lambda * depth, summed over the crops.
+        image_loss: (1 - ssim_lambda) * l1 + ssim_lambda * (1 - ssim), summed over the crops.
+        l1, mse, ssim, mask, depth: the terms; means over pixels (and channels) and crops. psnr = -10 log10(mse). The
+            depth term is |sum of weights * (depth - target)| / target, 0 where the target is unknown.
         pixels: of all crops together.
         grads: by parameter name, in the shapes of the parameters; tensors where the parameter was a tensor.
         grad2d: [N] f32, norm of the gradient by the projected mean in units of half the image (the densification
@@ -66,10 +70,12 @@ class RenderLoss:
     """
 
     loss: float
+    image_loss: float
     l1: float
     mse: float
     ssim: float
     mask: float
+    depth: float
     pixels: int
     grads: dict
     grad2d: np.ndarray
@@ -88,13 +94,17 @@ class Backend(Protocol):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Image [h, w, 3] f32 over `background` and alpha [h, w] f32 of the region (None: all of the image)."""
 
+    def render_depth(self, params: Params, camera: Camera) -> np.ndarray:
+        """[H, W] f32 expected depth along the optical axis, world units, as blending weighs it; 0 where nothing is
+        drawn."""
+
     def photometric_loss(
-        self, params: Params, crops: Sequence[Crop], *, ssim_lambda: float, mask_lambda: float
+        self, params: Params, crops: Sequence[Crop], *, ssim_lambda: float, mask_lambda: float, depth_lambda: float
     ) -> RenderLoss:
         """Loss of Gaussians against the targets of `crops`, and its gradients."""
 
     def start_photometric_loss(
-        self, params: Params, crops: Sequence[Crop], *, ssim_lambda: float, mask_lambda: float
+        self, params: Params, crops: Sequence[Crop], *, ssim_lambda: float, mask_lambda: float, depth_lambda: float
     ) -> PendingLoss:
         """Starts `photometric_loss` of the Gaussians as they are now, beside the caller.
 
@@ -154,7 +164,8 @@ class Backend(Protocol):
         rounding, and along that by their bits: Laplace code lengths with uniform noise in place of rounding.
 
         Args:
-            arrays: coefficients [K, N, C], gradient [N, C] by the sum, first and second moment [K, N, C]; f32.
+            arrays: coefficients [K, N, C], gradient [N, C] by the sum, first moment [K, N, C], and second [N, C], which
+                the K share; f32.
             at: [K], as of `trajectory_sum`.
             price: loss of one bit, Laplace scales [K], and at least N * C + K - 1 uniform values in -0.5 .. 0.5.
             step: of these coefficients, from 1.

@@ -39,36 +39,55 @@ class CpuBackend:
         """As of `Backend`."""
         return self.workspace.forward(_arrays(params), camera, background, region)
 
+    def render_depth(self, params: Params, camera: Camera) -> np.ndarray:
+        """As of `Backend`."""
+        return self.workspace.depth(_arrays(params), camera)
+
     def photometric_loss(
-        self, params: Params, crops: Sequence[Crop], *, ssim_lambda: float = 0.2, mask_lambda: float = 0.0
+        self,
+        params: Params,
+        crops: Sequence[Crop],
+        *,
+        ssim_lambda: float = 0.2,
+        mask_lambda: float = 0.0,
+        depth_lambda: float = 0.0,
     ) -> RenderLoss:
         """As of `Backend`.
 
         Raises:
             UsageError: shapes disagree, a camera has distortion, or there are no crops.
         """
-        return self._photometric_loss(params, _arrays(params), crops, (ssim_lambda, mask_lambda))
+        return self._photometric_loss(params, _arrays(params), crops, (ssim_lambda, mask_lambda, depth_lambda))
 
     def start_photometric_loss(
-        self, params: Params, crops: Sequence[Crop], *, ssim_lambda: float = 0.2, mask_lambda: float = 0.0
+        self,
+        params: Params,
+        crops: Sequence[Crop],
+        *,
+        ssim_lambda: float = 0.2,
+        mask_lambda: float = 0.0,
+        depth_lambda: float = 0.0,
     ) -> PendingLoss:
         """As of `Backend`."""
-        arrays = tuple(a.copy() for a in _arrays(params))
-        return self._worker.submit(self._photometric_loss, params, arrays, crops, (ssim_lambda, mask_lambda)).result
+        arrays, lambdas = tuple(a.copy() for a in _arrays(params)), (ssim_lambda, mask_lambda, depth_lambda)
+        return self._worker.submit(self._photometric_loss, params, arrays, crops, lambdas).result
 
     def _photometric_loss(
-        self, params: Params, arrays: tuple[np.ndarray, ...], crops: Sequence[Crop], lambdas: tuple[float, float]
+        self, params: Params, arrays: tuple[np.ndarray, ...], crops: Sequence[Crop], lambdas: tuple[float, ...]
     ) -> RenderLoss:
-        """`photometric_loss` of the six `arrays`; `params`: what the gradients look like."""
+        """`photometric_loss` of the six `arrays`; `params`: what the gradients look like. `lambdas`: of SSIM, mask and
+        depth."""
         if not crops:
             raise UsageError("a batch has at least one crop, got none")
         grads, statistics = self.workspace.gradients(arrays)
         step, native = self.workspace.native.step, [_native_crop(crop) for crop in crops]
         values, radii = call(step, arrays, native, lambdas, (grads, statistics))
-        losses, exposure = np.array([v[:5] for v in values]), np.array([v[5:] for v in values])
+        losses, exposure = np.array([v[:6] for v in values]), np.array([v[6:] for v in values])
         loss, means = float(losses[:, 0].sum()), losses[:, 1:].mean(0).tolist()
+        others = float((losses[:, 4:6] @ lambdas[1:]).sum())  # mask and depth
         return RenderLoss(
             loss,
+            loss - others,
             *means,
             pixels=sum(crop.part()[2] * crop.part()[3] for crop in crops),
             grads={k: _like(g, params[k]) for k, g in zip(PARAMETERS, grads, strict=True)},
@@ -131,7 +150,7 @@ def _arrays(params: Params) -> tuple[np.ndarray, ...]:
 
 def _native_crop(crop: Crop) -> tuple:
     """A crop as the native side takes it."""
-    target = (crop.target_rgb, crop.target_alpha, crop.weight)
+    target = (crop.target_rgb, crop.target_alpha, crop.weight, crop.target_depth)
     return (
         view(crop.camera, crop.part()),
         (rgb(crop.background), None if crop.exposure is None else tuple(map(rgb, crop.exposure))),

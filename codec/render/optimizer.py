@@ -99,7 +99,7 @@ class TrajectoryAdam:
         `Backend.trajectory_step`."""
         s, state = self._settings, self._states.get(name)
         if state is None:
-            state = self._states[name] = _State(np.zeros_like(coefficients), np.zeros_like(coefficients))
+            state = self._states[name] = _State(np.zeros_like(coefficients), np.zeros_like(grad))
         state.steps += 1
         arrays, betas = (coefficients, grad, state.first, state.second), (s.beta1, s.beta2)
         step = self._backend.trajectory_step
@@ -108,13 +108,14 @@ class TrajectoryAdam:
     def select(self, index: np.ndarray) -> None:
         """Keeps the Gaussians at `index` ([M] int or [N] bool)."""
         for state in self._states.values():
-            state.first, state.second = (np.ascontiguousarray(a[:, index]) for a in (state.first, state.second))
+            state.first, state.second = np.ascontiguousarray(state.first[:, index]), state.second[index]
 
     def append(self, count: int) -> None:
         """Adds `count` Gaussians with zero moments."""
         for state in self._states.values():
             more = np.zeros((len(state.first), count, *state.first.shape[2:]), np.float32)
-            state.first, state.second = (np.concatenate([a, more], 1) for a in (state.first, state.second))
+            state.first = np.concatenate([state.first, more], 1)
+            state.second = np.concatenate([state.second, more[0]])
 
 
 def _resized(a: np.ndarray, columns: int) -> np.ndarray:

@@ -61,6 +61,11 @@ class Workspace:
         image, alpha = call(self.native.forward, params, view(camera, region), rgb(background), training)
         return image.reshape(region[3], region[2], 3), alpha.reshape(region[3], region[2])
 
+    def depth(self, params, camera: Camera) -> np.ndarray:
+        """[H, W] f32 expected depth of `params` along the optical axis, world units; 0 where nothing is drawn."""
+        total, alpha = call(self.native.depth, params, view(camera, (0, 0, camera.width, camera.height)))
+        return (total / np.maximum(alpha, 1e-6)).reshape(camera.height, camera.width)
+
     def draw(self, params, camera: Camera, background) -> np.ndarray:
         """Renders `params`; returns [H, W, 3] uint8, rounded."""
         whole = (0, 0, camera.width, camera.height)

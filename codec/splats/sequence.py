@@ -20,6 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from ..capture.detect import LOOKED_FOR, find_capture
+from ..capture.images import SUFFIXES as PICTURES
+from ..capture.rig import VIDEOS
 from ..errors import CaptureError, UsageError
 from ..model.camera import NEAR, Camera
 from ..model.gaussian_sequence import DenseGroup, GaussianSequence
@@ -89,7 +91,21 @@ def detect_input(path: str | Path) -> str:
     if is_scene(path) or splat_paths(path):
         return "splats"
     looked = "; ".join([*LOOKED_FOR, f"splats, one per frame: {EXPECTED}", SCENES])
-    raise CaptureError(f"{path}: neither a capture nor splats; looked for {looked}")
+    raise CaptureError(f"{path}: {_instead(path)}neither a capture nor splats; looked for {looked}")
+
+
+def _instead(path: Path) -> str:
+    """What `path` is instead of an input, where that is known, the start of a sentence."""
+    if path.is_file():
+        return "a stream already, " if path.suffix.lower() == ".gsv" else ""
+    suffixes = [p.suffix.lower() for p in path.iterdir()]
+    if not suffixes:
+        return "the folder is empty, "
+    pictures, videos = (sum(s in known for s in suffixes) for known in (PICTURES, VIDEOS))
+    if pictures or videos:
+        found = f"{pictures} images" if pictures else f"{videos} videos"
+        return f"{found}, but no calibration (COLMAP, say, makes one), "
+    return ""
 
 
 def open_sequence(

@@ -55,7 +55,7 @@ class Changes:
         for camera, fitted in zip(self.views.train_cameras, self.fitted, strict=True):
             now = self._image(camera, frame)
             difference = cv2.blur(now.astype(np.float32) - fitted, (3, 3))
-            changed = np.abs(difference).max(2) > self.settings.threshold
+            changed = np.maximum.reduce(cv2.split(np.abs(difference))) > self.settings.threshold
             fitted[changed] = now[changed]
             masks.append(self._dilated(changed))
         return masks

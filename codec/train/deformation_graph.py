@@ -9,14 +9,14 @@ Gaussians and their nodes rest at a free place beside all others, and the nodes'
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
 
 from .. import _native
 from ..farthest_point_sampling import farthest_points
-from ..model.rotations import quat_multiply, quat_to_matrix, rigid_poses, rotvec_to_quat
+from ..model.rotations import quat_multiply, quat_normalize, rotvec_to_quat
 from .settings import DeformationGraphSettings
 
 
@@ -44,31 +44,19 @@ class Pose:
 
     def next(self) -> Pose:
         """The pose a frame later, at constant velocity."""
-        step = rotvec_to_quat(self.angular_velocity)
-        rotations = torch.nn.functional.normalize(quat_multiply(step, self.rotations), dim=1)
-        return Pose(self.nodes + self.velocity, rotations, self.angular_velocity, self.velocity)
+        return self.moved(self.angular_velocity, self.velocity)
+
+    def moved(self, turn: torch.Tensor, shift: torch.Tensor) -> Pose:
+        """The nodes turned by `turn` ([M, 3] rotation vectors) and shifted by `shift` ([M, 3] world units); their last
+        step stays as it was."""
+        rotations = quat_normalize(quat_multiply(rotvec_to_quat(turn), self.rotations))
+        return replace(self, nodes=self.nodes + shift, rotations=rotations)
 
     def extended(self, nodes: torch.Tensor) -> Pose:
         """With more nodes at `nodes` [K, 3], which have not moved yet."""
         zero = torch.zeros_like(nodes)
         more = Pose(nodes, rotvec_to_quat(zero), zero, zero)
         return Pose(*(torch.cat([getattr(self, f.name), getattr(more, f.name)]) for f in fields(Pose)))
-
-
-class _Blend(torch.autograd.Function):
-    """`_native.blend_rigid`, differentiable in the poses of the nodes."""
-
-    @staticmethod
-    def forward(ctx, poses, rest, neighbors, weights):
-        arrays = tuple(np.ascontiguousarray(t.detach().numpy(), np.float32) for t in (poses, rest))
-        ctx.arrays = (*arrays, neighbors, weights)
-        return tuple(torch.from_numpy(a) for a in _native.blend_rigid(*ctx.arrays))
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, by_means, by_rotations):
-        grads = (g.contiguous().numpy() for g in (by_means, by_rotations))
-        return torch.from_numpy(_native.blend_rigid_backward(*ctx.arrays, *grads)), None, None, None
 
 
 class NodeGraph:
@@ -85,7 +73,6 @@ class NodeGraph:
     Attributes:
         nodes: [M, 3] positions of the nodes at rest.
         neighbors: [N, k] u32, nodes that carry each Gaussian, the nearest first; weights: [N, k] f32.
-        spacing: median distance of neighbouring nodes.
     """
 
     def __init__(
@@ -112,12 +99,11 @@ class NodeGraph:
         self.nodes = self.low + self.step * torch.from_numpy(self.chosen.astype(np.float32))
         m, k = len(self.chosen), min(self.settings.edges, len(self.chosen) - 1)
         near = cKDTree(self.nodes.numpy()).query(self.nodes.numpy(), k + 1)[1].reshape(m, -1)[:, 1:]
-        self._edges = torch.from_numpy(near.astype(np.int64))
-        length = (self.nodes[self._edges] - self.nodes[:, None]).norm(dim=2, keepdim=True)
+        length = (self.nodes[near.astype(np.int64)] - self.nodes[:, None]).norm(dim=2)
         median = length.median() if k else torch.ones(())
         falloff = self.settings.edge_falloff * median
         weight = torch.exp2(-((length / falloff) ** 2))  # long edges bridge gaps: less weight
-        self._edge_weights, self.spacing = weight * self.settings.lattice / self.step, float(median)
+        self._edges = np.ascontiguousarray(near, np.uint32), (weight * self.settings.lattice / self.step).numpy()
 
     @staticmethod
     def of(
@@ -232,8 +218,35 @@ class NodeGraph:
         Returns:
             means [N, 3] and the blended rotation [N, 4] unit wxyz.
         """
-        poses = rigid_poses(self.nodes, pose.rotations, pose.nodes - self.nodes)
-        return _Blend.apply(poses, x, self.neighbors, self.weights)
+        carried = _native.blend_rigid(self._at(pose), x.numpy(), self.neighbors, self.weights)
+        return tuple(torch.from_numpy(a) for a in carried)
+
+    def gradients(
+        self,
+        x: torch.Tensor,
+        base: tuple[torch.Tensor, torch.Tensor],
+        pose: Pose,
+        by_carried: tuple[torch.Tensor, torch.Tensor],
+        rigidity: float,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Gradients [M, 3] and [M, 3] by the turn and the shift of the nodes (`Pose.moved`): those of a loss and of the
+        as-rigid-as-possible term, the mean weighted difference between edges as they are and as their node rotates them
+        (Sorkine and Alexa 2007), in lattice spacings times `lattice`.
+
+        Args:
+            x: [N, 3] as of `carry`.
+            base: rotations [M, 4] before the turn, and the turn [M, 3]; `pose`: the nodes behind it.
+            by_carried: gradients of the loss by the results of `carry`, [N, 3] and [N, 4].
+            rigidity: weight of the term.
+        """
+        rotations, turn = (a.contiguous().numpy() for a in base)
+        blend = x.numpy(), self.neighbors, self.weights
+        by = tuple(g.contiguous().numpy() for g in by_carried)
+        grads = _native.node_gradients(self._at(pose), (turn, rotations), blend, by, (*self._edges, rigidity))
+        return tuple(torch.from_numpy(g) for g in grads)
+
+    def _at(self, pose: Pose) -> tuple[np.ndarray, ...]:
+        return self.nodes.numpy(), pose.rotations.numpy(), pose.nodes.numpy()
 
     def carriers(self, chosen: torch.Tensor) -> torch.Tensor:
         """Nodes that carry a Gaussian of `chosen` ([N] bool) with a weight of more than
@@ -241,16 +254,6 @@ class NodeGraph:
         some = chosen.numpy()
         carried = self.neighbors[some][self.weights[some] > self.settings.carrier_weight_min]
         return torch.from_numpy(np.isin(np.arange(len(self)), carried))
-
-    def rigidity(self, pose: Pose) -> torch.Tensor:
-        """As-rigid-as-possible term: mean weighted difference between edges as they are and as their node rotates them
-        (Sorkine and Alexa 2007), in lattice spacings times `lattice`."""
-        if self._edges.numel() == 0:
-            return pose.nodes.sum() * 0
-        edge = self.nodes[self._edges] - self.nodes[:, None]
-        rotated = torch.einsum("mij,mkj->mki", quat_to_matrix(pose.rotations), edge)
-        missed = rotated - (pose.nodes[self._edges] - pose.nodes[:, None])
-        return (self._edge_weights * missed).square().sum(2).add(1e-12).sqrt().mean()
 
 
 def _padded(a: np.ndarray, width: int) -> np.ndarray:

@@ -96,8 +96,8 @@ def error_masks(
     g, out = model.gaussians(), []
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (settings.opening, settings.opening))
     for camera, mask in zip(views.train_cameras, masks, strict=True):
-        error = np.abs(views.render(g, camera, frame) - blend(views.view(camera, frame), GREY)).max(2)
-        small = cv2.resize(error, mask.shape[::-1], interpolation=cv2.INTER_AREA)
+        error = np.abs(views.render(g, camera, frame) - blend(views.view(camera, frame), GREY))
+        small = cv2.resize(np.maximum.reduce(cv2.split(error)), mask.shape[::-1], interpolation=cv2.INTER_AREA)
         wrong = (mask & (small > settings.error_min)).astype(np.uint8)
         out.append(cv2.morphologyEx(wrong, cv2.MORPH_OPEN, kernel) > 0)
     return out

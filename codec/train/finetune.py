@@ -8,7 +8,7 @@ them; their gradient passes straight through the rounding. joint_optimization.py
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -16,12 +16,12 @@ import torch
 from ..bitstream.color import STEP_WEIGHTS
 from ..bitstream.quantization import Steps, trajectory_step
 from ..model.parametric_group import NodeMotion, ParametricGroup
-from ..model.rotations import quat_conjugate, quat_multiply, quat_normalize, quat_to_rotvec, rotate, rotvec_to_quat
+from ..model.rotations import quat_conjugate, quat_to_rotvec, rotate
 from ..model.temporal_transform import dct_basis
 from ..render.backend import Backend
 from .deformation_graph import NodeGraph, Pose
 from .entropy_model import CanonicalRate
-from .model import NAMES, REMOVED_LOGIT, Model
+from .model import NAMES, REMOVED_LOGIT, Model, quat_product
 from .motion_field import MotionField
 from .settings import TrainSettings
 
@@ -32,8 +32,8 @@ class Frame:
 
     Attributes:
         params: attributes as they are rendered.
-        pose: of the nodes, with its leaves `turn` and `shift` [M, 3].
-        means, rotations: [N, 3] and [N, 4], where the nodes carry the Gaussians; differentiable in the leaves.
+        pose: of the nodes; turn: [M, 3] rotation vectors behind the tracked one.
+        means, rotations: [N, 3] and [N, 4], where the nodes carry the Gaussians. rest: [N, 3], canonical means.
         residual: [N, 4], the residual rotation, unit. inner: [N, 4], rotation before it. quats: [N, 4], canonical.
         shown: [N] bool.
     """
@@ -41,8 +41,8 @@ class Frame:
     params: dict[str, torch.Tensor]
     pose: Pose
     turn: torch.Tensor
-    shift: torch.Tensor
     means: torch.Tensor
+    rest: torch.Tensor
     rotations: torch.Tensor
     residual: torch.Tensor
     inner: torch.Tensor
@@ -149,7 +149,7 @@ class GroupModel:
         params = {n: self._hold_outside_lifetime([m.params[n] for m in tracked]).mean(0) for n in NAMES}
         params["means"] = self.graph.means
         rotations = [self.graph.carry(self.graph.means, pose)[1] for pose in self._tracked_poses]
-        back = [quat_multiply(quat_conjugate(q), m.params["quats"]) for q, m in zip(rotations, tracked, strict=True)]
+        back = [quat_product(q, m.params["quats"], inverse_a=True) for q, m in zip(rotations, tracked, strict=True)]
         back = self._hold_outside_lifetime(back)
         back = back * torch.where((back * back[-1]).sum(2, keepdim=True) < 0, -1.0, 1.0)
         params["quats"] = torch.nn.functional.normalize(back.sum(0), dim=1)
@@ -164,7 +164,7 @@ class GroupModel:
         for model, pose in zip(tracked, self._tracked_poses, strict=True):
             means, rotations = self.graph.carry(p["means"], pose)
             q = model.params
-            dq = quat_multiply(q["quats"], quat_conjugate(quat_multiply(rotations, p["quats"])))
+            dq = quat_product(q["quats"], quat_product(rotations, p["quats"]), inverse_b=True)
             residual["means"].append(q["means"] - means)
             residual["quats"].append(dq[:, 1:] * torch.where(dq[:, :1] < 0, -1.0, 1.0))
             for name in ("log_scales", "sh0"):
@@ -182,13 +182,20 @@ class GroupModel:
         """Residual at frame `t` for each coefficient of an attribute that is 1, [K] f32."""
         return self.unit[name] * self.basis[: len(self.coefficients[name]), t]
 
-    def pose(self, t: int) -> tuple[Pose, torch.Tensor, torch.Tensor]:
-        """Corrected pose of the nodes at frame `t`, differentiable in the correction [M, 3] and [M, 3] behind it."""
-        tracked, turn, shift = self._tracked_poses[t], self.turns[t].clone(), self.shifts[t].clone()
-        turn, shift = turn.requires_grad_(), shift.requires_grad_()
-        by_field = (0.0, 0.0) if self.field is None else self.field(t)
-        rotations = quat_normalize(quat_multiply(rotvec_to_quat(turn + by_field[0]), tracked.rotations))
-        return replace(tracked, rotations=rotations, nodes=tracked.nodes + shift + by_field[1]), turn, shift
+    def pose(self, t: int) -> tuple[Pose, torch.Tensor]:
+        """Corrected pose of the nodes at frame `t`, and their turn behind the tracked one, [M, 3] rotation vectors."""
+        turn, shift = self.turns[t], self.shifts[t]
+        if self.field is not None:
+            by_field = self.field(t)
+            turn, shift = turn + by_field[0], shift + by_field[1]
+        return self._tracked_poses[t].moved(turn, shift), turn
+
+    def by_nodes(
+        self, t: int, frame: Frame, by_carried: tuple[torch.Tensor, torch.Tensor], rigidity: float
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Gradients [M, 3] and [M, 3] by the turns and shifts of the nodes at frame `t` (`NodeGraph.gradients`)."""
+        base = self._tracked_poses[t].rotations, frame.turn
+        return self.graph.gradients(frame.rest, base, frame.pose, by_carried, rigidity)
 
     def frame(self, t: int, backend: Backend, noise: dict[str, torch.Tensor] | None = None) -> Frame:
         """Frame `t`.
@@ -202,43 +209,40 @@ class GroupModel:
         delta = {
             n: torch.from_numpy(backend.trajectory_sum(c, self.at(n, t), zone)) for n, c in self.coefficients.items()
         }
-        pose, turn, shift = self.pose(t)
+        pose, turn = self.pose(t)
         means, rotations = self.graph.carry(p["means"], pose)
-        with torch.no_grad():
-            dq = delta["quats"]
-            residual = torch.cat([(1 - dq.square().sum(1, keepdim=True)).clamp(min=1e-6).sqrt(), dq], 1)
-            inner = quat_multiply(rotations, p["quats"])
-            shown = (self.start <= t) & (t < self.end)
-            opacities = p["logit_opacities"] + delta["logit_opacities"][:, 0]
-            params = {
-                **p,
-                "means": means + delta["means"],
-                "quats": quat_multiply(residual, inner),
-                "log_scales": p["log_scales"] + delta["log_scales"],
-                "logit_opacities": torch.where(shown, opacities, REMOVED_LOGIT),
-                "sh0": p["sh0"] + delta["sh0"],
-            }
-        return Frame(params, pose, turn, shift, means, rotations, residual, inner, p["quats"], shown)
+        dq = delta["quats"]
+        residual = torch.cat([(1 - dq.square().sum(1, keepdim=True)).clamp(min=1e-6).sqrt(), dq], 1)
+        inner = quat_product(rotations, p["quats"])
+        shown = (self.start <= t) & (t < self.end)
+        opacities = p["logit_opacities"] + delta["logit_opacities"][:, 0]
+        params = {
+            **p,
+            "means": means + delta["means"],
+            "quats": quat_product(residual, inner),
+            "log_scales": p["log_scales"] + delta["log_scales"],
+            "logit_opacities": torch.where(shown, opacities, REMOVED_LOGIT),
+            "sh0": p["sh0"] + delta["sh0"],
+        }
+        return Frame(params, pose, turn, means, p["means"], rotations, residual, inner, p["quats"], shown)
 
-    @torch.no_grad()
     def gradients(self, frame: Frame, grads: dict[str, torch.Tensor]) -> tuple[dict, dict, torch.Tensor]:
         """From the gradients by what is rendered: those by the residuals, attribute -> [N, C], 0 for Gaussians that are
         not free; those by the canonical attributes; and that by the rotations of the nodes, [N, 4]."""
-        by_inner = quat_multiply(quat_conjugate(frame.residual), grads["quats"])
-        by_residual = quat_multiply(grads["quats"], quat_conjugate(frame.inner))
+        by_inner = quat_product(frame.residual, grads["quats"], inverse_a=True)
+        by_residual = quat_product(grads["quats"], frame.inner, inverse_b=True)
         by_dq = by_residual[:, 1:] - by_residual[:, :1] * (frame.residual[:, 1:] / frame.residual[:, :1])
         opacities = grads["logit_opacities"] * frame.shown
         residuals = {**grads, "quats": by_dq, "logit_opacities": opacities[:, None]}
         free = self.free[:, None]
         residuals = {n: (residuals[n] * free).numpy() for n in self.coefficients}
-        back = quat_conjugate(frame.rotations)
         canonical = {
             **grads,
-            "means": rotate(back, grads["means"]),
-            "quats": quat_multiply(back, by_inner),
+            "means": rotate(quat_conjugate(frame.rotations), grads["means"]),
+            "quats": quat_product(frame.rotations, by_inner, inverse_a=True),
             "logit_opacities": opacities,
         }
-        return residuals, canonical, quat_multiply(by_inner, quat_conjugate(frame.quats))
+        return residuals, canonical, quat_product(by_inner, frame.quats, inverse_b=True)
 
     def group(self, parents: np.ndarray | None) -> ParametricGroup:
         """The group as it is encoded; `parents` as in ParametricGroup."""
@@ -256,7 +260,6 @@ class GroupModel:
             rate_optimized=True,
         )
 
-    @torch.no_grad()
     def nodes(self) -> NodeMotion:
         """The carrying motion."""
         rotations, near = [], None

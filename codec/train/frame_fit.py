@@ -7,17 +7,16 @@ expressed by nodes, and does not accumulate in the Gaussians frame by frame.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from ..model.rotations import quat_conjugate, quat_multiply
 from ..render.optimizer import Adam
 from .deformation_graph import Pose
 from .keyframe import Statistics
-from .model import Model
+from .model import Model, quat_product
 from .motion_field import MotionField
 from .views import Target, photometric_loss
 
@@ -36,18 +35,18 @@ class FrameFit:
     def __init__(self, tracker: Tracker, rng: np.random.Generator):
         s, backend = tracker.settings.tracking, tracker.views.backend
         self.tracker, self._rng = tracker, rng
-        self._moving = tracker.moving.float()
+        self._moving, self._all_move = tracker.moving.float(), bool(tracker.moving.all())
         carriers = tracker.graph.carriers(tracker.moving).float()[:, None]
         self._nodes = {
-            "angular_velocity": (tracker.pose.angular_velocity * carriers).requires_grad_(),
-            "velocity": (tracker.pose.velocity * carriers).requires_grad_(),
+            "angular_velocity": tracker.pose.angular_velocity * carriers,
+            "velocity": tracker.pose.velocity * carriers,
         }
         self._carriers, self._adam = carriers, Adam(backend, s.node_adam)
         self._rates = {"angular_velocity": s.node_rotation_rate, "velocity": s.node_translation_rate * tracker.radius}
         self._field, f = None, tracker.settings.motion_field
         if f.tracking:
-            self._field = MotionField(tracker.graph.nodes, tracker.radius, 1, f, tracker.settings.seed)
-            self._field.start_optimizer(backend, s.node_adam)
+            nodes, seed = tracker.graph.nodes, tracker.settings.seed
+            self._field = MotionField(nodes, tracker.radius, 1, f, seed, backend, s.node_adam)
         self.own = Model(tracker.own.params)
         self.own.start_optimizer(backend, tracker.settings.adam)
         self.statistics = Statistics(len(self.own), tracker.settings.keyframe.mse_min)
@@ -75,27 +74,29 @@ class FrameFit:
         if full:
             self.statistics.add(result)
         grads = result.grads
-        rigidity = (s.first_round_rigidity if first else 1.0) * t.settings.rigidity * t.graph.rigidity(pose)
-        self._step_nodes(params, grads, rigidity, decay)
-        grads = {**grads, "quats": quat_multiply(quat_conjugate(rotations.detach()), grads["quats"])}  # before rotation
-        free = {n: g * self._moving.view(-1, *[1] * (g.dim() - 1)) for n, g in grads.items()}
+        by_rotations = quat_product(grads["quats"], self.own.params["quats"], inverse_b=True)
+        rigidity = (s.first_round_rigidity if first else 1.0) * t.settings.rigidity
+        self._step_nodes(pose, (grads["means"], by_rotations), rigidity, decay)
+        grads = {**grads, "quats": quat_product(rotations, grads["quats"], inverse_a=True)}  # before rotation
+        free = grads
+        if not self._all_move:
+            free = {n: g * self._moving.view(-1, *[1] * (g.dim() - 1)) for n, g in grads.items()}
         self.own.step(free, s.rates.scaled(t.radius, decay * (s.first_round_rates if first else 1.0)))
-        return result.loss - t.settings.mask_lambda * result.mask
+        return result.image_loss
 
-    def _step_nodes(self, params: dict, grads: dict, rigidity: torch.Tensor, decay: float) -> None:
-        """One step of the nodes along the gradients by the carried means and quats, and along that of `rigidity`."""
-        for p in self._nodes.values():
-            p.grad = None
-        heads = [params["means"], params["quats"], rigidity]
-        torch.autograd.backward(heads, [grads["means"], grads["quats"], torch.ones(())])
-        by_nodes = {n: p.grad * self._carriers for n, p in self._nodes.items()}
-        self._adam.step(self._nodes, by_nodes, {n: r * decay for n, r in self._rates.items()})
+    def _step_nodes(self, pose: Pose, by_carried: tuple, rigidity: float, decay: float) -> None:
+        """One step of the nodes along the gradients by where they carry the Gaussians, and along that of rigidity."""
+        graph, base = self.tracker.graph, (self.tracker.pose.rotations, pose.angular_velocity)
+        by = graph.gradients(graph.means, base, pose, by_carried, rigidity)
+        by = [g * self._carriers for g in by]
+        self._adam.step(self._nodes, dict(zip(self._nodes, by, strict=True)), self._scaled(decay))
         if self._field is not None:
-            self._field.step(decay)
+            self._field.step(0, *by, decay)
 
-    @torch.no_grad()
+    def _scaled(self, decay: float) -> dict[str, float]:
+        return {n: r * decay for n, r in self._rates.items()}
+
     def result(self) -> tuple[Model, Pose]:
         """The Gaussians' own attributes and the pose of the nodes."""
         quats = torch.nn.functional.normalize(self.own.params["quats"], dim=1)
-        pose = self._pose()
-        return Model({**self.own.params, "quats": quats}), Pose(*(getattr(pose, f.name).detach() for f in fields(Pose)))
+        return Model({**self.own.params, "quats": quats}), self._pose()

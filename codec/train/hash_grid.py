@@ -53,6 +53,13 @@ class HashGrid(torch.nn.Module):
         """[N, 3] in [0, 1] (clamped) -> [N, L * F]; gradients for the table, and for points that require one."""
         return _Lookup.apply(points, self.table, self.native, len(self.cells))
 
+    def by_table(self, points: torch.Tensor, grad_out: torch.Tensor) -> torch.Tensor:
+        """Gradient [entries, F] by the table, from that by the result of `forward` at points [N, 3] f32."""
+        grad = torch.zeros_like(self.table)
+        table = self.table.detach().numpy()
+        self.native.backward(points.numpy(), table, grad_out.contiguous().numpy(), grad.numpy(), None)
+        return grad
+
     def reference(self, points: torch.Tensor) -> torch.Tensor:
         """`forward` in plain torch, in the dtype of `points`."""
         table, outputs, first = self.table.to(points.dtype), [], 0

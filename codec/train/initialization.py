@@ -1,12 +1,16 @@
-"""Initial model of a keyframe: Gaussians at the capture's own points and at points of the visual hull or of a plane
-sweep, or at random ones where there is none of these."""
+"""Initial model of a keyframe: Gaussians at the capture's own points and at points of depth images, of the visual hull
+or of a plane sweep, or at random ones where there is none of these."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
 from ..bitstream.quantization import subject_radius
+from ..capture import View
 from ..errors import CaptureError
+from .depth_points import depth_points
 from .model import Model, from_points
 from .plane_sweep import shell, sweep
 from .settings import TrainSettings
@@ -16,13 +20,20 @@ from .visual_hull import hull_points, random_points
 Cloud = tuple[np.ndarray, np.ndarray]  # points [P, 3], colours [P, 3] in 0..1
 
 
-def initial_model(capture, frame: int, count: int, settings: TrainSettings) -> tuple[Model, float]:
-    """Gaussians on the surfaces that are known, and the radius of what they show: the capture's own points, and the
-    visual hull of the masks besides; without masks matched features, a plane sweep, and a far shell that the radius
-    does not count. They are random where too little is found.
+def initial_model(
+    capture,
+    frame: int,
+    count: int,
+    settings: TrainSettings,
+    look: Callable[[int, int], View] | None = None,
+) -> tuple[Model, float]:
+    """Gaussians on the surfaces that are known, and the radius of what they show: the capture's own points, and besides
+    what its depth images show, or else the visual hull of the masks; without either matched features and a plane sweep.
+    Without masks there is a far shell, too, which the radius does not count. They are random where too little is found.
 
     Args:
         count: of points, about.
+        look: (camera, frame) -> its picture, from a cache; None: `capture.view`.
 
     Raises:
         CaptureError: there is no training camera, or no point is seen by two of them.
@@ -30,30 +41,39 @@ def initial_model(capture, frame: int, count: int, settings: TrainSettings) -> t
     cameras = capture.indices("train")
     if not cameras:
         raise CaptureError(f"{capture.name}: no training camera, expected at least one with split 'train'")
-    s, views = settings.initialization, []
-    for camera in cameras:
-        v = capture.view(camera, frame)
-        views.append((capture.camera(camera, frame), v.rgb, v.alpha))
+    s, look = settings.initialization, look or capture.view
+    pictures = {camera: look(camera, frame) for camera in cameras}
+    views = [(capture.camera(i, frame), v.rgb, v.alpha) for i, v in pictures.items()]
+    depths = [v.depth if s.use_depth else None for v in pictures.values()]
     known = [c for c, _, _ in views]
+    has_depth, masked = any(d is not None for d in depths), all(alpha is not None for _, _, alpha in views)
     most = int(s.points_share_max * count)
     points = capture.points if s.use_points else None
-    if points is None and s.triangulate and any(alpha is None for _, _, alpha in views):
-        points = triangulated(capture, frame, s)
+    if points is None and s.triangulate and not masked and not has_depth:
+        points = triangulated(capture, frame, s, pictures.__getitem__)
     own = known_points(points, views, most, settings.seed)
     left = count - len(own[0])
-    if all(alpha is not None for _, _, alpha in views):
+    if has_depth:
+        found = _joined(own, depth_points(views, depths, left, settings.seed, settings.plane_sweep.depth_tolerance))
+        if len(found[0]) >= s.sweep_min_share * count:
+            return _on_surfaces(found, views, masked, settings)
+    if masked:
         hull = hull_points(known, views, left, settings.visual_hull)
         if len(hull[0]):
-            surface = _joined(own, hull)
-            return from_points(*surface, opacity=s.surface_opacity), subject_radius(surface[0])
+            return _on_surfaces(_joined(own, hull), views, masked, settings)
     found = _joined(own, sweep(views, left, settings.seed, settings.plane_sweep)) if s.use_plane_sweep else own
     if len(found[0]) and len(found[0]) >= s.sweep_min_share * count:
-        whole = _joined(found, shell(views, settings.plane_sweep))
-        return from_points(*whole, opacity=s.surface_opacity), subject_radius(found[0])
+        return _on_surfaces(found, views, False, settings)
     points, colors = random_points(known, views, count, settings.seed, settings.visual_hull)
     if len(points) == 0:
         raise CaptureError(f"{capture.name}: no point is seen by two cameras, expected cameras that overlap")
     return from_points(points, colors, opacity=s.random_opacity), subject_radius(points)
+
+
+def _on_surfaces(found: Cloud, views, masked: bool, settings: TrainSettings) -> tuple[Model, float]:
+    """Gaussians at points on surfaces, and in a far shell where there are no masks; and the radius of the points."""
+    whole = found if masked else _joined(found, shell(views, settings.plane_sweep))
+    return from_points(*whole, opacity=settings.initialization.surface_opacity), subject_radius(found[0])
 
 
 def _joined(a: Cloud, b: Cloud) -> Cloud:

@@ -38,9 +38,8 @@ class _Finetuner:
         self.scales, self.nodes = Adam(backend, f.coefficient_adam), Adam(backend, f.coefficient_adam)
         group.key.start_optimizer(backend, settings.adam)
         if settings.motion_field.finetune:
-            nodes = group.graph.nodes
-            group.field = MotionField(nodes, radius, group.frames, settings.motion_field, settings.seed)
-            group.field.start_optimizer(backend, f.coefficient_adam)
+            m, adam = settings.motion_field, f.coefficient_adam
+            group.field = MotionField(group.graph.nodes, radius, group.frames, m, settings.seed, backend, adam)
         canonical = settings.keyframe.rates.scaled(radius, f.canonical_rate_share)
         canonical["means"] = f.canonical_means_rate * radius
         self.canonical_rates = canonical if group.known < len(group.key) else {}
@@ -168,14 +167,13 @@ class _Finetuner:
         rigidity of the graph."""
         if not self.node_rates["turn"] and self.group.field is None:
             return
-        rigidity = self.settings.finetune.views * self.settings.rigidity * self.group.graph.rigidity(frame.pose)
-        heads, seeds = [frame.means, frame.rotations, rigidity], [by_means, by_rotations, torch.ones(())]
-        torch.autograd.backward(heads, seeds)
-        values = {f"turn {t}": self.group.turns[t], f"shift {t}": self.group.shifts[t]}
-        grads = {f"turn {t}": frame.turn.grad, f"shift {t}": frame.shift.grad}
+        group, rigidity = self.group, self.settings.finetune.views * self.settings.rigidity
+        by_turns, by_shifts = group.by_nodes(t, frame, (by_means, by_rotations), rigidity)
+        values = {f"turn {t}": group.turns[t], f"shift {t}": group.shifts[t]}
+        grads = {f"turn {t}": by_turns, f"shift {t}": by_shifts}
         self.nodes.step(values, grads, {n: decay * self.node_rates[n.split()[0]] for n in values})
-        if self.group.field is not None:
-            self.group.field.step(decay)
+        if group.field is not None:
+            group.field.step(t, by_turns, by_shifts, decay)
 
     def _bit_weight(self) -> float:
         """Weight of a bit in the image loss.

@@ -78,7 +78,7 @@ def train_keyframe(
     radius: float,
     on_step: Callable[[int, float], None] | None = None,
 ) -> float:
-    """Optimises `model` in place against the views of `frame`; returns the last image loss, without the mask term.
+    """Optimises `model` in place against the views of `frame`; returns the last image loss (`image_loss`).
 
     Args:
         steps: optimisation steps, one view each.
@@ -114,7 +114,7 @@ class _Run:
     """State of one keyframe's optimisation.
 
     Attributes:
-        losses: image loss of each step that was taken, without the mask term.
+        losses: image loss of each step that was taken, without the terms of mask and depth.
     """
 
     def __init__(self, model: Model, views: Views, frame: int, settings: TrainSettings, steps: int, radius: float):
@@ -146,7 +146,7 @@ class _Run:
         view, self._started = self._started, None
         k, model, result = self.settings.keyframe, self.model, view.pending()
         self.statistics.add(result)
-        self.losses.append(result.loss - self.settings.mask_lambda * result.mask)
+        self.losses.append(result.image_loss)
         progress = view.step / max(self.steps - 1, 1)
         decay = k.rate_decay**progress
         self.views.exposure.learn(view.target.index, result.grad_exposure[0], decay)

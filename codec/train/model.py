@@ -7,6 +7,7 @@ import math
 import numpy as np
 import torch
 
+from .. import _native
 from ..model.gaussians import PARAMETERS, SH_C0, Gaussians
 from ..render.backend import Backend
 from ..render.optimizer import Adam, AdamSettings
@@ -65,6 +66,11 @@ class Model:
         arrays = {n: p.detach().numpy().copy() for n, p in self.params.items()}
         arrays["quats"] /= np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
         return Gaussians(**arrays)
+
+
+def quat_product(a: torch.Tensor, b: torch.Tensor, *, inverse_a: bool = False, inverse_b: bool = False) -> torch.Tensor:
+    """Products [N, 4] of unit quaternions [N, 4] f32, of `a` or `b` their inverse; native and without a gradient."""
+    return torch.from_numpy(_native.quat_product(a.numpy(), b.numpy(), (inverse_a, inverse_b)))
 
 
 def from_points(points: np.ndarray, colors: np.ndarray, *, opacity: float) -> Model:

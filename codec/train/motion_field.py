@@ -19,17 +19,26 @@ from .hash_grid import HashGrid
 from .settings import MotionFieldSettings
 
 
-class MotionField(torch.nn.Module):
+class MotionField:
     """Motion of M nodes in `frames` frames.
 
     Args:
         nodes: [M, 3] positions at rest, world units.
         radius: of the moving Gaussians, world units: the unit of translations.
         frames: of the group; 1: the field does not depend on time.
+        backend: device of the optimiser; adam: its settings.
     """
 
-    def __init__(self, nodes: torch.Tensor, radius: float, frames: int, settings: MotionFieldSettings, seed: int):
-        super().__init__()
+    def __init__(
+        self,
+        nodes: torch.Tensor,
+        radius: float,
+        frames: int,
+        settings: MotionFieldSettings,
+        seed: int,
+        backend: Backend,
+        adam: AdamSettings,
+    ):
         low = nodes.min(0).values
         self._points = ((nodes - low) / (nodes.max(0).values - low).max().clamp(min=1e-9)).contiguous()
         self._radius, self._rates = radius, {"grid": settings.grid_rate, "mlp": settings.mlp_rate}
@@ -38,30 +47,42 @@ class MotionField(torch.nn.Module):
         self._encoding = torch.cos(math.pi * times[:, None] * orders)  # [T, K], as the temporal transform has them
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            self.grid = HashGrid(
+            self._grid = HashGrid(
                 settings.levels, settings.features, settings.log2_table, settings.coarsest, settings.finest
             )
             inputs, width = settings.levels * settings.features + len(orders), settings.width
-            layer, act = torch.nn.Linear, torch.nn.ReLU
-            self.mlp = torch.nn.Sequential(layer(inputs, width), act(), layer(width, width), act(), layer(width, 6))
-        torch.nn.init.zeros_(self.mlp[-1].weight)
-        torch.nn.init.zeros_(self.mlp[-1].bias)
+            layers = [torch.nn.Linear(inputs, width), torch.nn.Linear(width, width), torch.nn.Linear(width, 6)]
+        torch.nn.init.zeros_(layers[-1].weight)
+        torch.nn.init.zeros_(layers[-1].bias)
+        self._parameters = {"grid": self._grid.table.data}
+        for i, layer in enumerate(layers):
+            self._parameters |= {f"mlp.{i}.weight": layer.weight.data, f"mlp.{i}.bias": layer.bias.data}
+        self._adam = Adam(backend, adam)
 
-    def forward(self, frame: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    def __call__(self, frame: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
         """Rotation vectors [M, 3] and translations [M, 3] in world units at a frame."""
-        time = self._encoding[frame].expand(len(self._points), -1)
-        out = self.mlp(torch.cat([self.grid(self._points), time], 1))
+        out = self._layers(frame)[-1]
         return out[:, :3], self._radius * out[:, 3:]
 
-    def start_optimizer(self, backend: Backend, settings: AdamSettings) -> None:
-        """Forgets what an optimiser knew of earlier steps."""
-        self._adam = Adam(backend, settings)
+    @torch.no_grad()
+    def _layers(self, frame: int) -> list[torch.Tensor]:
+        """Input and output of the MLP, and what is between its layers."""
+        x, p = self._grid(self._points), self._parameters
+        x = [torch.cat([x, self._encoding[frame].expand(len(x), -1)], 1)]
+        for i in range(3):
+            y = torch.addmm(p[f"mlp.{i}.bias"], x[-1], p[f"mlp.{i}.weight"].T)
+            x.append(y.relu_() if i < 2 else y)
+        return x
 
-    def step(self, decay: float) -> None:
-        """One step along the gradients, which are cleared; all learning rates times `decay`."""
-        values = dict(self.named_parameters())
-        grads = {n: p.grad if p.grad is not None else torch.zeros_like(p) for n, p in values.items()}
-        rates = {n: decay * self._rates[n.split(".")[0]] for n in values}
-        with torch.no_grad():
-            self._adam.step({n: p.data for n, p in values.items()}, grads, rates)
-        self.zero_grad()
+    @torch.no_grad()
+    def step(self, frame: int, by_turns: torch.Tensor, by_shifts: torch.Tensor, decay: float) -> None:
+        """One step along the gradients by the rotation vectors and the translations at a frame, [M, 3] both; all
+        learning rates times `decay`."""
+        layers, p, grads = self._layers(frame), self._parameters, {}
+        by = torch.cat([by_turns, self._radius * by_shifts], 1)
+        for i in (2, 1, 0):
+            grads[f"mlp.{i}.weight"], grads[f"mlp.{i}.bias"] = by.T @ layers[i], by.sum(0)
+            by = by @ p[f"mlp.{i}.weight"]
+            by = by * (layers[i] > 0) if i else by
+        grads["grid"] = self._grid.by_table(self._points, by[:, : -self._encoding.shape[1] or None])
+        self._adam.step(p, grads, {n: decay * self._rates[n.split(".")[0]] for n in p})

@@ -48,7 +48,7 @@ def sweep(
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for i, camera in enumerate(cameras):
         y, x = np.nonzero(depths[i])
-        found = _unproject(camera, x, y, depths[i][y, x])
+        found = unproject(camera, x, y, depths[i][y, x])
         sure = np.any(
             [_agree(found, cameras[j], depths[j], settings.depth_tolerance) for j in near[i]]
             or [np.zeros(len(found), bool)],
@@ -84,7 +84,7 @@ def _neighbours(cameras, i: int, settings: PlaneSweepSettings) -> list[int]:
     return order[: settings.neighbours]
 
 
-def _unproject(camera, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.ndarray:
+def unproject(camera, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Points [N, 3] of pixels at a depth."""
     rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1) @ np.linalg.inv(camera.K).T
     return (rays * depth[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]

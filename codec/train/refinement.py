@@ -8,6 +8,7 @@ takes the steps (`follow`); this stage draws the pictures and says how far a ste
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from functools import lru_cache
 from typing import Protocol
 
@@ -87,5 +88,5 @@ class PictureRefinement:
             i = order[t].pop()
             view, camera = cached(i, t)
             background = tuple(random.uniform(0, 1, 3).tolist())
-            evened = View(calibration.evened(view.rgb, i), view.alpha)
+            evened = replace(view, rgb=calibration.evened(view.rgb, i))
             yield t, camera, background, np.ascontiguousarray(blend(evened, background) / 255, np.float32)

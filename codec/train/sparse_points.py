@@ -7,8 +7,11 @@ of every view that has it in sight, so that of a subject that has moved on only 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
+from ..capture import View
 from ..capture.matching import Matches, matched_features
 from ..capture.points import Points
 from ..model.camera import Camera
@@ -42,22 +45,29 @@ def known_points(points, views, count: int, seed: int) -> tuple[np.ndarray, np.n
     return points.means[kept].astype(np.float64), points.colors[kept] / 255
 
 
-def triangulated(capture, frame: int, settings: InitializationSettings) -> Points:
+def triangulated(
+    capture, frame: int, settings: InitializationSettings, look: Callable[[int], View] | None = None
+) -> Points:
     """Points of features of `frame` that are matched between neighbouring training cameras.
+
+    Args:
+        look: camera -> its picture at `frame`, where it is decoded already; None: as the capture gives it.
 
     Raises:
         CaptureError: an image cannot be read.
     """
     s, trained = settings, capture.indices("train")
+    look = look or (lambda camera: capture.view(camera, frame))
     means, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
-    for m in matched_features(capture, frame, trained, neighbours=s.match_neighbours, features=s.match_features):
+    sought = {"neighbours": s.match_neighbours, "features": s.match_features}
+    for m in matched_features(capture, frame, trained, look, **sought):
         if not len(m.p):
             continue
         first, second = (capture.camera(trained[i], frame) for i in (m.first, m.second))
         x, good = _intersections(first, second, m, s)
         at = m.p[good].astype(int)
         means.append(x[good])
-        colors.append(capture.view(trained[m.first], frame).rgb[at[:, 1], at[:, 0]])
+        colors.append(look(trained[m.first]).rgb[at[:, 1], at[:, 0]])
     return Points(np.concatenate(means).astype(np.float32), np.concatenate(colors))
 
 

@@ -23,13 +23,13 @@ import numpy as np
 import torch
 
 from ..bitstream.quantization import subject_radius
-from ..model.rotations import quat_conjugate, quat_multiply, rotate, rotvec_to_quat
+from ..model.rotations import quat_conjugate, rotate, rotvec_to_quat
 from .change_detection import Changes
 from .deformation_graph import NodeGraph, Pose
 from .densification import error_masks, spawn
 from .frame_fit import FrameFit
 from .keyframe import Statistics
-from .model import NAMES, REMOVED_LOGIT, Model
+from .model import NAMES, REMOVED_LOGIT, Model, quat_product
 from .relocalization import relocalize
 from .settings import TrainSettings
 from .views import Views, view_losses
@@ -93,7 +93,7 @@ class Tracker:
     def carried(self, own: Model, pose: Pose) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """Attributes of `own` carried to `pose`, and the rotation of each Gaussian by the nodes, [N, 4]."""
         means, rotations = self.graph.carry(self.graph.means, pose)
-        quats = quat_multiply(rotations, own.params["quats"])
+        quats = quat_product(rotations, own.params["quats"])
         return {**own.params, "means": means + own.params["means"], "quats": quats}, rotations
 
     @property
@@ -180,14 +180,13 @@ class Tracker:
         self.own.select(chosen)
         self.moving = self.moving[chosen]
 
-    @torch.no_grad()
     def adopt(self, group: GroupModel) -> None:
         """Goes on from the last frame as fine-tuning left it."""
         frame = group.frame(group.frames - 1, self.views.backend)
         new = group.origin < 0
         self.moving = torch.where(new, True, self.moving[group.origin])
         self.graph, self.pose = group.graph.copy(), frame.pose
-        quats = quat_multiply(quat_conjugate(frame.rotations), frame.params["quats"])
+        quats = quat_product(frame.rotations, frame.params["quats"], inverse_a=True)
         self.own = Model({**frame.params, "means": frame.params["means"] - frame.means, "quats": quats})
 
     def densify(self, frame: int, on_step: OnStep = None) -> None:
@@ -205,7 +204,7 @@ class Tracker:
         params = spawned.params
         self.graph.extend(self._rest_positions(params["means"]))
         means, rotations = (x[len(self.own) :] for x in self.graph.carry(self.graph.means, self.pose))
-        quats = quat_multiply(quat_conjugate(rotations), params["quats"])
+        quats = quat_product(rotations, params["quats"], inverse_a=True)
         self.own.append({**params, "means": params["means"] - means, "quats": quats})
         self.moving = torch.cat([self.moving, torch.ones(len(spawned), dtype=torch.bool)])
 

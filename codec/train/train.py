@@ -167,7 +167,7 @@ class _Run:
         s = self.settings
         budget = keyframe_budget(self.views, frames[0], s)
         self.progress.total += budget.steps - s.keyframe_steps
-        model, radius = initial_model(self.capture, frames[0], budget.points, s)
+        model, radius = initial_model(self.capture, frames[0], budget.points, s, self.views.view)
         on_step = self._report(f"keyframe {frames[0]}")
         loss = train_keyframe(model, self.views, frames[0], s, steps=budget.steps, radius=radius, on_step=on_step)
         return Subject(Tracker.start(model, self.views, s, loss, frames), loss, radius)

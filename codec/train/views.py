@@ -33,6 +33,7 @@ class Target:
         rgb: [H, W, 3] u8, unassociated colour.
         alpha: [H, W] u8; 255 everywhere where the capture has no masks.
         index: of the camera in the capture.
+        depth: [H, W] f32, world units along the optical axis, 0 where unknown; None: the camera has no depth images.
         opaque: the capture has no masks.
         exposure: gain and offset of the camera, [3] each.
     """
@@ -41,6 +42,7 @@ class Target:
     rgb: np.ndarray
     alpha: np.ndarray
     index: int
+    depth: np.ndarray | None = None
     opaque: bool = False
     exposure: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -126,7 +128,7 @@ class Views:
         learned from `frame` on where the capture's own contradict its pictures."""
         self.exposure.reset()
         if self._poses_learn is None:
-            error = epipolar_error(self.capture, frame, self.train_cameras)
+            error = epipolar_error(self.capture, frame, self.train_cameras, lambda i: self.view(i, frame))
             self._poses_learn = error is not None and error > self._pose_error_min
         self.extrinsics.learns = self._poses_learn
         self.extrinsics.reset()
@@ -149,17 +151,17 @@ class Views:
 
     @staticmethod
     def _size(t: View | Target) -> int:
-        return t.rgb.nbytes + (0 if t.alpha is None else t.alpha.nbytes)
+        return sum(a.nbytes for a in (t.rgb, t.alpha, t.depth) if a is not None)
 
     def _cropped(self, camera: int, frame: int) -> Target:
         view, crop = cropped(self.view(camera, frame), self.capture.camera(camera, frame))
         opaque = view.alpha is None
         alpha = np.full(view.rgb.shape[:2], 255, np.uint8) if opaque else view.alpha
-        return Target(crop, view.rgb, alpha, camera, opaque)
+        return Target(crop, view.rgb, alpha, camera, view.depth, opaque)
 
 
 def shrink(target: Target, scale: float) -> Target:
-    """The same view at `scale` times its size; each pixel is the mean of those it covers."""
+    """The same view at `scale` times its size; each pixel is the mean of those it covers, its depth that of one."""
     import cv2
 
     height, width = target.rgb.shape[:2]
@@ -172,12 +174,13 @@ def shrink(target: Target, scale: float) -> Target:
         camera=target.camera.resized(*size),
         rgb=np.rint(rgb.clip(0, 255)).astype(np.uint8),
         alpha=np.rint(255 * small).astype(np.uint8),
+        depth=None if target.depth is None else cv2.resize(target.depth, size, interpolation=cv2.INTER_NEAREST_EXACT),
     )
 
 
 def _crop(target: Target, rng: np.random.Generator) -> Crop:
     background = GREY if target.opaque else tuple(rng.uniform(0, 1, 3))
-    return Crop(target.camera, target.rgb, target.alpha, background, target.exposure)
+    return Crop(target.camera, target.rgb, target.alpha, background, target.exposure, target_depth=target.depth)
 
 
 def photometric_loss(
@@ -185,8 +188,7 @@ def photometric_loss(
 ) -> RenderLoss:
     """Loss of Gaussians against one target (`Backend.photometric_loss`). Behind a target with alpha the background is
     random: with a known one, Gaussians in its colour could stand for transparency. An opaque one is to be covered."""
-    crop = _crop(target, rng)
-    return backend.photometric_loss(params, [crop], ssim_lambda=settings.ssim_lambda, mask_lambda=settings.mask_lambda)
+    return backend.photometric_loss(params, [_crop(target, rng)], **_lambdas(settings))
 
 
 def start_photometric_loss(
@@ -195,9 +197,16 @@ def start_photometric_loss(
     """`photometric_loss` of Gaussians as they are now against all `targets`, summed, beside the caller
     (`Backend.start_photometric_loss`)."""
     crops = [_crop(t, rng) for t in targets]
-    return backend.start_photometric_loss(
-        params, crops, ssim_lambda=settings.ssim_lambda, mask_lambda=settings.mask_lambda
-    )
+    return backend.start_photometric_loss(params, crops, **_lambdas(settings))
+
+
+def _lambdas(settings: TrainSettings) -> dict[str, float]:
+    """Weights of the terms of the loss."""
+    return {
+        "ssim_lambda": settings.ssim_lambda,
+        "mask_lambda": settings.mask_lambda,
+        "depth_lambda": settings.depth_lambda,
+    }
 
 
 def view_losses(

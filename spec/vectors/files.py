@@ -50,7 +50,7 @@ def make_file(payloads, *, finish=True, sound=(), **config):
         start += frames
     if finish:
         index = [(len(f), n, s, []) for f, (_, n, s) in zip(fragments, payloads, strict=True)]
-        init = bytes(_native.finish(init, index))
+        init = bytes(_native.finish(init, [index]))
     return init + b"".join(fragments)
 
 
@@ -120,6 +120,26 @@ def other_mdat_sizes():
     (_, first_moof), (_, first_mdat), (_, last_moof), (_, last_mdat) = parts[2:]
     first_mdat = struct.pack(">I4sQ", 1, b"mdat", len(first_mdat) + 8) + first_mdat[8:]
     return parts[0][1] + parts[1][1] + shift_data(first_moof, 8) + first_mdat + last_moof + bytes(4) + last_mdat[4:]
+
+
+def second_trun(data, which):
+    """The file with the trun number `which` of its first moof written twice in its traf; its samples stay in place."""
+    parts = split_boxes(data)
+    at = next(i for i, (kind, _) in enumerate(parts) if kind == b"moof")
+    inner, result, number = parts[at][1][8:], b"", 0
+    for kind, start, body, end in boxes(inner, 0, len(inner)):
+        whole = inner[start:end]
+        if kind == b"traf":
+            trun = whole[whole.index(b"trun") - 4 :]  # the last box of a traf
+            whole = box(b"traf", inner[body:end] + trun) if number == which else whole
+            number += 1
+        result += whole
+    moof = box(b"moof", result)
+    grown, position = len(moof) - len(parts[at][1]), -1
+    while (position := moof.find(b"trun", position + 1)) >= 0:
+        place = position + 12
+        moof = poke(moof, place, struct.pack(">i", struct.unpack_from(">i", moof, place)[0] + grown))
+    return b"".join(whole if i != at else moof for i, (_, whole) in enumerate(parts))
 
 
 def full_box(kind, flags, *fields, version=0):
@@ -220,3 +240,66 @@ CAMERA = {
 }
 CAMERA["near"] = 0.75
 CAMERA["viewmat"] = np.array([[0, 0, 1, 0.5], [1, 0, 0, -2], [0, 1, 0, 3], [0, 0, 0, 1.0]])
+
+# ---- Tracks ---------------------------------------------------------------------------------------------------------
+
+TURN = (0.8, 0.0, 0.36, 0.48)
+PLACED = {
+    "name": "Männlein",
+    "hidden": False,
+    "offset": -500,
+    "repeats": 0,
+    "keys": [(-300, (1.0, 0.0, 0.0, 0.0), (0.5, 0.0, -1.0), 1.0), (1700, TURN, (-0.25, 2.0, 0.0), 2.5)],
+}
+
+
+def scene_file(*tracks, finish=True, change=lambda parts: parts):
+    """tracks: (groups, config) of each -> bytes of a file. `change`: of the top-level boxes."""
+    configs = [CONFIG | config | {"track": k} for k, (_, config) in enumerate(tracks)]
+    init = bytes(_native.init_segment(configs[0], configs[1:]))
+    fragments, indices, number = b"", [], 0
+    for (groups, _), config in zip(tracks, configs, strict=True):
+        start, index = 0, []
+        for group in groups:
+            number += 1
+            fragment = bytes(_native.fragment(encode(group), number, start, group.frames, True, config))
+            index.append((len(fragment), group.frames, True, []))
+            fragments, start = fragments + fragment, start + group.frames
+        indices.append(index)
+    data = (bytes(_native.finish(init, indices)) if finish else init) + fragments
+    return b"".join(whole for _, whole in change(split_boxes(data)))
+
+
+def two_tracks(**options):
+    """A track at 30 frames a second, and one at 25 that is placed and repeated, with SH of degree 3."""
+    second = {"sh_degree": 3, "fps": (1000, 40), "placement": PLACED}
+    return scene_file(
+        (
+            [make_group(40, 3, nodes=4), make_group(30, 2, seed=2)],
+            {"placement": PLACED | {"name": "room", "offset": 0, "keys": []}},
+        ),
+        ([make_group(25, 4, seed=3, sh_degree=3, trajectories={"shN": 2})], second),
+        **options,
+    )
+
+
+def alternating(parts):
+    """The fragments of two tracks in turn: of the first, the second, the first."""
+    *head, a, b, c, d, e, f = parts
+    return [*head, a, b, e, f, c, d]
+
+
+def tracks_patched(offset, new, kind=b"gsvT", which=1):
+    """`two_tracks` with bytes changed at an offset from the body of a box of a type, the last one or number `which`."""
+
+    def build():
+        data, at = two_tracks(finish=False), -1
+        for _ in range(which + 1):
+            at = data.index(kind, at + 1)
+        return poke(data, at + 4 + offset, new)
+
+    return build
+
+
+def many_tracks():
+    return scene_file(*[([], {})] * 65, finish=False)

@@ -7,6 +7,7 @@ gsv.md) are those of the reference decoder.
 """
 
 import json
+import struct
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,8 @@ sys.path.insert(0, str(HERE.parent))
 import reference_decoder as reference  # noqa: E402
 from files import (  # noqa: E402
     CAMERA,
+    PLACED,
+    alternating,
     before_mdat,
     box,
     f32,
@@ -24,15 +27,20 @@ from files import (  # noqa: E402
     ignored_fields,
     major_brand_only,
     make_file,
+    many_tracks,
     no_mdat,
     other_mdat_sizes,
     other_track,
+    scene_file,
     second_moof,
+    second_trun,
     sound_file,
     sound_patched,
+    tracks_patched,
     truncated,
     truncated_after_sample,
     truncated_to_end,
+    two_tracks,
     u32,
     unknown_boxes,
 )
@@ -218,6 +226,23 @@ VALID = {  # name: (what it is about, bytes)
     "sound": ("an audio track of Opus, in the first of two groups", sound_file),
     "sound_aac": ("an audio track of AAC", lambda: sound_file(b"mp4a", b"esds", finish=False)),
     "sound_unknown": ("an audio track that is neither AAC nor Opus", lambda: sound_file(b"fLaC", b"dfLa")),
+    "tracks": ("two tracks of other frame rates and degrees, one placed and played without end", two_tracks),
+    "tracks_in_turn": (
+        "the fragments of two tracks in turn, without an index",
+        lambda: two_tracks(finish=False, change=alternating),
+    ),
+    "tracks_hidden": (
+        "three tracks: a hidden one, one that ends before the last, one without groups",
+        lambda: scene_file(
+            ([make_group(30, 2)], {"placement": PLACED | {"hidden": True}}),
+            ([make_group(20, 3, seed=2)], {"placement": PLACED | {"offset": 1, "repeats": 2}}),
+            ([], {}),
+        ),
+    ),
+    "track_named": (
+        "one track with a name",
+        lambda: scene_file(([make_group(30, 2)], {"placement": PLACED | {"offset": 2}})),
+    ),
     "no_groups": ("a stream without groups yet", lambda: groups_file(finish=False)),
 }
 
@@ -227,7 +252,7 @@ B, L = "BitstreamError", "LimitError"
 INVALID = {  # name: (error, part of the message of both decoders, bytes)
     # Container
     "container_empty": (B, "moov", lambda: b""),
-    "container_text": (B, "gsv file", lambda: b"This is not a volumetric video, it only has a friendly name.\n"),
+    "container_text": (B, "ftyp", lambda: b"This is not a volumetric video, it only has a friendly name.\n"),
     "container_magic": (B, "ftyp", other_top(lambda p: [(b"ftyp", box(b"ftyp", b"isom\0\0\0\0isommp42")), *p[1:]])),
     "container_no_moov": (B, "moov", other_top(lambda p: p[:1])),
     "container_no_ftyp": (B, "ftyp", other_top(lambda p: p[1:])),
@@ -239,6 +264,7 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "container_huge_header_box": (L, "moof", patched(b"moof", -8, u32(2**24 + 9))),
     "container_nested_size": (B, "bytes", patched(b"traf", -8, u32(10**6))),
     "container_two_samples": (B, "sample", patched(b"trun", 4, u32(2))),
+    "container_second_trun": (B, "trun", lambda: second_trun(groups_file(make_group(30, 2), finish=False), 0)),
     "container_outside_mdat": (B, "mdat", patched(b"trun", 8, u32(4))),
     "container_no_mdat": (B, "mdat", no_mdat),
     "container_second_moov": (B, "moov", other_top(lambda p: [*p[:2], *p[1:]])),
@@ -257,7 +283,7 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "config_background": (B, "background", patched(b"gsvC", 12, f32(1.5))),
     "config_sh_degree": (B, "sh_degree", patched(b"gsvC", 24, b"\4")),
     "config_sh_frame": (B, "sh_frame", patched(b"gsvC", 25, b"\2")),
-    "config_camera_count": (B, "gsvC", patched(b"gsvC", 26, b"\xff\xff")),
+    "config_camera_count": (B, "63 more", patched(b"gsvC", 26, b"\xff\xff")),
     "config_camera_name": (B, "camera name", patched(b"gsvC", 29, b"\xff\xff")),
     "config_camera_width": (B, "pixel", patched(b"gsvC", 29 + len(CAMERA["name"].encode()), u32(0))),
     "config_camera_near": (B, "near", patched(b"gsvC", 29 + len(CAMERA["name"].encode()) + 76, f32(0))),
@@ -272,10 +298,21 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "sound_edit_empty": (B, "one edit", sound_patched(b"elst", 12, u32(2**32 - 1), 0)),
     "sound_many_samples": (L, "65536", sound_patched(b"trun", 4, u32(65537))),
     "sound_samples_missing": (B, "4 more", sound_patched(b"trun", 4, u32(4))),
+    "sound_second_trun": (B, "trun", lambda: second_trun(sound_file(finish=False), 0)),
     "sound_sample_empty": (B, "at least one byte", sound_patched(b"trun", 16, u32(0))),
     "sound_elsewhere": (B, "where the group starts", sound_patched(b"trun", 8, u32(4))),
     "sound_too_long": (B, "where the group starts", sound_patched(b"trun", 16, u32(2**32 - 1))),
     "sound_outside_mdat": (B, "mdat", before_mdat),
+    "tracks_many": (L, "65 tracks", many_tracks),
+    "tracks_same_id": (B, "track_ID", tracks_patched(12, u32(1), b"tkhd", 1)),
+    "track_name": (B, "track names in UTF-8", tracks_patched(2, b"\xff")),
+    "track_name_long": (B, "more", tracks_patched(1, b"\xff")),
+    "track_keys_missing": (B, "more", tracks_patched(2 + 9 + 8, b"\0\3")),
+    "track_keys_order": (B, "order of their times", tracks_patched(2 + 9 + 10 + 36, struct.pack(">i", -300))),
+    "track_rotation_nan": (B, "finite", tracks_patched(2 + 9 + 14, f32(NAN))),
+    "track_rotation_long": (B, "squared length", tracks_patched(2 + 9 + 14, f32(1.01))),
+    "track_translation": (B, "translation", tracks_patched(2 + 9 + 30, f32(INF))),
+    "track_scale_0": (B, "scale", tracks_patched(2 + 9 + 42, f32(0))),
     # Units
     "unit_none": (B, "4 more", lambda: payload_file(lambda p: b"")),
     "unit_crc": (B, "CRC", change_unit(TILE, damage=1)),
@@ -419,9 +456,15 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
 
 
 def describe(data):
-    """The manifest entry of a valid file, by the reference decoder."""
-    _, groups = reference.decode(data)
-    facts = [
+    """The manifest entry of a valid file, by the reference decoder; of a scene the tracks behind the first apart."""
+    config, groups = reference.decode(data)
+    others = [describe_track(reference.decode(data, k)[1]) for k in range(1, config.tracks)]
+    facts = {"frames": sum(sample.frames for sample, _ in groups), "groups": describe_track(groups)}
+    return facts | ({"tracks": others} if others else {})
+
+
+def describe_track(groups):
+    return [
         {
             "start_frame": sample.start_frame,
             "frames": sample.frames,
@@ -431,7 +474,6 @@ def describe(data):
         }
         for sample, group in groups
     ]
-    return {"frames": sum(sample.frames for sample, _ in groups), "groups": facts}
 
 
 def main():
@@ -440,10 +482,10 @@ def main():
         file = f"valid/{name}.gsv"
         files[file] = build()
         manifest["valid"].append({"file": file, "about": about} | describe(files[file]))
-    for name, (error, _, build) in INVALID.items():
+    for name, (error, reason, build) in INVALID.items():
         file = f"invalid/{name}.gsv"
         files[file] = build()
-        manifest["invalid"].append({"file": file, "error": error})
+        manifest["invalid"].append({"file": file, "error": error, "reason": reason})
     for old in HERE.glob("*valid/*.gsv"):
         old.unlink()
     for file, data in files.items():

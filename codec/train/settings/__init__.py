@@ -74,6 +74,7 @@ class TrainSettings:
         sh_degree: bound on the degree of spherical harmonics; a keyframe keeps them where they lower the error.
         ssim_lambda: share of D-SSIM in the image loss (3D Gaussian Splatting: 0.2).
         mask_lambda: weight of the alpha loss where the capture has masks.
+        depth_lambda: weight of the depth loss where the capture has depth images.
         cut_ratio: a frame whose image loss exceeds that of the frame before by this factor starts anew.
         rigidity: weight of the as-rigid-as-possible term.
         rate_lambda: share by which the image loss may rise where bits fall by one share.
@@ -91,6 +92,7 @@ class TrainSettings:
     sh_degree: int = 3
     ssim_lambda: float = 0.2
     mask_lambda: float = 0.1
+    depth_lambda: float = 0.1
     cut_ratio: float = 1.5
     rigidity: float = 0.3
     rate_lambda: float = 0.4

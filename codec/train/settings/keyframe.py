@@ -12,6 +12,7 @@ class InitializationSettings:
     """Initial points of a keyframe, and which source they come from."""
 
     use_points: bool = True  # the sparse points of the capture, where it has some
+    use_depth: bool = True  # the depth images of the capture, where it has some
     triangulate: bool = True  # where a capture without masks has none: matched features of its cameras
     match_neighbours: int = 4  # cameras that each one is matched with
     match_features: int = 8000  # of one image at most

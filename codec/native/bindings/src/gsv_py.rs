@@ -5,6 +5,7 @@ mod container;
 mod decoded;
 mod group_from;
 mod parametric;
+mod placement;
 mod quantized_from;
 mod report;
 mod rigid_blend;
@@ -34,10 +35,13 @@ pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(container::init_segment, m)?)?;
     m.add_function(wrap_pyfunction!(container::fragment, m)?)?;
     m.add_function(wrap_pyfunction!(container::finish, m)?)?;
+    m.add_function(wrap_pyfunction!(container::track_count, m)?)?;
     m.add_function(wrap_pyfunction!(container::demux, m)?)?;
     m.add_function(wrap_pyfunction!(container::read_audio, m)?)?;
+    m.add_function(wrap_pyfunction!(placement::pose_at, m)?)?;
     m.add_function(wrap_pyfunction!(rigid_blend::blend_rigid, m)?)?;
-    m.add_function(wrap_pyfunction!(rigid_blend::blend_rigid_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(rigid_blend::node_gradients, m)?)?;
+    m.add_function(wrap_pyfunction!(rigid_blend::quat_product, m)?)?;
     m.add_function(wrap_pyfunction!(attributes, m)?)?;
     m.add_class::<parametric::ParametricEvaluator>()?;
     m.add_class::<decoded::DecodedGroup>()

@@ -9,7 +9,9 @@ mod kernels;
 use arrays::{In, InOut, contiguous, level, usage};
 use numpy::{PyArray1, PyReadonlyArrayDyn, prelude::*};
 use pyo3::prelude::*;
-use raster::{Background, Gradients, Lambdas, Projected, Region, SimdLevel, Splats, Step, Surface, TargetImage, View};
+use raster::{
+    Background, Gradients, Lambdas, Projected, Region, SimdLevel, Splats, Step, StepValue, Surface, TargetImage, View,
+};
 
 type Bytes<'py> = PyReadonlyArrayDyn<'py, u8>;
 type Params<'py> = (In<'py>, In<'py>, In<'py>, In<'py>, In<'py>, In<'py>);
@@ -20,9 +22,9 @@ type Grads<'py> = (
 type Crop<'py> = (
     ViewArgs,
     ([f32; 3], Option<([f32; 3], [f32; 3])>),
-    (Bytes<'py>, Option<Bytes<'py>>, Option<In<'py>>),
+    (Bytes<'py>, Option<Bytes<'py>>, Option<In<'py>>, Option<In<'py>>),
 );
-type Value = (f64, f64, f64, f64, f64, [f64; 3], [f64; 3]);
+type Value = (f64, f64, f64, f64, f64, f64, [f64; 3], [f64; 3]);
 /// (image, alpha), flat
 type Picture<'py> = (Bound<'py, PyArray1<f32>>, Bound<'py, PyArray1<f32>>);
 
@@ -139,7 +141,7 @@ impl Rasterizer {
         let (splats, view) = (splats(&params)?, view.view());
         py.detach(|| {
             self.inner
-                .forward(&splats, &view, Background::new(background), training)
+                .forward(&splats, &view, Background::new(background), training, false)
         })
         .map_err(usage)?;
         Ok((
@@ -148,23 +150,35 @@ impl Rasterizer {
         ))
     }
 
+    /// Renders depth: weight times depth along the optical axis, summed over the Gaussians, and alpha, flat.
+    fn depth<'py>(&mut self, py: Python<'py>, params: Params<'py>, view: ViewArgs) -> PyResult<Picture<'py>> {
+        let (splats, view, black) = (splats(&params)?, view.view(), Background::new([0.0; 3]));
+        py.detach(|| self.inner.forward(&splats, &view, black, false, true))
+            .map_err(usage)?;
+        Ok((
+            PyArray1::from_slice(py, self.inner.depth()),
+            PyArray1::from_slice(py, self.inner.alpha()),
+        ))
+    }
+
     fn backward(&mut self, py: Python, params: Params, grad_image: In, grad_alpha: In, grads: Grads) -> PyResult<()> {
         let mut grads = grads;
         let (splats, mut out) = (splats(&params)?, gradients(&mut grads)?);
         let (image, alpha) = (contiguous(grad_image.as_slice())?, contiguous(grad_alpha.as_slice())?);
-        py.detach(|| self.inner.backward(&splats, image, alpha, &mut out))
+        py.detach(|| self.inner.backward(&splats, image, alpha, &[], &mut out))
             .map_err(usage)
     }
 
-    /// One training step on a batch of crops. Returns for each crop (loss, l1, mse, ssim, mask, gradient of the gain, of the
-    /// offset), and [N] the largest radii. The gradients are those of the sum of the losses. A crop is (view, (background,
-    /// (gain, offset) or None), (rgb, alpha or None, weight or None)).
+    /// One training step on a batch of crops. Returns for each crop (loss, l1, mse, ssim, mask, depth, gradient of the gain,
+    /// of the offset), and [N] the largest radii. The gradients are those of the sum of the losses. A crop is (view,
+    /// (background, (gain, offset) or None), (rgb, alpha or None, weight or None, depth or None)); the lambdas are those of
+    /// SSIM, mask and depth.
     fn step<'py>(
         &mut self,
         py: Python<'py>,
         params: Params,
         crops: Vec<Crop>,
-        lambdas: (f32, f32),
+        lambdas: (f32, f32, f32),
         grads: Grads,
     ) -> PyResult<(Vec<Value>, Bound<'py, PyArray1<f32>>)> {
         let mut grads = grads;
@@ -172,14 +186,16 @@ impl Rasterizer {
         let lambdas = Lambdas {
             ssim: lambdas.0,
             mask: lambdas.1,
+            depth: lambdas.2,
         };
         let (step, inner) = (&mut self.step, &mut self.inner);
         let (mut values, mut radii) = (Vec::new(), vec![0.0f32; splats.len()]);
-        for (view, (background, exposure), (rgb, alpha, weight)) in &crops {
+        for (view, (background, exposure), (rgb, alpha, weight, depth)) in &crops {
             let target = TargetImage {
                 rgb: contiguous(rgb.as_slice())?,
                 alpha: alpha.as_ref().map(|a| contiguous(a.as_slice())).transpose()?,
                 weight: weight.as_ref().map(|w| contiguous(w.as_slice())).transpose()?,
+                depth: depth.as_ref().map(|d| contiguous(d.as_slice())).transpose()?,
                 offset: exposure.map_or([0.0; 3], |e| e.1),
             };
             let (view, background) = (
@@ -192,7 +208,8 @@ impl Rasterizer {
             let v = py
                 .detach(|| step.run(inner, &splats, &view, background, target, lambdas, &mut out))
                 .map_err(usage)?;
-            values.push((v.loss, v.image.l1, v.image.mse, v.image.ssim, v.mask, v.gain, v.offset));
+            let StepValue { image, mask, depth, .. } = v;
+            values.push((v.loss, image.l1, image.mse, image.ssim, mask, depth, v.gain, v.offset));
             radii
                 .iter_mut()
                 .zip(inner.projected())

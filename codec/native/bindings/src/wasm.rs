@@ -9,6 +9,7 @@ mod pack;
 mod player;
 mod text;
 
+use gsv::container::demux::Demuxer;
 use player::Player;
 use std::cell::RefCell;
 
@@ -53,6 +54,18 @@ pub extern "C" fn output_length() -> usize {
 #[unsafe(no_mangle)]
 pub extern "C" fn push() -> bool {
     with(Player::push)
+}
+
+/// Reads the gsv track `number` of the file, from 0 on; called before the first `push`.
+#[unsafe(no_mangle)]
+pub extern "C" fn track(number: usize) {
+    with(|p| p.demuxer = Demuxer::of_track(number));
+}
+
+/// Output: the transform of the track at time `u` of the scene, in units of its timescale: rotation (wxyz), translation, scale, f32.
+#[unsafe(no_mangle)]
+pub extern "C" fn pose(u: f64) {
+    with(|p| p.pose(u));
 }
 
 /// File offset of the next byte to push.
@@ -109,7 +122,8 @@ pub extern "C" fn release(slot: usize) {
     with(|p| p.release(slot));
 }
 
-/// Evaluates frame `t` of the group in `slot`, unless it is the last one that was evaluated of it.
+/// Evaluates frame `t` of the group in `slot`, unless it is the last one that was evaluated of it. Input: a transform as of `pose`
+/// that places it, with a scale of 0 nothing is shown; or nothing.
 #[unsafe(no_mangle)]
 pub extern "C" fn frame(slot: usize, t: u16) -> bool {
     with(|p| p.frame(slot, t))

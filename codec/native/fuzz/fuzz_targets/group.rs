@@ -13,7 +13,7 @@ static REFERENCE: LazyLock<Group> = LazyLock::new(|| {
     decode_group(include_bytes!("../layered.bin"), &Decoding::at(&LEVELS[0])).expect("the seed is sound")
 });
 
-fuzz_target!(|input: (u8, bool, Vec<u8>, &[u8])| {
+fuzz_target!(init: fuzz::one_thread(), |input: (u8, bool, Vec<u8>, &[u8])| {
     let (how, sealed, header, rest) = input;
     let payload = if sealed { unit::write(&header, &[rest.to_vec()]).expect("it is short") } else { rest.to_vec() };
     let data = &payload[..];

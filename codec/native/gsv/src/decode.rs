@@ -130,7 +130,13 @@ fn open<'a>(payload: &'a [u8], how: &Decoding) -> Result<(Header, Vec<Unit<'a>>)
     how.level.cap("group", "bytes", payload.len() as u64, how.level.bytes)?;
     let header = read_header(payload, how)?;
     let wanted = |layer, tile| how.wants(&header, layer, tile);
-    let units = unit::scan(payload, how.layers, how.packed, wanted)?;
+    let mut units = unit::scan(payload, how.layers, how.packed, wanted)?;
+    for u in units.iter_mut().filter(|u| u.kind == Some(UnitType::Tile)) {
+        let unasked = !how.asks(u.layer.into(), u.index.into());
+        if let (true, Some(Error::Bitstream { expected, .. })) = (unasked, &mut u.damage) {
+            expected.push_str("; the tiles that were asked for start from it");
+        }
+    }
     Ok((header, units))
 }
 

@@ -118,11 +118,11 @@ impl Evaluator {
     /// Evaluates frame `t` (clamped to the group) into `frame`, whose buffers are reused.
     pub fn frame(&self, t: u16, frame: &mut Frame) {
         frame.resize_as(&self.canonical);
-        self.frame_into(t, frame.as_mut());
+        self.frame_into(t, &mut frame.as_mut());
     }
 
     /// Evaluates frame `t` (clamped to the group) into buffers as long as those of `Frame`.
-    pub fn frame_into(&self, t: u16, out: FrameMut) {
+    pub fn frame_into(&self, t: u16, out: &mut FrameMut) {
         self.parametric().frame_into(t, out);
     }
 }

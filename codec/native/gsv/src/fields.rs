@@ -63,6 +63,23 @@ pub trait Fields {
         self.must(value > 0.0, || format!("{what} > 0, found {value}"))
     }
 
+    /// Text of at most 255 bytes; `what` names it in messages.
+    fn text(&mut self, v: &mut String, what: &str) -> Result<()> {
+        let mut bytes = std::mem::take(v).into_bytes();
+        let mut length = bytes.len() as u8;
+        self.must(usize::from(length) == bytes.len(), || {
+            format!("{what} of at most 255 bytes")
+        })?;
+        self.u8(&mut length)?;
+        bytes.resize(usize::from(length), 0);
+        self.bytes(&mut bytes)?;
+        match String::from_utf8(bytes) {
+            Ok(text) => *v = text,
+            Err(_) => return self.fail(format!("{what} in UTF-8")),
+        }
+        Ok(())
+    }
+
     fn must(&self, holds: bool, expected: impl FnOnce() -> String) -> Result<()> {
         if holds { Ok(()) } else { self.fail(expected()) }
     }

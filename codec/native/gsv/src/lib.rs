@@ -30,6 +30,8 @@ pub mod neighbors;
 mod node_search;
 mod parallel;
 pub mod parametric;
+pub mod pose;
+pub mod pose_gradient;
 pub mod positions;
 pub mod range_coder;
 pub mod rigid_blend;

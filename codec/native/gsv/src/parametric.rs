@@ -145,16 +145,20 @@ pub struct Parametric<'a, V> {
 
 impl<V: Coefficient> Parametric<'_, V> {
     /// Evaluates frame `t` (clamped to the group) into buffers as long as those of `Frame`.
-    pub fn frame_into(&self, t: u16, out: FrameMut) {
+    pub fn frame_into(&self, t: u16, out: &mut FrameMut) {
         let basis = &basis(self.frames, t.min(self.frames.saturating_sub(1)))[..];
         let rest = self.rest;
         let still = [
-            (Attribute::LogScales, &rest.log_scales, out.log_scales),
-            (Attribute::LogitOpacities, &rest.logit_opacities, out.logit_opacities),
-            (Attribute::Sh0, &rest.sh0, out.sh0),
-            (Attribute::ShN, &rest.sh_n, out.sh_n),
+            (Attribute::LogScales, &rest.log_scales, &mut *out.log_scales),
+            (
+                Attribute::LogitOpacities,
+                &rest.logit_opacities,
+                &mut *out.logit_opacities,
+            ),
+            (Attribute::Sh0, &rest.sh0, &mut *out.sh0),
+            (Attribute::ShN, &rest.sh_n, &mut *out.sh_n),
         ];
-        let (means, quats) = (out.means, out.quats);
+        let (means, quats) = (&mut *out.means, &mut *out.quats);
         join(
             || self.move_at(basis, means, quats),
             || {

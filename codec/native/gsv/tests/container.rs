@@ -8,8 +8,10 @@ use gsv::container::audio::{AudioRun, AudioTrack};
 use gsv::container::config::{Camera, Config, rate};
 use gsv::container::demux::Demuxer;
 use gsv::container::entry::Entry;
+use gsv::container::placement::{Key, Placement};
 use gsv::container::whole;
 use gsv::container::write::{Reference, Sound, finish, fragment, init_segment};
+use gsv::pose::Pose;
 use proptest::prelude::*;
 
 fn config() -> Config {
@@ -33,13 +35,14 @@ fn config() -> Config {
         sh_frame: 1,
         cameras: vec![camera.clone(), camera],
         audio: None,
+        ..Config::default()
     }
 }
 
 /// A finished file of three groups, and the entries of its samples.
 fn file() -> (Vec<u8>, Vec<Entry>) {
     let config = config();
-    let init = init_segment(&config).unwrap();
+    let init = init_segment(std::slice::from_ref(&config)).unwrap();
     let groups = [
         (vec![1u8; 100], 20, true),
         (vec![2; 0], 1, false),
@@ -57,7 +60,7 @@ fn file() -> (Vec<u8>, Vec<Entry>) {
         fragments.extend(f);
         start += u64::from(*frames);
     }
-    let mut out = finish(&init, &config, &index).unwrap();
+    let mut out = finish(&init, &[(&config, index.clone())]).unwrap();
     let (mut end, mut start, mut entries) = (out.len() as u64, 0, Vec::new());
     for ((payload, frames, sync), r) in groups.iter().zip(&index) {
         end += r.size;
@@ -130,7 +133,7 @@ fn a_cut_file_keeps_its_whole_groups() {
 #[test]
 fn a_growing_file_has_no_index() {
     let config = config();
-    let init = init_segment(&config).unwrap();
+    let init = init_segment(std::slice::from_ref(&config)).unwrap();
     let f = fragment(b"group", 1, 40, 20, true, &config, None).unwrap();
     let d = parsed(&[&init, &f]);
     assert_eq!(d.groups().len(), 1);
@@ -165,7 +168,7 @@ fn other_files_are_named() {
     mp4[16..20].copy_from_slice(b"isom");
     assert!(message(&mp4).contains("gsv1"));
     let (bytes, _) = file();
-    let init = init_segment(&config()).unwrap();
+    let init = init_segment(&[config()]).unwrap();
     assert!(message(&[&bytes[..28], &bytes[init.len()..]].concat()).contains("moov"));
 }
 
@@ -218,7 +221,7 @@ fn frame_rates() {
 #[test]
 fn a_sample_needs_its_mdat() {
     let config = config();
-    let init = init_segment(&config).unwrap();
+    let init = init_segment(std::slice::from_ref(&config)).unwrap();
     let sound = fragment(&[7; 50], 1, 0, 20, true, &config, None).unwrap();
     let mut other = sound.clone();
     let mdat = other.len() - 54;
@@ -236,7 +239,7 @@ fn a_sample_needs_its_mdat() {
 #[test]
 fn layers_can_be_found() {
     let config = config();
-    let init = init_segment(&config).unwrap();
+    let init = init_segment(std::slice::from_ref(&config)).unwrap();
     let group = |size: u64, layers: &[u64]| Reference {
         size,
         frames: 1,
@@ -245,7 +248,7 @@ fn layers_can_be_found() {
     };
     let large = (1 << 25) + 5;
     let groups = [group(900, &[300, 300, 900]), group(50, &[]), group(large, &[7, large])];
-    let head = finish(&init, &config, &groups).unwrap();
+    let head = finish(&init, &[(&config, groups.to_vec())]).unwrap();
     let read = |head: &[u8]| {
         let mut d = Demuxer::default();
         d.push(head).unwrap();
@@ -263,7 +266,7 @@ fn layers_can_be_found() {
         d.push(&bad).unwrap();
         assert_eq!(d.index().len(), 3);
     }
-    let plain = finish(&init, &config, &groups[1..2]).unwrap();
+    let plain = finish(&init, &[(&config, groups[1..2].to_vec())]).unwrap();
     assert!(!plain.windows(4).any(|w| w == b"ssix"));
 }
 
@@ -287,7 +290,7 @@ fn sounding() -> (Vec<u8>, AudioRun) {
         samples: &samples,
         data: b"abcdefgh",
     };
-    let init = init_segment(&config).unwrap();
+    let init = init_segment(std::slice::from_ref(&config)).unwrap();
     let first = fragment(&[1; 40], 1, 0, 20, true, &config, Some(sound)).unwrap();
     let second = fragment(&[2; 10], 2, 20, 1, true, &config, None).unwrap();
     let run = AudioRun {
@@ -340,6 +343,116 @@ fn damaged_sound_is_named() {
                 for run in d.groups().iter().filter_map(|g| g.audio.as_ref()) {
                     assert!(run.offset + run.size() <= bytes.len() as u64);
                 }
+            }
+        }
+    }
+}
+
+/// Three tracks of two groups each, the second one placed; and the number of bytes in front of the fragments.
+fn scene() -> (Vec<u8>, usize) {
+    let pose = Pose {
+        rotation: [0.8, 0.0, 0.6, 0.0],
+        translation: [1.0, 2.0, 3.0],
+        scale: 0.5,
+    };
+    let placement = Placement {
+        name: "männlein".into(),
+        offset: -40,
+        repeats: 3,
+        keys: vec![Key { time: -7, pose }, Key { time: 9, pose }],
+        ..Placement::default()
+    };
+    let configs: Vec<Config> = (0..3)
+        .map(|track| Config {
+            track,
+            placement: if track == 1 {
+                placement.clone()
+            } else {
+                Placement::default()
+            },
+            ..config()
+        })
+        .collect();
+    let (mut fragments, mut tracks) = (Vec::new(), Vec::new());
+    for config in &configs {
+        let mut index = Vec::new();
+        for i in 0..2 {
+            let f = fragment(&[7; 60], 1, 20 * i, 20, i == 0, config, None).unwrap();
+            index.push(Reference {
+                size: f.len() as u64,
+                frames: 20,
+                sync: i == 0,
+                layers: vec![f.len() as u64 - 5, f.len() as u64],
+            });
+            fragments.extend(f);
+        }
+        tracks.push((config, index));
+    }
+    let head = finish(&init_segment(&configs).unwrap(), &tracks).unwrap();
+    ([head.as_slice(), &fragments].concat(), head.len())
+}
+
+/// Spec 2.2, 2.5 and 2.8: each track has its own groups, index, layers and placement, however the bytes come.
+#[test]
+fn tracks_are_found_apart() {
+    let (bytes, head) = scene();
+    assert_eq!(whole::tracks(&bytes[..head]).unwrap(), 3);
+    for track in 0..3 {
+        for piece in [1, bytes.len()] {
+            let mut d = Demuxer::of_track(track);
+            bytes.chunks(piece).for_each(|b| d.push(b).unwrap());
+            let fragments: Vec<u64> = d.index().iter().map(|e| e.offset + e.size).collect();
+            let ends: Vec<u64> = d.groups().iter().map(|g| g.offset + g.size).collect();
+            assert_eq!(ends, fragments);
+            assert_eq!((d.layers().len(), d.tracks(), d.complete()), (2, 3, true));
+            let placement = &d.config().unwrap().placement;
+            assert_eq!(
+                (placement.keys.len(), placement.repeats),
+                if track == 1 { (2, 3) } else { (0, 1) }
+            );
+        }
+    }
+    assert!(Demuxer::of_track(3).push(&bytes).is_err());
+}
+
+proptest! {
+    /// Damage behind the index costs no track but that in whose bytes it is.
+    #[test]
+    fn damage_stays_in_its_track(seed in any::<u64>()) {
+        let (bytes, head) = scene();
+        let mut r = Random(seed);
+        let mut bad = bytes.clone();
+        let at = head + r.below((bytes.len() - head) as u64) as usize;
+        bad[at] ^= 1 + r.below(255) as u8;
+        let mut hurt = 0;
+        for track in 0..3 {
+            let (whole, _) = whole::read(&bytes, true, track).unwrap();
+            let (saved, damage) = whole::read(&bad, false, track).unwrap();
+            let last = whole.groups().last().unwrap();
+            let first = whole.index()[0].offset as usize;
+            if !(first..(last.offset + last.size) as usize).contains(&at) {
+                prop_assert_eq!(saved.groups(), whole.groups());
+                prop_assert!(damage.is_empty());
+            } else {
+                hurt += 1;
+            }
+        }
+        prop_assert_eq!(hurt, 1);
+    }
+
+    /// No byte of moov or of an index makes a panic, in whichever track one looks.
+    #[test]
+    fn damaged_heads_never_panic(seed in any::<u64>()) {
+        let (mut bytes, head) = scene();
+        let mut r = Random(seed);
+        for _ in 0..1 + r.below(4) {
+            let at = r.below(head as u64) as usize;
+            bytes[at] = r.next() as u8;
+        }
+        for track in 0..3 {
+            if let Ok((d, _)) = whole::read(&bytes, false, track) {
+                let pose = d.config().map_or(Pose::default(), |c| c.placement.pose(r.below(99) as f64 - 50.0));
+                prop_assert!(pose.scale > 0.0 && pose.rotation.iter().all(|v| v.is_finite()));
             }
         }
     }

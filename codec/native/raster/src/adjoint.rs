@@ -9,14 +9,17 @@ pub struct Adjoint {
     /// Starts at 1 (0 outside of the image).
     pub transmittance: Plane,
     pub remainder: Plane,
-    /// Gradient with respect to the blended colours.
-    pub rgb: [Plane; 3],
+    /// Gradient with respect to the blended colours and depth.
+    pub channels: [Plane; 4],
 }
 
 /// A rendered region and the gradient of the loss with respect to it.
 pub struct Pixels<'a> {
     pub image: &'a [f32],
     pub alpha: &'a [f32],
+    /// Sums of weight times depth, and the gradient by them; empty where there is no loss of depth.
+    pub depth: &'a [f32],
+    pub grad_depth: &'a [f32],
     pub grad_image: &'a [f32],
     pub grad_alpha: &'a [f32],
     pub width: usize,
@@ -30,7 +33,7 @@ impl Pixels<'_> {
         let mut a = Adjoint {
             transmittance: Plane::ZERO,
             remainder: Plane::ZERO,
-            rgb: [Plane::ZERO; 3],
+            channels: [Plane::ZERO; 4],
         };
         let (rows, gain) = (
             (self.alpha.len() / self.width - y).min(TILE),
@@ -52,9 +55,17 @@ impl Pixels<'_> {
                     let k = (first + i) & 15;
                     a.transmittance.0[b][k] = 1.0;
                     for ch in 0..3 {
-                        a.rgb[ch].0[b][k] = g[ch] * gain[ch];
+                        a.channels[ch].0[b][k] = g[ch] * gain[ch];
                     }
                     a.remainder.0[b][k] = g[0] * c[0] + g[1] * c[1] + g[2] * c[2] - (1.0 - t[i]) * gt[i];
+                }
+            }
+            if let (Some(depth), Some(grad)) = (self.depth.get(at..at + columns), self.grad_depth.get(at..at + columns))
+            {
+                for (i, (depth, grad)) in depth.iter().zip(grad).enumerate() {
+                    let (b, k) = swizzle(i, j);
+                    a.channels[3].0[b][k] = *grad;
+                    a.remainder.0[b][k] += grad * depth;
                 }
             }
         }

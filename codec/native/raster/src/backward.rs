@@ -16,7 +16,7 @@ use crate::simd::{Vector, c, dispatch};
 use crate::tile::{BATCH, BLOCK, BLOCKS, Batch, Hits, Local, PIXEL_X, PIXEL_Y, Plane, opacities};
 
 /// Sums over the pixels of a pair. With a = dL/dalpha * alpha (the gradient with respect to ln alpha) and w the blending
-/// weight: a, a u, a v, a u^2, a u v, a v^2, w g (3), w, largest w, unused.
+/// weight: a, a u, a v, a u^2, a u v, a v^2, w g (3), w, largest w, w times the gradient of depth.
 ///
 /// One cache line, since they are gathered in random order.
 #[derive(Clone, Copy)]
@@ -112,12 +112,19 @@ struct Accumulator<V>([V; 12], V);
 
 /// Adds one visit to the sums of its Gaussian.
 #[inline(always)]
-fn visit<V: Vector>(visits: &Visits, k: usize, at: usize, s: &Local, adjoint: &mut Adjoint, acc: &mut Accumulator<V>) {
+fn visit<V: Vector, const C: usize>(
+    visits: &Visits,
+    k: usize,
+    at: usize,
+    s: &Local,
+    adjoint: &mut Adjoint,
+    acc: &mut Accumulator<V>,
+) {
     let zero = c::<V>(0.0);
     let b = usize::from(visits.block[k]) & (BLOCKS - 1);
     let t = V::load(&adjoint.transmittance.0[b][at..]);
     let remainder = V::load(&adjoint.remainder.0[b][at..]);
-    let g: [V; 3] = std::array::from_fn(|ch| V::load(&adjoint.rgb[ch].0[b][at..]));
+    let g: [V; C] = std::array::from_fn(|ch| V::load(&adjoint.channels[ch].0[b][at..]));
     let [u, v, alpha] = [&visits.u, &visits.v, &visits.alpha].map(|rows| V::load(&rows[k][at..]));
     let drawn = alpha * t;
     let next = t - drawn;
@@ -126,7 +133,10 @@ fn visit<V: Vector>(visits: &Visits, k: usize, at: usize, s: &Local, adjoint: &m
     // where nothing is drawn, the pixel is finished or was so before
     next.select(draw, t.negative())
         .store(&mut adjoint.transmittance.0[b][at..]);
-    let d = g[0].mul_add(c(s.rgb[0]), g[1].mul_add(c(s.rgb[1]), g[2] * c(s.rgb[2])));
+    let mut d = g[C - 1] * c(s.channels[C - 1]);
+    for ch in (0..C - 1).rev() {
+        d = g[ch].mul_add(c(s.channels[ch]), d);
+    }
     let wd = weight * d;
     let rest = remainder - wd;
     rest.store(&mut adjoint.remainder.0[b][at..]);
@@ -144,6 +154,9 @@ fn visit<V: Vector>(visits: &Visits, k: usize, at: usize, s: &Local, adjoint: &m
     sums[5] = av.mul_add(v, sums[5]);
     for ch in 0..3 {
         sums[6 + ch] = weight.mul_add(g[ch], sums[6 + ch]);
+    }
+    if C > 3 {
+        sums[11] = weight.mul_add(g[3], sums[11]);
     }
     sums[9] = sums[9] + weight;
     acc.1 = acc.1.max(weight);
@@ -163,9 +176,9 @@ fn transpose(hits: &Hits) -> [u16; BATCH] {
     masks
 }
 
-/// `hits`: the `seen` masks of the forward pass for the batches of the tile; `sums` gets one row per pair.
+/// `hits`: the `seen` masks of the forward pass for the batches of the tile; `sums` gets one row per pair. `C` as of `blend`.
 #[inline(always)]
-fn backward_kernel<V: Vector>(
+fn backward_kernel<V: Vector, const C: usize>(
     projected: &[Projected],
     pairs: &[AtomicU32],
     pixels: &Pixels,
@@ -199,7 +212,7 @@ fn backward_kernel<V: Vector>(
                 let last = k + masks[j].count_ones() as usize;
                 for k in k..last.min(ROOM) {
                     for at in (0..BLOCK).step_by(V::LANES) {
-                        visit(&visits, k, at, &batch.splats[j], adjoint, &mut acc);
+                        visit::<V, C>(&visits, k, at, &batch.splats[j], adjoint, &mut acc);
                     }
                 }
                 k = last;
@@ -211,7 +224,7 @@ fn backward_kernel<V: Vector>(
     }
 }
 dispatch!(
-    pub fn backward = backward_kernel(
+    pub fn backward<const C: usize> = backward_kernel(
         projected: &[Projected],
         pairs: &[AtomicU32],
         pixels: &Pixels,

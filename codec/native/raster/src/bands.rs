@@ -167,7 +167,7 @@ mod tests {
         };
         let (view, background) = (view(150, 141), Background::new([0.2, 0.4, 0.6]));
         let mut whole = Rasterizer::new(SimdLevel::best(), 0);
-        whole.forward(&splats, &view, background, false).unwrap();
+        whole.forward(&splats, &view, background, false, false).unwrap();
         for count in [1, 2, 3, 9, 40] {
             let (mut project, mut draw) = (
                 Rasterizer::new(SimdLevel::best(), 0),
@@ -182,6 +182,7 @@ mod tests {
                 let surface = Surface::Floats {
                     image: &mut image,
                     alpha: &mut alpha,
+                    depth: &mut [],
                 };
                 draw.draw(surface, [150, band.rows], background, |p| p.clone_from(&band.splats))
                     .unwrap();

@@ -1,4 +1,5 @@
-//! Alpha blending of one tile, front to back: the Gaussian-tile pairs of the tile -> colour and transmittance per pixel.
+//! Alpha blending of one tile, front to back: the Gaussian-tile pairs of the tile -> colour and transmittance per pixel, and
+//! depth where a loss asks for it.
 //!
 //! The transmittance of a finished pixel is negated: its magnitude stays the final transmittance, and every later test on it
 //! fails, so no mask of finished pixels is needed.
@@ -10,10 +11,11 @@ use crate::projected::{Projected, TILE};
 use crate::simd::{Vector, c, dispatch};
 use crate::tile::{BATCH, BLOCK, BLOCKS, Batch, Hits, PIXEL_X, PIXEL_Y, Plane, opacities, swizzle};
 
-/// Colour and transmittance of a tile during blending.
+/// Colour, depth and transmittance of a tile during blending.
 pub struct Canvas {
     pub transmittance: Plane,
-    pub rgb: [Plane; 3],
+    /// Red, green, blue and depth, weighted sums.
+    pub channels: [Plane; 4],
     /// Blocks with unfinished pixels.
     pub live: u16,
 }
@@ -23,7 +25,7 @@ impl Canvas {
     pub fn new(width: usize, height: usize) -> Canvas {
         let mut canvas = Canvas {
             transmittance: Plane::ZERO,
-            rgb: [Plane::ZERO; 3],
+            channels: [Plane::ZERO; 4],
             live: 0,
         };
         if width >= TILE && height >= TILE {
@@ -43,19 +45,13 @@ impl Canvas {
 }
 
 /// Blends the Gaussians of the batch whose bit in `hits` is set onto one vector of pixels. Returns the bits of those that
-/// were visited before all pixels were finished, and whether any pixel is unfinished.
+/// were visited before all pixels were finished, and whether any pixel is unfinished. `C` = 3: colours; 4: and depth.
 #[inline(always)]
-fn blend<V: Vector>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut Canvas) -> (u64, bool) {
-    let [red, green, blue] = &mut canvas.rgb;
+fn blend<V: Vector, const C: usize>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut Canvas) -> (u64, bool) {
     let t_row = &mut canvas.transmittance.0[b & 15][at..];
-    let rows = [
-        &mut red.0[b & 15][at..],
-        &mut green.0[b & 15][at..],
-        &mut blue.0[b & 15][at..],
-    ];
     let (px, py) = (V::load(&PIXEL_X.0[b & 15][at..]), V::load(&PIXEL_Y.0[b & 15][at..]));
     let mut t = V::load(t_row);
-    let mut rgb = [V::load(rows[0]), V::load(rows[1]), V::load(rows[2])];
+    let mut sums: [V; C] = std::array::from_fn(|ch| V::load(&canvas.channels[ch].0[b & 15][at..]));
     let mut rest = hits;
     while rest != 0 {
         let splats = batch.take(&mut rest);
@@ -67,8 +63,8 @@ fn blend<V: Vector>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut 
             let hit = e.ge(c(LOG2_ALPHA_MIN));
             let draw = hit & next.ge(c(TRANSMITTANCE_STOP));
             let weight = drawn.select(draw, c(0.0));
-            for ch in 0..3 {
-                rgb[ch] = weight.mul_add(c(s.rgb[ch]), rgb[ch]);
+            for ch in 0..C {
+                sums[ch] = weight.mul_add(c(s.channels[ch]), sums[ch]);
             }
             t = next.select(draw, t.negative().select(hit, t));
         }
@@ -77,8 +73,8 @@ fn blend<V: Vector>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut 
         }
     }
     t.store(t_row);
-    for ch in 0..3 {
-        rgb[ch].store(rows[ch]);
+    for ch in 0..C {
+        sums[ch].store(&mut canvas.channels[ch].0[b & 15][at..]);
     }
     (hits & !rest, V::any(c::<V>(0.0).lt(t)))
 }
@@ -86,7 +82,7 @@ fn blend<V: Vector>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut 
 /// Blends the first `count` pairs onto the canvas. `seen` gets, for each batch, which Gaussians were drawn on which blocks,
 /// for the backward pass; it is empty if there is none.
 #[inline(always)]
-fn forward_kernel<V: Vector>(
+fn forward_kernel<V: Vector, const C: usize>(
     projected: &[Projected],
     pairs: &[AtomicU32],
     count: usize,
@@ -106,7 +102,7 @@ fn forward_kernel<V: Vector>(
             live &= live - 1;
             let (mut visited, mut open) = (0, false);
             for at in (0..BLOCK).step_by(V::LANES) {
-                let (s, o) = blend::<V>(&batch, hits[b], b, at, canvas);
+                let (s, o) = blend::<V, C>(&batch, hits[b], b, at, canvas);
                 visited |= s;
                 open |= o;
             }
@@ -123,7 +119,7 @@ fn forward_kernel<V: Vector>(
     }
 }
 dispatch!(
-    pub fn forward = forward_kernel(
+    pub fn forward<const C: usize> = forward_kernel(
         projected: &[Projected],
         pairs: &[AtomicU32],
         count: usize,

@@ -7,13 +7,15 @@ use crate::forward::Canvas;
 use crate::projected::TILE;
 use crate::region::Region;
 use crate::scene::Background;
+use crate::tile::swizzle;
 
 /// The pixels of the rendered region, in rows. Viewers draw straight to bytes, without a float image in between.
 pub enum Surface<'a> {
-    /// [H, W, 3] and [H, W]
+    /// [H, W, 3], [H, W], and [H, W] sums of weight times depth, or nothing where depth is not asked for.
     Floats {
         image: &'a mut [f32],
         alpha: &'a mut [f32],
+        depth: &'a mut [f32],
     },
     Rgb(&'a mut [[u8; 3]]),
     /// Alpha is 255.
@@ -26,9 +28,10 @@ impl<'a> Surface<'a> {
     pub fn check(&self, region: Region) -> Result<(), RasterError> {
         let pixels = region.pixels();
         match self {
-            Surface::Floats { image, alpha } => {
+            Surface::Floats { image, alpha, depth } => {
                 check_length("image", image.len(), 3 * pixels)?;
-                check_length("alpha", alpha.len(), pixels)
+                check_length("alpha", alpha.len(), pixels)?;
+                check_length("depth", depth.len(), if depth.is_empty() { 0 } else { pixels })
             }
             Surface::Rgb(p) => check_length("8-bit image", p.len(), pixels),
             Surface::Rgba(p) => check_length("8-bit image", p.len(), pixels),
@@ -46,9 +49,10 @@ impl<'a> Surface<'a> {
     /// The pixels of `range`.
     pub fn part(&mut self, range: Range<usize>) -> Surface<'_> {
         match self {
-            Surface::Floats { image, alpha } => Surface::Floats {
+            Surface::Floats { image, alpha, depth } => Surface::Floats {
                 image: &mut image[3 * range.start..3 * range.end],
-                alpha: &mut alpha[range],
+                alpha: &mut alpha[range.clone()],
+                depth: if depth.is_empty() { depth } else { &mut depth[range] },
             },
             Surface::Rgb(p) => Surface::Rgb(&mut p[range]),
             Surface::Rgba(p) => Surface::Rgba(&mut p[range]),
@@ -58,14 +62,16 @@ impl<'a> Surface<'a> {
     /// The first `n` pixels, and the others.
     pub fn split_at(self, n: usize) -> (Surface<'a>, Surface<'a>) {
         match self {
-            Surface::Floats { image, alpha } => {
+            Surface::Floats { image, alpha, depth } => {
                 let (image, image_rest) = image.split_at_mut(3 * n);
                 let (alpha, alpha_rest) = alpha.split_at_mut(n);
+                let (depth, depth_rest) = depth.split_at_mut(n.min(depth.len()));
                 let rest = Surface::Floats {
                     image: image_rest,
                     alpha: alpha_rest,
+                    depth: depth_rest,
                 };
-                (Surface::Floats { image, alpha }, rest)
+                (Surface::Floats { image, alpha, depth }, rest)
             }
             Surface::Rgb(p) => {
                 let (a, b) = p.split_at_mut(n);
@@ -78,12 +84,17 @@ impl<'a> Surface<'a> {
         }
     }
 
+    /// Whether depth is asked for.
+    pub fn has_depth(&self) -> bool {
+        matches!(self, Surface::Floats { depth, .. } if !depth.is_empty())
+    }
+
     /// Writes `columns` pixels from index `at` on.
     #[inline(always)]
     fn put(&mut self, at: usize, columns: usize, rgb: &[[f32; 3]; TILE], opacity: &[f32; TILE]) {
         let (rgb, opacity) = (&rgb[..columns], &opacity[..columns]);
         match self {
-            Surface::Floats { image, alpha } => {
+            Surface::Floats { image, alpha, .. } => {
                 image[3 * at..3 * (at + columns)].copy_from_slice(rgb.as_flattened());
                 alpha[at..at + columns].copy_from_slice(opacity);
             }
@@ -119,7 +130,7 @@ pub fn finish(canvas: &Canvas, background: Background, x: usize, width: usize, b
         for column in 0..4 {
             let b = (y / 4 * 4 + column) & 15;
             let t = &canvas.transmittance.0[b][four.clone()];
-            let [r, g, b] = [0, 1, 2].map(|ch| &canvas.rgb[ch].0[b][four.clone()]);
+            let [r, g, b] = [0, 1, 2].map(|ch| &canvas.channels[ch].0[b][four.clone()]);
             for i in 0..4 {
                 let (at, t) = (4 * column + i, t[i].abs());
                 rgb_row[at] = [
@@ -131,6 +142,14 @@ pub fn finish(canvas: &Canvas, background: Background, x: usize, width: usize, b
             }
         }
         band.put(y * width + x, columns, &rgb_row, &alpha_row);
+        if let Surface::Floats { depth, .. } = band
+            && let Some(row) = depth.get_mut(y * width + x..y * width + x + columns)
+        {
+            for (i, d) in row.iter_mut().enumerate() {
+                let (b, k) = swizzle(i, y);
+                *d = canvas.channels[3].0[b][k];
+            }
+        }
     }
 }
 
@@ -143,8 +162,11 @@ pub fn finish_empty(background: Background, columns: Range<usize>, width: usize,
     for y in 0..band.pixels() / width {
         let row = y * width + columns.start..y * width + columns.end;
         match band {
-            Surface::Floats { image, alpha } => {
+            Surface::Floats { image, alpha, depth } => {
                 alpha[row.clone()].fill(0.0);
+                if let Some(depth) = depth.get_mut(row.clone()) {
+                    depth.fill(0.0);
+                }
                 image.as_chunks_mut::<3>().0[row].fill(colour);
             }
             Surface::Rgb(p) => p[row].fill(colour.map(byte)),

@@ -93,6 +93,7 @@ fn gather(bins: &TileBins, sums: &[Sums], first: usize, n: usize, rows: &mut [Ro
             for k in 0..10 {
                 total[k] += s[k];
             }
+            total[11] += s[11];
             total[10] = total[10].max(s[10]);
             seen |= 1 << lane;
         });
@@ -155,9 +156,9 @@ fn quat_backward<V: Vector>(e: &Ewa<V>, d: &[[V; 3]; 3]) -> [V; 4] {
     ]
 }
 
-/// Writes means, quats and log_scales except the part of means that comes from colour.
+/// Writes means, quats and log_scales except the part of means that comes from colour. `depth`: gradient by it.
 #[inline(always)]
-fn geometry<V: Vector>(e: &Ewa<V>, lens: &Lens, s: &Screen<V>, at: usize, out: &mut GradientRows) {
+fn geometry<V: Vector>(e: &Ewa<V>, lens: &Lens, s: &Screen<V>, depth: V, at: usize, out: &mut GradientRows) {
     let (two, w) = (c::<V>(2.0), &lens.rotation);
     let mut dm = [[c::<V>(0.0); 3]; 2];
     let mut drot = [[c::<V>(0.0); 3]; 3];
@@ -174,7 +175,7 @@ fn geometry<V: Vector>(e: &Ewa<V>, lens: &Lens, s: &Screen<V>, at: usize, out: &
     for (i, v) in quat_backward(e, &drot).into_iter().enumerate() {
         v.store(&mut out.quats[i][at..]);
     }
-    let mut dp = [c::<V>(0.0); 3];
+    let mut dp = [c(0.0), c(0.0), depth];
     for i in 0..2 {
         let a = c::<V>(lens.focal[i]) * e.inv_z;
         let djw = [dot3(dm[i], e.rot[0]), dot3(dm[i], e.rot[1]), dot3(dm[i], e.rot[2])];
@@ -225,7 +226,7 @@ fn chunk<V: Vector>(soa: &Soa, lens: &Lens, k: usize, sums: &[Row; 12], out: &mu
     for at in (0..CHUNK).step_by(V::LANES) {
         let e = ewa::<V>(soa, lens, at);
         let s = screen(&e, sums, at);
-        geometry(&e, lens, &s, at, out);
+        geometry(&e, lens, &s, V::load(&sums[11][at..]), at, out);
         colour_backward::<V>(soa, lens, k, sums, at, out);
         // d ln(sigmoid(x)) / dx = 1 - sigmoid(x)
         let logit = V::load(&soa.logits[0][at..]).max(c(-55.0));

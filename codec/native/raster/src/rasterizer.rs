@@ -56,6 +56,7 @@ pub struct Rasterizer {
     sums: Vec<Sums>,
     pub(crate) image: Vec<f32>, // [H, W, 3] of the region
     pub(crate) alpha: Vec<f32>, // [H, W]
+    pub(crate) depth: Vec<f32>, // [H, W] sums of weight times depth, or empty
     drawn: Option<(Lens, Region, Background)>,
     pub timings: Timings,
 }
@@ -78,6 +79,7 @@ impl Rasterizer {
             sums: Vec::new(),
             image: Vec::new(),
             alpha: Vec::new(),
+            depth: Vec::new(),
             drawn: None,
             timings: Timings::default(),
         }
@@ -97,11 +99,17 @@ impl Rasterizer {
         &self.alpha
     }
 
+    /// [H, W] of the region, by the last forward pass: weight times depth, summed over the Gaussians; empty if not asked for.
+    pub fn depth(&self) -> &[f32] {
+        &self.depth
+    }
+
     /// Bytes of all buffers.
     pub fn memory(&self) -> usize {
         let gaussians = size_of::<Projected>() * self.projected.capacity() + self.sort.memory();
         let pairs = size_of::<Hits>() * self.seen.capacity() + size_of::<Sums>() * self.sums.capacity();
-        gaussians + self.bins.memory() + pairs + 4 * (self.image.capacity() + self.alpha.capacity())
+        let planes = self.image.capacity() + self.alpha.capacity() + self.depth.capacity();
+        gaussians + self.bins.memory() + pairs + 4 * planes
     }
 
     /// [N] the Gaussians after projection.
@@ -175,7 +183,7 @@ impl Rasterizer {
         }
     }
 
-    /// Renders the view. `training` keeps what `backward` needs.
+    /// Renders the view. `training` keeps what `backward` needs; `depth`: renders depth besides.
     ///
     /// # Errors
     /// Wrong lengths, an empty or too large view, too many Gaussian-tile pairs.
@@ -185,10 +193,11 @@ impl Rasterizer {
         view: &View,
         background: Background,
         training: bool,
+        depth: bool,
     ) -> Result<(), RasterError> {
         splats.check()?;
         view.check()?;
-        self.run(|s| s.forward_here(splats, view, background, training))
+        self.run(|s| s.forward_here(splats, view, background, training, depth))
     }
 
     pub(crate) fn forward_here(
@@ -197,19 +206,22 @@ impl Rasterizer {
         view: &View,
         background: Background,
         training: bool,
+        depth: bool,
     ) -> Result<(), RasterError> {
         let lens = Lens::new(view);
         self.drawn = None;
         self.project_here(splats, &lens);
-        let (mut image, mut alpha) = (take(&mut self.image), take(&mut self.alpha));
+        let (mut image, mut alpha, mut depths) = (take(&mut self.image), take(&mut self.alpha), take(&mut self.depth));
         image.resize(3 * view.region.pixels(), 0.0);
         alpha.resize(view.region.pixels(), 0.0);
+        depths.resize(if depth { view.region.pixels() } else { 0 }, 0.0);
         let surface = Surface::Floats {
             image: &mut image,
             alpha: &mut alpha,
+            depth: &mut depths,
         };
         let drawn = self.draw_on(surface, view.region, background, training);
-        (self.image, self.alpha) = (image, alpha);
+        (self.image, self.alpha, self.depth) = (image, alpha, depths);
         drawn?;
         if training {
             self.drawn = Some((lens, view.region, background));

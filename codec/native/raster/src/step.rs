@@ -1,7 +1,8 @@
 //! The image side of a training step in one call: render, compare with an 8-bit target image, differentiate.
 //!
 //! Target: unassociated 8-bit colour and optional alpha, composited on the same background as the Gaussians. Loss: the image
-//! loss plus mask_lambda * mean |alpha - target alpha|. No buffer with a value per pixel passes through the caller.
+//! loss, plus mask_lambda * mean |alpha - target alpha|, plus depth_lambda * mean |D - alpha d| / d, with D the sum of weight
+//! times depth and d the target depth, where that is known. No buffer with a value per pixel passes through the caller.
 
 use rayon::prelude::*;
 
@@ -12,12 +13,14 @@ use crate::loss::{ImageLoss, LossValue};
 use crate::rasterizer::Rasterizer;
 use crate::scene::{Background, Gradients, Splats, View};
 
-/// The target of a view: [H, W, 3], [H, W] and [H, W] of the whole image, not of the region.
+/// The target of a view: [H, W, 3] and thrice [H, W] of the whole image, not of the region.
 #[derive(Clone, Copy)]
 pub struct TargetImage<'a> {
     pub rgb: &'a [u8],
     pub alpha: Option<&'a [u8]>,
     pub weight: Option<&'a [f32]>,
+    /// World units along the optical axis; 0: unknown.
+    pub depth: Option<&'a [f32]>,
     /// Added by the camera to all light of the Gaussians; the loss compares what is left without it.
     pub offset: [f32; 3],
 }
@@ -26,12 +29,14 @@ pub struct TargetImage<'a> {
 pub struct Lambdas {
     pub ssim: f32,
     pub mask: f32,
+    pub depth: f32,
 }
 
 #[derive(Clone, Copy, Default, Debug)]
 pub struct StepValue {
     pub image: LossValue,
     pub mask: f64,
+    pub depth: f64,
     pub loss: f64,
     /// Gradient with respect to the gain of `Background`.
     pub gain: [f64; 3],
@@ -58,7 +63,8 @@ pub struct Step {
     weight: Vec<f32>,
     grad_image: Vec<f32>,
     grad_alpha: Vec<f32>,
-    rows: Vec<[f64; 7]>, // mask, gain and offset sums of each image row
+    grad_depth: Vec<f32>, // empty without a target depth
+    rows: Vec<[f64; 8]>,  // mask, gain, offset and depth sums of each image row
 }
 
 impl Step {
@@ -81,6 +87,7 @@ impl Step {
         check_length("target rgb", target.rgb.len(), 3 * pixels)?;
         check_length("target alpha", target.alpha.map_or(pixels, <[u8]>::len), pixels)?;
         check_length("weight", target.weight.map_or(pixels, <[f32]>::len), pixels)?;
+        check_length("target depth", target.depth.map_or(pixels, <[f32]>::len), pixels)?;
         // gain sum(w rgb) + (1 - T) offset + T background, less the offset, is that over a background less the offset
         let less = std::array::from_fn(|ch| background.rgb[ch] - target.offset[ch]);
         let shifted = Background {
@@ -88,11 +95,11 @@ impl Step {
             ..background
         };
         rasterizer.run(|r| {
-            r.forward_here(splats, view, shifted, true)?;
+            r.forward_here(splats, view, shifted, true, target.depth.is_some())?;
             let start = Clock::start();
             let value = self.photometric_loss(r, view, background, target, lambdas)?;
             r.timings.loss = start.ms();
-            r.backward_here(splats, &self.grad_image, &self.grad_alpha, out)?;
+            r.backward_here(splats, &self.grad_image, &self.grad_alpha, &self.grad_depth, out)?;
             Ok(value)
         })
     }
@@ -109,8 +116,9 @@ impl Step {
         self.target.resize(3 * n, 0.0);
         self.grad_image.resize(3 * n, 0.0);
         self.grad_alpha.resize(n, 0.0);
-        self.rows.resize(view.region.height, [0.0; 7]);
+        self.rows.resize(view.region.height, [0.0; 8]);
         self.composite(r, view, background, target, lambdas.mask);
+        let depth = self.depth_loss(r, view, target.depth, lambdas.depth);
         let weight = target.weight.map(|w| {
             let region = view.region;
             self.weight.clear();
@@ -132,7 +140,8 @@ impl Step {
         Ok(StepValue {
             image,
             mask,
-            loss: image.loss + f64::from(lambdas.mask) * mask,
+            depth,
+            loss: image.loss + f64::from(lambdas.mask) * mask + f64::from(lambdas.depth) * depth,
             gain,
             offset,
         })
@@ -191,6 +200,42 @@ impl Step {
         });
     }
 
+    /// The loss of depth, a mean over all pixels of the region. Writes its gradient by the sums, and adds that by alpha.
+    fn depth_loss(&mut self, r: &Rasterizer, view: &View, target: Option<&[f32]>, lambda: f32) -> f64 {
+        self.grad_depth.clear();
+        let Some(target) = target else {
+            return 0.0;
+        };
+        let region = view.region;
+        self.grad_depth.resize(region.pixels(), 0.0);
+        let slope = lambda / region.pixels() as f32;
+        let grads = self
+            .grad_depth
+            .par_chunks_mut(region.width)
+            .zip(self.grad_alpha.par_chunks_mut(region.width));
+        let drawn = r
+            .depth()
+            .par_chunks(region.width)
+            .zip(r.alpha().par_chunks(region.width));
+        let rows = grads.zip(drawn).zip(&mut self.rows).enumerate();
+        rows.for_each(|(y, (((grad, grad_alpha), (drawn, alpha)), sums))| {
+            let target = &target[(region.y + y) * view.width + region.x..][..region.width];
+            let mut sum = 0.0;
+            for (x, &d) in target.iter().enumerate() {
+                if !(d > 0.0 && d.is_finite()) {
+                    continue;
+                }
+                let off = drawn[x] / d - alpha[x];
+                let sign = slope * (f32::from(off > 0.0) - f32::from(off < 0.0));
+                grad[x] = sign / d;
+                grad_alpha[x] -= sign;
+                sum += off.abs();
+            }
+            sums[7] = f64::from(sum);
+        });
+        self.rows.iter().map(|s| s[7]).sum::<f64>() / region.pixels() as f64
+    }
+
     /// By the gain: sum over pixels of g . (image - T background) / gain; by the offset: sum of g (1 - T).
     fn exposure_gradient(
         &mut self,
@@ -216,7 +261,7 @@ impl Step {
                         s[3 + ch] += f64::from(g[3 * x + ch] * a);
                     }
                 }
-                sums[1..].copy_from_slice(&s);
+                sums[1..7].copy_from_slice(&s);
             });
         let sum = |i: usize| self.rows.iter().map(|s| s[1 + i]).sum::<f64>();
         let by_gain = |ch: usize| {

@@ -60,7 +60,8 @@ pub struct Local {
     pub l22: f32,
     pub v0: f32,
     pub log2_opacity: f32,
-    pub rgb: [f32; 3],
+    /// Red, green, blue and depth.
+    pub channels: [f32; 4],
     x: f32,
     y: f32,
 }
@@ -74,7 +75,7 @@ impl Local {
         l22: 0.0,
         v0: 0.0,
         log2_opacity: -100.0,
-        rgb: [0.0; 3],
+        channels: [0.0; 4],
         x: 0.0,
         y: 0.0,
     };
@@ -125,7 +126,7 @@ impl Batch {
                 l22: p.l22,
                 v0: -(p.l22 * y),
                 log2_opacity: p.log2_opacity,
-                rgb: p.rgb,
+                channels: [p.rgb[0], p.rgb[1], p.rgb[2], p.depth],
                 x,
                 y,
             };

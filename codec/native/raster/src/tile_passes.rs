@@ -56,7 +56,8 @@ pub fn blend_tiles(
                 empty = x + TILE;
                 let mut canvas = Canvas::new(width - x, band.pixels() / width);
                 let origin = [x as f32, ((top + row.start) * TILE) as f32];
-                forward(
+                let draw = if band.has_depth() { forward::<4> } else { forward::<3> };
+                draw(
                     level,
                     projected,
                     &bins.pairs[range.start..],
@@ -100,7 +101,12 @@ pub fn backward_tiles(
             }
             let (x, y) = (column * TILE, row.start * TILE);
             let (pairs, hits) = (&bins.pairs[bins.first(t)..], &seen[bins.batches(t)..]);
-            backward(level, projected, pairs, pixels, [x, y], background, hits, own);
+            let differentiate = if pixels.grad_depth.is_empty() {
+                backward::<3>
+            } else {
+                backward::<4>
+            };
+            differentiate(level, projected, pairs, pixels, [x, y], background, hits, own);
         }
     });
 }

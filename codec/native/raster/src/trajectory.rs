@@ -6,7 +6,7 @@
 
 use rayon::prelude::*;
 
-use crate::adam::{Adam, adam_values};
+use crate::adam::Adam;
 use crate::error::{RasterError, check_length};
 use crate::ewa::exp;
 use crate::simd::{MAGIC, SimdLevel, Vector, c, dispatch};
@@ -27,7 +27,10 @@ pub struct BitPrice<'a> {
     pub noise: &'a [f32],
 }
 
-/// [K, V] coefficients of one attribute and the moments of Adam.
+/// [K, V] coefficients of one attribute, and the moments of Adam: the first [K, V], the second [V].
+///
+/// The gradient by coefficient k at a frame is `at[k]` times that by the sum, and the mean square of `at[k]` over the frames
+/// is the same for all k of an orthonormal transform. So the K share one second moment: their mean square.
 pub struct Trajectories<'a> {
     pub values: &'a mut [f32],
     pub first: &'a mut [f32],
@@ -92,56 +95,132 @@ pub fn step(
     price: Option<BitPrice>,
 ) -> Result<Vec<[f64; 2]>, RasterError> {
     let count = grad.len();
-    for (name, a) in [
-        ("coefficients", &t.values),
-        ("first moment", &t.first),
-        ("second moment", &t.second),
-    ] {
-        check_length(name, a.len(), at.len() * count)?;
-    }
+    check_length("coefficients", t.values.len(), at.len() * count)?;
+    check_length("first moment", t.first.len(), at.len() * count)?;
+    check_length("second moment", t.second.len(), count)?;
     if let Some(p) = price {
         check_length("scales", p.scales.len(), at.len())?;
         if p.noise.len() + 1 < count + at.len() {
             check_length("noise", p.noise.len(), count + at.len() - 1)?;
         }
     }
-    if count == 0 {
+    if count == 0 || at.is_empty() {
         return Ok(vec![[0.0; 2]; at.len()]);
     }
-    let rows = t
-        .values
-        .chunks_mut(count)
-        .zip(t.first.chunks_mut(count))
-        .zip(t.second.chunks_mut(count));
-    Ok(rows
-        .enumerate()
-        .map(|(k, ((values, first), second))| {
-            let noise = price.map(|p| (p.weight, p.scales[k], &p.noise[k..k + count]));
-            let parts = values
-                .par_chunks_mut(SHARE)
-                .zip(first.par_chunks_mut(SHARE))
-                .zip(second.par_chunks_mut(SHARE));
-            let sums: Vec<[f64; 2]> = parts
-                .zip(grad.par_chunks(SHARE))
-                .enumerate()
-                .map(|(i, (((values, first), second), grad))| {
-                    let mut by = [0.0f32; SHARE];
-                    let by = &mut by[..grad.len()];
-                    let sum = match noise {
-                        Some((weight, scale, noise)) => {
-                            bits(level, values, &noise[i * SHARE..][..grad.len()], scale, weight, by)
-                        }
-                        None => [0.0; 2],
-                    };
-                    by.iter_mut().zip(grad).for_each(|(b, g)| *b += at[k] * g);
-                    adam_values(level, adam, values, by, first, second);
-                    sum
-                })
-                .collect();
-            sums.iter().fold([0.0; 2], |a, b| [a[0] + b[0], a[1] + b[1]]) // in order: the same on any number of threads
+    let mut shares: Vec<Share> = t
+        .second
+        .chunks_mut(SHARE)
+        .zip(grad.chunks(SHARE))
+        .map(|(second, grad)| Share {
+            second,
+            grad,
+            rows: Vec::with_capacity(at.len()),
         })
-        .collect())
+        .collect();
+    for (values, first) in t.values.chunks_mut(count).zip(t.first.chunks_mut(count)) {
+        for ((share, values), first) in shares
+            .iter_mut()
+            .zip(values.chunks_mut(SHARE))
+            .zip(first.chunks_mut(SHARE))
+        {
+            share.rows.push((values, first));
+        }
+    }
+    let sums: Vec<Vec<[f64; 2]>> = shares
+        .into_par_iter()
+        .enumerate()
+        .map(|(i, share)| share.step(level, adam, at, price, i * SHARE))
+        .collect();
+    let add = |k: usize| sums.iter().fold([0.0; 2], |a, b| [a[0] + b[k][0], a[1] + b[k][1]]);
+    Ok((0..at.len()).map(add).collect()) // in order: the same on any number of threads
 }
+
+/// Some of the V: their second moments, their gradient, and values and first moments of each coefficient.
+struct Share<'a> {
+    second: &'a mut [f32],
+    grad: &'a [f32],
+    rows: Vec<(&'a mut [f32], &'a mut [f32])>,
+}
+
+impl Share<'_> {
+    /// One step of these values, which begin at `from`.
+    fn step(mut self, level: SimdLevel, adam: Adam, at: &[f32], price: Option<BitPrice>, from: usize) -> Vec<[f64; 2]> {
+        let count = self.grad.len();
+        let mut sums = vec![[0.0; 2]; at.len()];
+        let mut by_bits = vec![0.0; price.map_or(0, |_| at.len() * count)]; // weighted gradients by the bits
+        let mut rate = vec![0.0; count];
+        let (mut square, mut cross) = (at.iter().map(|a| a * a).sum::<f32>(), vec![]);
+        if let Some(p) = price {
+            cross = vec![0.0; count];
+            rate.fill(0.0);
+            for (k, (by, (values, _))) in by_bits.chunks_mut(count).zip(&self.rows).enumerate() {
+                sums[k] = bits(level, values, &p.noise[k + from..][..count], p.scales[k], p.weight, by);
+                for ((r, c), b) in rate.iter_mut().zip(&mut cross).zip(by) {
+                    *r += *b * *b;
+                    *c += at[k] * *b;
+                }
+            }
+        }
+        let share = 1.0 / at.len() as f32;
+        square *= share;
+        for (i, (v, g)) in self.second.iter_mut().zip(self.grad).enumerate() {
+            let by = cross.get(i).map_or(0.0, |c| share * (rate[i] + 2.0 * c * g));
+            *v = adam.betas[1] * *v + (1.0 - adam.betas[1]) * (square * g * g + by).max(0.0);
+            rate[i] = adam.rate / ((*v * adam.correction).sqrt() + adam.epsilon);
+        }
+        for (k, (values, first)) in self.rows.iter_mut().enumerate() {
+            let by = by_bits.get(k * count..(k + 1) * count);
+            advance(level, adam.betas[0], at[k], self.grad, by, &rate, first, values);
+        }
+        sums
+    }
+}
+
+#[inline(always)]
+#[allow(clippy::too_many_arguments)] // a kernel over five arrays
+fn advance_lanes<V: Vector>(
+    i: usize,
+    beta: f32,
+    at: f32,
+    grad: &[f32],
+    by_bits: Option<&[f32]>,
+    rate: &[f32],
+    first: &mut [f32],
+    values: &mut [f32],
+) {
+    let mut g = V::load(&grad[i..]) * c(at);
+    if let Some(by) = by_bits {
+        g = g + V::load(&by[i..]);
+    }
+    let m = V::load(&first[i..]);
+    let m = c::<V>(1.0 - beta).mul_add(g - m, m);
+    m.store(&mut first[i..]);
+    V::load(&rate[i..])
+        .neg_mul_add(m, V::load(&values[i..]))
+        .store(&mut values[i..]);
+}
+
+/// The first moment and the values of one coefficient, `rate` [V] being the learning rate of each value.
+#[inline(always)]
+#[allow(clippy::too_many_arguments)]
+fn advance_kernel<V: Vector>(
+    beta: f32,
+    at: f32,
+    grad: &[f32],
+    by_bits: Option<&[f32]>,
+    rate: &[f32],
+    first: &mut [f32],
+    values: &mut [f32],
+) {
+    let whole = values.len() / V::LANES * V::LANES;
+    for i in (0..whole).step_by(V::LANES) {
+        advance_lanes::<V>(i, beta, at, grad, by_bits, rate, first, values);
+    }
+    for i in whole..values.len() {
+        advance_lanes::<f32>(i, beta, at, grad, by_bits, rate, first, values);
+    }
+}
+dispatch!(fn advance = advance_kernel(beta: f32, at: f32, grad: &[f32], by_bits: Option<&[f32]>, rate: &[f32], first: &mut [f32], values: &mut [f32]));
 
 /// The bits of some coefficients and their derivative by the log of the scale; `weight` times that by each value -> out.
 #[inline(always)]
@@ -220,7 +299,7 @@ mod tests {
         let run = |level| {
             let mut out = vec![0.0; count];
             sum_at(level, &values, &at, 0.1, &mut out).unwrap();
-            let (mut moved, mut first, mut second) = (values.clone(), vec![0.0; 3 * count], vec![0.0; 3 * count]);
+            let (mut moved, mut first, mut second) = (values.clone(), vec![0.0; 3 * count], vec![0.0; count]);
             let adam = Adam {
                 betas: [0.9, 0.999],
                 epsilon: 1e-8,

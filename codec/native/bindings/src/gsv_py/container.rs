@@ -1,5 +1,6 @@
 //! Config dicts <-> the container: init segment, fragments, index, demuxer.
 
+use super::placement::{placement_from, placement_into};
 use super::values::{bytes_of, invalid, item, optional, raise, value};
 use gsv::container::audio::AudioTrack;
 use gsv::container::config::{COLOR_SPACES, Camera, Config, NEAR, SH_FRAMES, UP_AXES, rate};
@@ -38,6 +39,8 @@ fn config_from(py: Python, d: &Bound<PyDict>) -> PyResult<Config> {
         sh_frame: choice("sh_frame", &SH_FRAMES)?,
         cameras: Vec::new(),
         audio: optional(d, "audio")?.map(|a| audio_from(&a.extract()?)).transpose()?,
+        track: optional(d, "track")?.map_or(Ok(0), |v| v.extract())?,
+        placement: placement_from(optional(d, "placement")?)?,
     };
     Level::get(config.level).map_err(|e| PyValueError::new_err(e.to_string()))?;
     if let Some(cameras) = optional(d, "cameras")? {
@@ -124,13 +127,22 @@ fn config_into<'py>(py: Python<'py>, c: &Config) -> PyResult<Bound<'py, PyDict>>
     if let Some(audio) = &c.audio {
         d.set_item("audio", audio_into(py, audio)?)?;
     }
+    d.set_item("track", c.track)?;
+    d.set_item("placement", placement_into(py, &c.placement)?)?;
     Ok(d)
 }
 
-/// ftyp and moov: what opens a file.
+/// ftyp and moov: what opens a file. `config`: of its track; `others`: of its other tracks.
 #[pyfunction]
-pub fn init_segment<'py>(py: Python<'py>, config: &Bound<'py, PyDict>) -> PyResult<Bound<'py, PyBytes>> {
-    let out = write::init_segment(&config_from(py, config)?).map_err(|e| raise(py, e))?;
+#[pyo3(signature = (config, others = Vec::new()))]
+pub fn init_segment<'py>(
+    py: Python<'py>,
+    config: Bound<'py, PyDict>,
+    others: Vec<Bound<'py, PyDict>>,
+) -> PyResult<Bound<'py, PyBytes>> {
+    let all = std::iter::once(config).chain(others);
+    let configs: Vec<Config> = all.map(|d| config_from(py, &d)).collect::<PyResult<_>>()?;
+    let out = write::init_segment(&configs).map_err(|e| raise(py, e))?;
     Ok(PyBytes::new(py, &out))
 }
 
@@ -168,41 +180,60 @@ pub fn fragment<'py>(
     Ok(PyBytes::new(py, &out))
 }
 
-/// What precedes the fragments of a finished file: `init` and an index of (fragment size, frames, sync, bytes of the
-/// fragment that end with each layer).
+/// An index entry: fragment size, frames, sync, and bytes of the fragment that end with each layer.
+type IndexEntry = (u64, u32, bool, Vec<u64>);
+
+/// What precedes the fragments of a finished file: `init` and an index of each track.
 #[pyfunction]
 pub fn finish<'py>(
     py: Python<'py>,
     init: &Bound<'py, PyAny>,
-    index: Vec<(u64, u32, bool, Vec<u64>)>,
+    tracks: Vec<Vec<IndexEntry>>,
 ) -> PyResult<Bound<'py, PyBytes>> {
-    let mut demuxer = Demuxer::default();
     let init = bytes_of(init)?;
     let init = init.as_slice()?;
-    demuxer.push(init).map_err(|e| raise(py, e))?;
-    let Some(config) = demuxer.config() else {
-        return invalid("expected an init segment".into());
+    let mut demuxers = Vec::new();
+    for number in 0..tracks.len() {
+        let mut demuxer = Demuxer::of_track(number);
+        demuxer.push(init).map_err(|e| raise(py, e))?;
+        demuxers.push(demuxer);
+    }
+    let reference = |(size, frames, sync, layers)| Reference {
+        size,
+        frames,
+        sync,
+        layers,
     };
-    let groups: Vec<Reference> = index
-        .into_iter()
-        .map(|(size, frames, sync, layers)| Reference {
-            size,
-            frames,
-            sync,
-            layers,
-        })
+    let indexed: Vec<_> = demuxers
+        .iter()
+        .zip(tracks)
+        .filter_map(|(d, index)| Some((d.config()?, index.into_iter().map(reference).collect())))
         .collect();
-    let out = write::finish(init, config, &groups).map_err(|e| raise(py, e))?;
+    if indexed.len() != demuxers.len() {
+        return invalid("expected an init segment".into());
+    }
+    let out = write::finish(init, &indexed).map_err(|e| raise(py, e))?;
     Ok(PyBytes::new(py, &out))
 }
 
-/// Config and groups of a file in any object with the buffer protocol; only headers are read. Not strict: what an index can
+/// How many gsv tracks a file has; only moov is read.
+#[pyfunction]
+pub fn track_count(py: Python, buffer: &Bound<PyAny>) -> PyResult<usize> {
+    whole::tracks(bytes_of(buffer)?.as_slice()?).map_err(|e| raise(py, e))
+}
+
+/// Config and groups of a track of a file in any object with the buffer protocol; only headers are read. Not strict: what an index can
 /// save of a file with damaged headers; `damage` lists group and message.
 #[pyfunction]
-#[pyo3(signature = (buffer, strict = true))]
-pub fn demux<'py>(py: Python<'py>, buffer: &Bound<'py, PyAny>, strict: bool) -> PyResult<Bound<'py, PyDict>> {
+#[pyo3(signature = (buffer, strict = true, track = 0))]
+pub fn demux<'py>(
+    py: Python<'py>,
+    buffer: &Bound<'py, PyAny>,
+    strict: bool,
+    track: usize,
+) -> PyResult<Bound<'py, PyDict>> {
     let data = bytes_of(buffer)?;
-    let (demuxer, damage) = whole::read(data.as_slice()?, strict).map_err(|e| raise(py, e))?;
+    let (demuxer, damage) = whole::read(data.as_slice()?, strict, track).map_err(|e| raise(py, e))?;
     let Some(config) = demuxer.config() else {
         return invalid("expected a config".into());
     };

@@ -2,6 +2,7 @@
 
 use super::group_from::group_from;
 use super::parametric::{canonical, carried, frame};
+use super::placement::{PoseTuple, pose_from};
 use super::quantized_from::{parents_into, quantized};
 use super::report;
 use super::values::{bytes_of, raise};
@@ -11,6 +12,7 @@ use gsv::decode::{Decoding, decode_damaged, decode_group, read_header};
 use gsv::evaluate::Evaluator;
 use gsv::group::Group;
 use gsv::levels::Level;
+use gsv::pose::Pose;
 use gsv::unit::{ALL_LAYERS, UnitType};
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods};
 use pyo3::exceptions::PyIndexError;
@@ -138,9 +140,18 @@ impl DecodedGroup {
     }
 
     /// Attributes of frame `t` of all Gaussians, f32: views of one array, since few large pages are had faster than many small ones.
-    fn frame<'py>(&self, py: Python<'py>, t: u16) -> PyResult<Bound<'py, PyDict>> {
+    /// `pose`: what `pose_at` gives, by which they are placed.
+    #[pyo3(signature = (t, pose = None))]
+    fn frame<'py>(&self, py: Python<'py>, t: u16, pose: Option<PoseTuple>) -> PyResult<Bound<'py, PyDict>> {
         self.check(t)?;
-        frame(py, &self.evaluator.parametric(), t, sh_coefficients(self.sh_degree()))
+        let pose = pose.map_or(Pose::default(), pose_from);
+        frame(
+            py,
+            &self.evaluator.parametric(),
+            t,
+            sh_coefficients(self.sh_degree()),
+            &pose,
+        )
     }
 
     /// [N] bool: which Gaussians frame `t` shows; None: all.

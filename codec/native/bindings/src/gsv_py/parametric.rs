@@ -5,6 +5,7 @@ use super::values::invalid;
 use gsv::attributes::{Attribute, sh_coefficients};
 use gsv::blend::Blend;
 use gsv::parametric::{AttributeMotion, Coefficient, Frame, FrameMut, Parametric};
+use gsv::pose::Pose;
 use gsv::trajectories::Trajectories;
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
 use pyo3::exceptions::PyIndexError;
@@ -112,7 +113,7 @@ impl ParametricEvaluator {
                 self.frames
             )));
         }
-        frame(py, &self.parametric(), t, self.sh_coefficients)
+        frame(py, &self.parametric(), t, self.sh_coefficients, &Pose::default())
     }
 
     /// Means [T, N, 3] and quaternions [T, N, 4] wxyz of all frames.
@@ -194,6 +195,7 @@ pub fn frame<'py, V: Coefficient>(
     p: &Parametric<V>,
     t: u16,
     k: usize,
+    pose: &Pose,
 ) -> PyResult<Bound<'py, PyDict>> {
     let n = p.rest.means.len();
     let shapes = [
@@ -214,7 +216,7 @@ pub fn frame<'py, V: Coefficient>(
         let (log_scales, rest) = rest.split_at_mut(3 * n);
         let (logit_opacities, rest) = rest.split_at_mut(n);
         let (sh0, sh_n) = rest.split_at_mut(3 * n);
-        let out = FrameMut {
+        let mut out = FrameMut {
             means: means.as_chunks_mut().0,
             quats: quats.as_chunks_mut().0,
             log_scales,
@@ -222,7 +224,10 @@ pub fn frame<'py, V: Coefficient>(
             sh0,
             sh_n,
         };
-        py.detach(|| p.frame_into(t, out));
+        py.detach(|| {
+            p.frame_into(t, &mut out);
+            pose.apply(out);
+        });
     }
     let (d, mut start) = (PyDict::new(py), 0);
     for (name, shape) in shapes {

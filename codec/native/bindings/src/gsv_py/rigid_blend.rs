@@ -1,10 +1,14 @@
-//! The blend of rigid motions for training and fitting, and its gradient.
+//! The blend of rigid motions for training and fitting, and its gradient by what moves the nodes.
 
 use super::values::invalid;
 use gsv::blend::Blend;
-use gsv::rigid_blend::{Pose, RigidBlend};
+use gsv::dequantize::multiply;
+use gsv::pose_gradient::{self, Edges, Moved};
+use gsv::rigid_blend::{self, RigidBlend};
 use numpy::{IntoPyArray, PyArrayMethods, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::prelude::*;
+
+type Floats<'py> = PyReadonlyArray2<'py, f32>;
 
 /// Neighbours and weights of `count` Gaussians, as the core takes them.
 pub fn blend_of(
@@ -44,34 +48,36 @@ fn rows<'a, const K: usize>(
     Ok(a.as_slice()?.as_chunks().0)
 }
 
-/// Poses [M, 16] f32 (rows of R, offset s of x -> R x + s, quaternion wxyz) -> `RigidBlend`.
-fn poses(a: &PyReadonlyArray2<f32>) -> PyResult<RigidBlend> {
-    let pose = |r: &[f32; 16]| -> Pose {
-        let column = |b: usize| [r[b], r[3 + b], r[6 + b], 0.0];
-        [
-            column(0),
-            column(1),
-            column(2),
-            [r[9], r[10], r[11], 0.0],
-            [r[12], r[13], r[14], r[15]],
-        ]
+/// Nodes: positions at rest [M, 3], rotations [M, 4] wxyz about them, positions [M, 3].
+type Nodes<'py> = (Floats<'py>, Floats<'py>, Floats<'py>);
+
+/// The poses of nodes.
+fn poses(nodes: &Nodes) -> PyResult<RigidBlend> {
+    let rest: &[[f32; 3]] = rows(&nodes.0, "nodes", "M", None)?;
+    let count = Some(rest.len());
+    let rotations: &[[f32; 4]] = rows(&nodes.1, "rotations of nodes", "M", count)?;
+    let positions: &[[f32; 3]] = rows(&nodes.2, "positions of nodes", "M", count)?;
+    let all = rest.iter().zip(rotations).zip(positions);
+    let pose = |((c, q), p): ((&[f32; 3], &[f32; 4]), &[f32; 3])| {
+        rigid_blend::pose(*q, *c, [p[0] - c[0], p[1] - c[1], p[2] - c[2]])
     };
-    Ok(RigidBlend::new(rows(a, "poses", "M", None)?.iter().map(pose).collect()))
+    Ok(RigidBlend::new(all.map(pose).collect()))
 }
 
 /// Where [N, 3] positions at rest are carried, [N, 3], and by which rotations, [N, 4] wxyz (spec 13.3).
 ///
-/// `poses` [M, 16] f32: rows of the rotation matrix R, offset s of x -> R x + s, quaternion of R.
+/// `nodes`: positions at rest [M, 3], rotations [M, 4] about them, positions [M, 3].
 #[pyfunction]
 pub fn blend_rigid<'py>(
     py: Python<'py>,
-    poses: PyReadonlyArray2<'py, f32>,
-    rest: PyReadonlyArray2<'py, f32>,
+    nodes: Nodes<'py>,
+    rest: Floats<'py>,
     neighbors: PyReadonlyArray2<'py, u32>,
-    weights: PyReadonlyArray2<'py, f32>,
+    weights: Floats<'py>,
 ) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
-    let (nodes, x) = (self::poses(&poses)?, rows(&rest, "rest", "N", None)?);
-    let blend = blend_of(&neighbors, &weights, x.len(), poses.shape()[0])?;
+    let (count, x) = (nodes.0.shape()[0], rows(&rest, "rest", "N", None)?);
+    let blend = blend_of(&neighbors, &weights, x.len(), count)?;
+    let nodes = poses(&nodes)?;
     let (mut means, mut rotations) = (vec![[0.0f32; 3]; x.len()], vec![[0.0f32; 4]; x.len()]);
     py.detach(|| nodes.carry(&blend, x, (&mut means, &mut rotations), |_, x, q| (x, q)));
     let means = means
@@ -83,47 +89,69 @@ pub fn blend_rigid<'py>(
     Ok((means, rotations.reshape([x.len(), 4])?.into_any()))
 }
 
-/// The gradient [M, 16] by `poses` of a loss, from its gradients by the results of `blend_rigid`.
+/// Gradients [M, 3] and [M, 3] of a loss by the turns and by the shifts of nodes (`gsv::pose_gradient`).
+///
+/// # Arguments
+/// * `nodes`: as of `blend_rigid`, behind the turns [M, 3] of base rotations [M, 4].
+/// * `blend`: rest [N, 3], neighbors [N, k], weights [N, k].
+/// * `by_carried`: gradients [N, 3] and [N, 4] by the results of `blend_rigid`.
+/// * `edges`: nodes [M, e] u32 at the other ends, their weights [M, e], strength of the rigidity term.
 #[pyfunction]
-pub fn blend_rigid_backward<'py>(
+pub fn node_gradients<'py>(
     py: Python<'py>,
-    poses: PyReadonlyArray2<'py, f32>,
-    rest: PyReadonlyArray2<'py, f32>,
-    neighbors: PyReadonlyArray2<'py, u32>,
-    weights: PyReadonlyArray2<'py, f32>,
-    by_means: PyReadonlyArray2<'py, f32>,
-    by_rotations: PyReadonlyArray2<'py, f32>,
-) -> PyResult<Bound<'py, PyAny>> {
-    let (nodes, x) = (self::poses(&poses)?, rows(&rest, "rest", "N", None)?);
-    let blend = blend_of(&neighbors, &weights, x.len(), poses.shape()[0])?;
-    let (g, h) = (
-        rows(&by_means, "by_means", "N", Some(x.len()))?,
-        rows(&by_rotations, "by_rotations", "N", Some(x.len()))?,
-    );
-    let grads = py.detach(|| nodes.backward(&blend, x, g, h));
-    let row = |p: &Pose| -> [f32; 16] {
-        let r = |a: usize, b: usize| p[b][a];
-        let [s, q] = [p[3], p[4]];
-        [
-            r(0, 0),
-            r(0, 1),
-            r(0, 2),
-            r(1, 0),
-            r(1, 1),
-            r(1, 2),
-            r(2, 0),
-            r(2, 1),
-            r(2, 2),
-            s[0],
-            s[1],
-            s[2],
-            q[0],
-            q[1],
-            q[2],
-            q[3],
-        ]
+    nodes: Nodes<'py>,
+    turned: (Floats<'py>, Floats<'py>),
+    blend: (Floats<'py>, PyReadonlyArray2<'py, u32>, Floats<'py>),
+    by_carried: (Floats<'py>, Floats<'py>),
+    edges: (PyReadonlyArray2<'py, u32>, Floats<'py>, f32),
+) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
+    let (motion, x) = (poses(&nodes)?, rows(&blend.0, "rest", "N", None)?);
+    let (n, m) = (Some(x.len()), Some(nodes.0.shape()[0]));
+    let by_means = rows(&by_carried.0, "by_means", "N", n)?;
+    let by_rotations = rows(&by_carried.1, "by_rotations", "N", n)?;
+    let moved = Moved {
+        rest: rows(&nodes.0, "nodes", "M", m)?,
+        turns: rows(&turned.0, "turns", "M", m)?,
+        base: rows(&turned.1, "base rotations", "M", m)?,
+        positions: rows(&nodes.2, "positions of nodes", "M", m)?,
     };
-    let rows: Vec<[f32; 16]> = grads.iter().map(row).collect();
-    let count = rows.len();
-    Ok(rows.into_flattened().into_pyarray(py).reshape([count, 16])?.into_any())
+    let count = moved.rest.len();
+    let graph = blend_of(&edges.0, &edges.1, count, count)?;
+    let edges = Edges {
+        per: graph.per,
+        index: &graph.index,
+        weights: &graph.weight,
+        strength: edges.2,
+    };
+    let blend = blend_of(&blend.1, &blend.2, x.len(), count)?;
+    let (by_turns, by_shifts) = py.detach(|| {
+        let by_poses = motion.backward(&blend, x, by_means, by_rotations);
+        pose_gradient::backward(&moved, &by_poses, &edges)
+    });
+    let array = |a: Vec<[f32; 3]>| -> PyResult<Bound<'py, PyAny>> {
+        Ok(a.into_flattened().into_pyarray(py).reshape([count, 3])?.into_any())
+    };
+    Ok((array(by_turns)?, array(by_shifts)?))
+}
+
+/// Products [N, 4] of quaternions [N, 4] wxyz, each of the two as it is or conjugated: the rotation `b`, then `a`.
+#[pyfunction]
+pub fn quat_product<'py>(
+    py: Python<'py>,
+    a: Floats<'py>,
+    b: Floats<'py>,
+    conjugated: (bool, bool),
+) -> PyResult<Bound<'py, PyAny>> {
+    let first: &[[f32; 4]] = rows(&a, "a", "N", None)?;
+    let second: &[[f32; 4]] = rows(&b, "b", "N", Some(first.len()))?;
+    let signs = [conjugated.0, conjugated.1].map(|c| if c { -1.0 } else { 1.0 });
+    let of = |[w, x, y, z]: [f32; 4], s: f32| [w, s * x, s * y, s * z];
+    let all = first.iter().zip(second);
+    let products: Vec<[f32; 4]> = all.map(|(a, b)| multiply(of(*a, signs[0]), of(*b, signs[1]))).collect();
+    let count = products.len();
+    Ok(products
+        .into_flattened()
+        .into_pyarray(py)
+        .reshape([count, 4])?
+        .into_any())
 }

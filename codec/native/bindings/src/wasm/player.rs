@@ -10,6 +10,7 @@ use gsv::group::Group;
 use gsv::header::Header;
 use gsv::levels::{LEVELS, Level};
 use gsv::parametric::Frame;
+use gsv::pose::Pose;
 use gsv::unit;
 use raster::{Background, Band, Bands, Projected, Rasterizer, Region, SimdLevel, Splats, Surface, View, band_ends};
 use std::fmt::Display;
@@ -23,7 +24,7 @@ const SLOTS: usize = 255;
 struct Slot {
     group: Evaluator,
     frame: Frame,
-    at: Option<u16>,
+    at: Option<(u16, Vec<f32>)>, // which frame it is, and its transform
 }
 
 pub struct Player {
@@ -150,7 +151,8 @@ impl Player {
             return false;
         };
         self.shown = slot;
-        if at.replace(t) == Some(t) {
+        let now = (t, numbers(&self.input));
+        if at.as_ref() == Some(&now) {
             return true;
         }
         group.frame(t, frame);
@@ -160,7 +162,17 @@ impl Player {
                 *logit = f32::NEG_INFINITY; // the projection leaves it out
             }
         }
+        if let Some(transform) = now.1.first_chunk() {
+            place(frame, *transform);
+        }
+        *at = Some(now);
         true
+    }
+
+    pub fn pose(&mut self, u: f64) {
+        let pose = self.demuxer.config().map_or(Pose::default(), |c| c.placement.pose(u));
+        let ([w, x, y, z], [a, b, c]) = (pose.rotation, pose.translation);
+        self.output = floats(&[w, x, y, z, a, b, c, pose.scale]);
     }
 
     pub fn bounds(&mut self) {
@@ -288,6 +300,20 @@ fn splats(slot: Option<&Option<Slot>>) -> Splats<'_> {
         sh0: &f.sh0,
         sh_n: &f.sh_n,
         sh_k,
+    }
+}
+
+/// Places a frame by a transform as of `Player::pose`.
+fn place(frame: &mut Frame, [w, x, y, z, a, b, c, scale]: [f32; 8]) {
+    if scale > 0.0 {
+        let pose = Pose {
+            rotation: [w, x, y, z],
+            translation: [a, b, c],
+            scale,
+        };
+        pose.apply(frame.as_mut());
+    } else {
+        frame.logit_opacities.fill(f32::NEG_INFINITY); // the projection leaves them out
     }
 }
 

@@ -9,7 +9,7 @@ use gsv::tile_bounds;
 use gsv::unit::{self, UnitType};
 use std::fmt::Write;
 
-/// {config, groups, pending, index, layers, complete}; config is null before moov, pending is null except after a moof.
+/// {config, tracks, groups, pending, index, layers, complete}; config is null before moov, pending is null except after a moof.
 pub fn describe(d: &Demuxer, first: usize) -> String {
     let groups = list(d.groups().iter().skip(first), entry);
     let index = list(d.index().iter(), entry);
@@ -17,7 +17,8 @@ pub fn describe(d: &Demuxer, first: usize) -> String {
     let pending = d.pending().map_or("null".into(), entry);
     let config = d.config().map_or("null".into(), config);
     format!(
-        r#"{{"config":{config},"groups":{groups},"pending":{pending},"index":{index},"layers":{layers},"complete":{}}}"#,
+        r#"{{"config":{config},"tracks":{},"groups":{groups},"pending":{pending},"index":{index},"layers":{layers},"complete":{}}}"#,
+        d.tracks(),
         d.complete()
     )
 }
@@ -71,9 +72,18 @@ pub fn index(h: &Header, directory: &[unit::Entry], start: usize) -> String {
 }
 
 fn config(c: &Config) -> String {
+    let p = &c.placement;
+    let placement = format!(
+        r#"{{"name":{},"hidden":{},"offset":{},"repeats":{},"keys":{}}}"#,
+        string(&p.name),
+        p.hidden,
+        p.offset,
+        p.repeats,
+        p.keys.len()
+    );
     let name = |names: &[&str], i: u8| string(names.get(usize::from(i)).copied().unwrap_or_default());
     format!(
-        r#"{{"fps":[{},{}],"level":{},"metres_per_unit":{},"up":{},"color_space":{},"background":{},"sh_degree":{},"sh_frame":{},"cameras":{},"audio":{}}}"#,
+        r#"{{"fps":[{},{}],"level":{},"metres_per_unit":{},"up":{},"color_space":{},"background":{},"sh_degree":{},"sh_frame":{},"cameras":{},"audio":{},"placement":{placement}}}"#,
         c.timescale,
         c.frame_duration,
         c.level,

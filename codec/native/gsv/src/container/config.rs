@@ -1,8 +1,10 @@
 //! gsvC (spec 2.3) and the frame rate: the configuration of the whole file.
 
 use super::audio::AudioTrack;
+use super::placement::Placement;
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader, Writer};
+use crate::levels::Level;
 
 /// Names of `up_axis` values.
 pub const UP_AXES: [&str; 6] = ["x", "y", "z", "-x", "-y", "-z"];
@@ -55,6 +57,10 @@ pub struct Config {
     pub cameras: Vec<Camera>,
     /// Not in gsvC: a track of its own (spec 2.7).
     pub audio: Option<AudioTrack>,
+    /// Which of the gsv tracks of the file this is. Not in gsvC.
+    pub track: usize,
+    /// gsvT.
+    pub placement: Placement,
 }
 
 impl Config {
@@ -81,6 +87,7 @@ impl Config {
         f.u8(&mut version)?;
         f.must(version == 4, || format!("configuration_version 4, found {version}"))?;
         f.u8(&mut self.level)?;
+        Level::get(self.level)?;
         f.u32(&mut self.frame_duration)?;
         f.must(self.frame_duration > 0, || "frame_duration > 0, found 0".into())?;
         f.step(&mut self.metres_per_unit, "metres_per_unit")?;
@@ -125,18 +132,7 @@ fn choice<F: Fields>(f: &mut F, v: &mut u8, count: usize, what: &str) -> Result<
 }
 
 fn camera<F: Fields>(f: &mut F, c: &mut Camera) -> Result<()> {
-    let mut name = std::mem::take(&mut c.name).into_bytes();
-    let mut length = name.len() as u8;
-    f.must(usize::from(length) == name.len(), || {
-        "camera names of at most 255 bytes".into()
-    })?;
-    f.u8(&mut length)?;
-    name.resize(usize::from(length), 0);
-    f.bytes(&mut name)?;
-    match String::from_utf8(name) {
-        Ok(name) => c.name = name,
-        Err(_) => return f.fail("camera names in UTF-8".into()),
-    }
+    f.text(&mut c.name, "camera names")?;
     f.u32(&mut c.width)?;
     f.u32(&mut c.height)?;
     f.must(c.width > 0 && c.height > 0, || "cameras of at least one pixel".into())?;

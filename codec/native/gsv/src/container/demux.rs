@@ -1,4 +1,4 @@
-//! Push parser of the container (spec 2): bytes in pieces of any size -> config and groups.
+//! Push parser of the container (spec 2): bytes in pieces of any size -> config and groups of one gsv track.
 //!
 //! No I/O inside, so it serves files, HTTP ranges and growing files alike. Media data is never copied: a caller that can
 //! seek asks `skippable` and omits those bytes. Waiting for more bytes is a state, not an error.
@@ -26,6 +26,8 @@ enum State {
 }
 
 pub struct Demuxer {
+    /// Which of the gsv tracks.
+    number: usize,
     state: State,
     buffer: Vec<u8>,
     position: u64,
@@ -37,11 +39,14 @@ pub struct Demuxer {
     end: Option<u64>,
     index: Vec<Entry>,
     layers: Vec<Vec<u64>>,
+    /// Whether the last sidx was that of the track, so that a ssix is, too.
+    indexed: bool,
 }
 
 impl Default for Demuxer {
     fn default() -> Self {
         Demuxer {
+            number: 0,
             state: State::Head,
             buffer: Vec::new(),
             position: 0,
@@ -52,11 +57,25 @@ impl Default for Demuxer {
             end: None,
             index: Vec::new(),
             layers: Vec::new(),
+            indexed: false,
         }
     }
 }
 
 impl Demuxer {
+    /// For the gsv track `number`, from 0 on; by default it is the first one.
+    pub fn of_track(number: usize) -> Demuxer {
+        Demuxer {
+            number,
+            ..Demuxer::default()
+        }
+    }
+
+    /// How many gsv tracks the file has; 0 before moov.
+    pub fn tracks(&self) -> usize {
+        self.track.as_ref().map_or(0, |t| t.of)
+    }
+
     /// None before moov.
     pub fn config(&self) -> Option<&Config> {
         self.track.as_ref().map(|t| &t.config)
@@ -131,6 +150,13 @@ impl Demuxer {
         self.groups.truncate(i);
     }
 
+    /// Drops what claims to be a group of the track, but lies among the fragments of others.
+    pub fn drop_strays(&mut self) {
+        if let (Some(first), Some(end), 2..) = (self.index.first(), self.end, self.tracks()) {
+            self.groups.retain(|g| (first.offset..end).contains(&g.offset));
+        }
+    }
+
     /// Continues at the fragment that starts at `position`, the offset of the next byte to `push`.
     pub fn seek(&mut self, position: u64) {
         self.state = State::Head;
@@ -198,7 +224,7 @@ impl Demuxer {
         if std::mem::take(&mut self.first) && &kind != b"ftyp" {
             return Err(Error::bitstream(
                 start as usize,
-                "",
+                "file",
                 "a .gsv file, which starts with an ftyp box",
             ));
         }
@@ -251,13 +277,14 @@ impl Demuxer {
             b"ftyp" => isobmff::ftyp(body),
             b"moov" if self.track.is_some() => Err(Error::bitstream(0, "", "one moov box")),
             b"moov" => {
-                self.track = Some(isobmff::moov(body)?);
+                self.track = Some(isobmff::moov(body, self.number)?);
                 Ok(())
             }
             b"sidx" => {
-                self.announced(body);
+                self.indexed = self.announced(body);
                 Ok(())
             }
+            b"ssix" if !self.indexed => Ok(()),
             b"ssix" => {
                 let told = isobmff::ssix(body).filter(|l| l.len() == self.index.len());
                 self.layers = told.unwrap_or_default();
@@ -267,10 +294,11 @@ impl Demuxer {
         }
     }
 
-    /// Stores the groups of sidx (spec 2.5).
-    fn announced(&mut self, sidx: &[u8]) {
-        let (Some((first, references)), Some(track)) = (isobmff::sidx(sidx), &self.track) else {
-            return;
+    /// Stores the groups of sidx (spec 2.5), if it is that of the track.
+    fn announced(&mut self, sidx: &[u8]) -> bool {
+        let Some(track) = &self.track else { return false };
+        let Some((first, references)) = isobmff::sidx(sidx, track.id) else {
+            return false;
         };
         let frame = u64::from(track.config.frame_duration);
         let (mut offset, mut time) = (self.position.saturating_add(first), 0u64);
@@ -288,6 +316,7 @@ impl Demuxer {
             time += u64::from(duration);
         }
         self.end = Some(offset);
+        true
     }
 
     fn fragment(&mut self, start: u64, body: &[u8]) -> Result<()> {

@@ -4,14 +4,20 @@
 use super::audio::{AudioRun, AudioTrack, ENTRY_MAX, SAMPLES_MAX};
 use super::config::Config;
 use super::entry::{Entry, name};
+use super::placement::Placement;
 use super::write::BRAND;
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader};
 
-/// The gsv track, as moov describes it.
+/// Most gsv tracks of a file.
+const TRACKS_MAX: usize = 64;
+
+/// A gsv track, as moov describes it.
 pub struct Track {
-    id: u32,
+    pub id: u32,
     pub config: Config,
+    /// How many gsv tracks the file has.
+    pub of: usize,
     defaults: Defaults,
     audio: Option<Audio>,
 }
@@ -91,17 +97,36 @@ pub fn ftyp(body: &[u8]) -> Result<()> {
     }
 }
 
-/// Parses the body of moov: the first track with handler volv, and the audio track.
-pub fn moov(body: &[u8]) -> Result<Track> {
-    let Some(b) = tracks(body, b"volv")?.into_iter().next() else {
-        return Err(Error::bitstream(0, "", "a track with handler volv, found none"));
+/// Parses the body of moov: the track `number` of those with handler volv, and for the first one the audio track.
+pub fn moov(body: &[u8], number: usize) -> Result<Track> {
+    let all = tracks(body, b"volv")?;
+    if all.len() > TRACKS_MAX {
+        let told = format!("{} tracks, at most {TRACKS_MAX} are allowed", all.len());
+        return Err(Error::limit("moov box", told));
+    }
+    let Some(b) = all.get(number) else {
+        let told = match number {
+            0 => "a track with handler volv, found none".into(),
+            _ => format!("a track {number} with handler volv, found {}", all.len()),
+        };
+        return Err(Error::bitstream(0, "", told));
     };
     let (id, mut config) = track(b.body).map_err(|e| e.at(b.offset, "gsv track"))?;
-    let audio = audio_track(body)?;
+    let mut others = all.iter().filter(|other| other.offset != b.offset);
+    if others.any(|other| after_times(other.body, &[b"tkhd"]).is_ok_and(|own| own == id)) {
+        return Err(Error::bitstream(
+            b.offset,
+            "tkhd box",
+            "a track_ID that no other track has",
+        ));
+    }
+    let audio = if number == 0 { audio_track(body)? } else { None };
     config.audio = audio.as_ref().map(|a| a.description.clone());
+    config.track = number;
     Ok(Track {
         id,
         config,
+        of: all.len(),
         defaults: extends(body, id)?,
         audio,
     })
@@ -158,8 +183,8 @@ fn audio(body: &[u8]) -> Result<Option<(u32, AudioTrack)>> {
     if timescale == 0 {
         return Err(Error::bitstream(base, "", "a timescale > 0"));
     }
-    let media_start = match find(body, &[b"edts", b"elst"]) {
-        Ok((elst, base)) => edit(&mut Reader::new(elst)).map_err(|e| e.at(base, "elst box"))?,
+    let media_start = match find(body, &[b"edts"]) {
+        Ok((edts, base)) => edits(edts).map_err(|e| e.at(base, "edts box"))?,
         Err(_) => 0,
     };
     let entry = entries[entry.offset - 8..entry.offset + entry.body.len()].to_vec();
@@ -172,6 +197,15 @@ fn audio(body: &[u8]) -> Result<Option<(u32, AudioTrack)>> {
             entry,
         },
     )))
+}
+
+/// edts: media_time of the only edit, 0 without elst.
+fn edits(edts: &[u8]) -> Result<u32> {
+    let inner = boxes(edts)?;
+    let elst = inner.iter().find(|b| &b.kind == b"elst");
+    elst.map_or(Ok(0), |b| {
+        edit(&mut Reader::new(b.body)).map_err(|e| e.at(b.offset, "elst box"))
+    })
 }
 
 /// elst: media_time of the only edit.
@@ -205,8 +239,12 @@ fn track(body: &[u8]) -> Result<(u32, Config)> {
         return Err(Error::bitstream(base, "", "a sample entry gsv1, found none"));
     };
     let base = base + 8 + entry.offset + 40; // SampleEntry and compressor_name
-    let (config, at) = find(entry.body.get(40..).unwrap_or(&[]), &[b"gsvC"]).map_err(|e| e.at(base, ""))?;
-    let config = Config::read(config, timescale).map_err(|e| e.at(base + at, "gsvC box"))?;
+    let inside = entry.body.get(40..).unwrap_or(&[]);
+    let (config, at) = find(inside, &[b"gsvC"]).map_err(|e| e.at(base, ""))?;
+    let mut config = Config::read(config, timescale).map_err(|e| e.at(base + at, "gsvC box"))?;
+    if let Ok((placement, at)) = find(inside, &[b"gsvT"]) {
+        config.placement = Placement::read(placement).map_err(|e| e.at(base + at, "gsvT box"))?;
+    }
     if timescale == 0 {
         return Err(Error::bitstream(base, "", "a timescale > 0"));
     }
@@ -259,8 +297,11 @@ fn extends(moov: &[u8], id: u32) -> Result<Defaults> {
 /// An entry of sidx: bytes, duration in units of the timescale, and whether it starts with a sync sample.
 pub type SidxReference = (u32, u32, bool);
 
-/// Spec 2.5: first_offset and the entries of sidx; None if it is malformed.
-pub fn sidx(body: &[u8]) -> Option<(u64, Vec<SidxReference>)> {
+/// Spec 2.5: first_offset and the entries of the sidx of track `id`; None if it is malformed, or that of another track.
+pub fn sidx(body: &[u8], id: u32) -> Option<(u64, Vec<SidxReference>)> {
+    if body.get(4..8)? != id.to_be_bytes() {
+        return None;
+    }
     let head = if body.first()? == &0 { 20 } else { 28 };
     let first_offset = match head {
         20 => u64::from(u32::from_be_bytes(body.get(16..20)?.try_into().ok()?)),
@@ -339,7 +380,7 @@ fn audio_traf(body: &[u8], audio: &Audio, start: u64) -> Result<Option<AudioRun>
         return Ok(None);
     };
     let time = decode_time(body)?;
-    let (trun, base) = find(body, &[b"trun"])?;
+    let (trun, base) = only_trun(body)?;
     let (offset, samples) = audio_run(&mut Reader::new(trun), defaults).map_err(|e| e.at(base, ""))?;
     let Some(offset) = data.checked_add_signed(i64::from(offset)) else {
         return Err(Error::bitstream(base, "", "a data offset within the file"));
@@ -389,7 +430,7 @@ fn traf(body: &[u8], track: &Track, start: u64) -> Result<Option<Entry>> {
         return Ok(None);
     };
     let time = decode_time(body)?;
-    let (trun, base) = find(body, &[b"trun"])?;
+    let (trun, base) = only_trun(body)?;
     let (offset, sample) = run(&mut Reader::new(trun), defaults).map_err(|e| e.at(base, ""))?;
     let fail = |expected: &str| Err(Error::bitstream(base, "", expected));
     let Some(offset) = data.checked_add_signed(i64::from(offset)) else {
@@ -451,6 +492,20 @@ fn decode_time(traf: &[u8]) -> Result<u64> {
     };
     read().map_err(|e| e.at(base, ""))?;
     Ok(long.max(u64::from(short)))
+}
+
+/// The body of the trun of a traf and its offset; a second trun is an error (spec 2.4).
+#[inline(never)]
+fn only_trun(traf: &[u8]) -> Result<(&[u8], usize)> {
+    let second = boxes(traf)?.into_iter().filter(|b| &b.kind == b"trun").nth(1);
+    match second {
+        Some(b) => Err(Error::bitstream(
+            b.offset,
+            "",
+            "one trun of a track, found a second one",
+        )),
+        None => find(traf, &[b"trun"]),
+    }
 }
 
 /// trun: data offset and the only sample.

@@ -1,4 +1,4 @@
-//! A whole file in memory -> its groups. Wraps the demuxer, and recovers the groups behind damaged boxes.
+//! A whole file in memory -> the groups of a track. Wraps the demuxer, and recovers the groups behind damaged boxes.
 //!
 //! Damaged boxes of a fragment end the walk from box to box. With an index (spec 2.5) that agrees with the groups so far,
 //! the walk continues at the next fragment.
@@ -14,26 +14,26 @@ const LOST_MAX: usize = 64;
 /// Bytes pushed to the demuxer at a time between skipped boxes.
 const LOOK: usize = 4096;
 
-/// Reads the headers of a file. Strict: damage is an error. Otherwise groups that only the index has are listed with the
+/// Reads the headers of a file, for the gsv track `track`. Strict: damage is an error. Otherwise groups that only the index has are listed with the
 /// bytes of their fragment, and the errors are returned with the number of the group.
 ///
 /// # Errors
 /// There is no moov; boxes are damaged and no index helps.
-pub fn read(data: &[u8], strict: bool) -> Result<(Demuxer, Vec<(usize, Error)>)> {
-    let mut demuxer = Demuxer::default();
+pub fn read(data: &[u8], strict: bool, track: usize) -> Result<(Demuxer, Vec<(usize, Error)>)> {
+    let mut demuxer = Demuxer::of_track(track);
     let (mut at, mut tried, mut damage) = (0, None, Vec::new());
     loop {
         let walked = walk(&mut demuxer, data, at);
+        if !strict {
+            demuxer.drop_strays();
+        }
         if demuxer.config().is_none() {
-            walked?;
-            return Err(Error::bitstream(
-                data.len(),
-                "file",
-                "a moov box, found the end of the data",
-            ));
+            return Err(walked.err().unwrap_or_else(|| no_moov(data)));
         }
         let short = walked.is_err() || demuxer.groups().len() < demuxer.index().len();
+        let whole = !demuxer.index().is_empty() && demuxer.groups().len() >= demuxer.index().len();
         match (walked, missing(&demuxer, data.len()).filter(|_| short && !strict)) {
+            (Err(_), None) if whole && !strict => return Ok((demuxer, damage)), // it is behind the groups, of another track
             (walked, None) => return walked.map(|()| (demuxer, damage)),
             (walked, Some(_)) if damage.len() >= LOST_MAX => return walked.map(|()| (demuxer, damage)),
             (walked, Some((next, _))) if tried == Some(next) => {
@@ -67,18 +67,44 @@ fn missing(demuxer: &Demuxer, size: usize) -> Option<(usize, Entry)> {
 
 fn walk(demuxer: &mut Demuxer, data: &[u8], mut at: usize) -> Result<()> {
     while at < data.len() {
-        let left = data.len() - at;
-        let skip = usize::try_from(demuxer.skippable()).unwrap_or(usize::MAX).min(left);
-        if skip > 0 {
-            demuxer.skip(skip as u64);
-            at += skip;
-        } else {
-            let to = at + left.min(LOOK);
-            demuxer.push(&data[at..to])?;
-            at = to;
-        }
+        at = step(demuxer, data, at)?;
     }
     Ok(())
+}
+
+/// Pushes or skips the next bytes of `data`; returns where they end.
+fn step(demuxer: &mut Demuxer, data: &[u8], at: usize) -> Result<usize> {
+    let left = data.len() - at;
+    let skip = usize::try_from(demuxer.skippable()).unwrap_or(usize::MAX).min(left);
+    if skip > 0 {
+        demuxer.skip(skip as u64);
+        return Ok(at + skip);
+    }
+    let to = at + left.min(LOOK);
+    demuxer.push(&data[at..to])?;
+    Ok(to)
+}
+
+/// How many gsv tracks a file has; only moov is read.
+///
+/// # Errors
+/// There is no moov, or it breaks a rule.
+pub fn tracks(data: &[u8]) -> Result<usize> {
+    let (mut demuxer, mut at) = (Demuxer::default(), 0);
+    while demuxer.tracks() == 0 && at < data.len() {
+        at = match step(&mut demuxer, data, at) {
+            Err(e) if demuxer.tracks() == 0 => return Err(e),
+            walked => walked.unwrap_or(data.len()),
+        };
+    }
+    match demuxer.tracks() {
+        0 => Err(no_moov(data)),
+        count => Ok(count),
+    }
+}
+
+fn no_moov(data: &[u8]) -> Error {
+    Error::bitstream(data.len(), "file", "a moov box, found the end of the data")
 }
 
 /// A fragmented MP4 of sound alone, as a multiplexer leaves it -> its first track of mp4a or Opus, and its samples.

@@ -2,6 +2,7 @@
 
 use super::audio::{AudioTrack, SAMPLES_MAX};
 use super::config::Config;
+use super::placement::Placement;
 use crate::error::{Error, Result};
 
 pub const TRACK_ID: u32 = 1;
@@ -56,38 +57,58 @@ fn words(v: &[u32]) -> Vec<u8> {
     v.iter().flat_map(|w| w.to_be_bytes()).collect()
 }
 
-/// ftyp and moov, which start every file.
-pub fn init_segment(config: &Config) -> Result<Vec<u8>> {
+/// track_ID of a gsv track; AUDIO_ID is left out.
+fn track_id(number: usize) -> u32 {
+    match number {
+        0 => TRACK_ID,
+        _ => AUDIO_ID + number as u32,
+    }
+}
+
+/// ftyp and moov, which start every file: of one track, or of several. The sound is that of the first one.
+pub fn init_segment(configs: &[Config]) -> Result<Vec<u8>> {
+    let Some(first) = configs.first() else {
+        return Err(Error::Input("expected at least one track".into()));
+    };
     let mut out = boxed(b"ftyp", &[BRAND, &[0; 4], BRAND, b"iso6", b"cmfc"]);
-    let tracks = if config.audio.is_some() { AUDIO_ID } else { TRACK_ID };
+    let sound = first.audio.as_ref().map(|_| AUDIO_ID);
+    let others = (1..configs.len()).map(track_id);
+    let ids: Vec<u32> = [TRACK_ID].into_iter().chain(sound).chain(others).collect();
     let mvhd = [
-        words(&[0, 0, config.timescale, 0, 1 << 16]),
+        words(&[0, 0, first.timescale, 0, 1 << 16]),
         vec![1, 0],
         vec![0; 10],
         words(&UNITY),
         vec![0; 24],
-        words(&[tracks + 1]),
+        words(&[ids.last().map_or(0, |id| id + 1)]),
     ];
     let mvhd = full(b"mvhd", 0, 0, &[&mvhd.concat()]);
-    let trex: Vec<u8> = (1..=tracks)
-        .flat_map(|id| full(b"trex", 0, 0, &[&words(&[id, 1, 0, 0, 0])]))
+    let trex: Vec<u8> = ids
+        .iter()
+        .flat_map(|id| full(b"trex", 0, 0, &[&words(&[*id, 1, 0, 0, 0])]))
         .collect();
-    let audio = config.audio.as_ref().map_or(Vec::new(), audio_track);
-    out.extend(boxed(
-        b"moov",
-        &[&mvhd, &track(config)?, &audio, &boxed(b"mvex", &[&trex])],
-    ));
+    let mut traks = Vec::new();
+    for (number, config) in configs.iter().enumerate() {
+        traks.extend(track(config, track_id(number))?);
+        if number == 0 {
+            traks.extend(config.audio.as_ref().map_or(Vec::new(), audio_track));
+        }
+    }
+    out.extend(boxed(b"moov", &[&mvhd, &traks, &boxed(b"mvex", &[&trex])]));
     Ok(out)
 }
 
-fn track(config: &Config) -> Result<Vec<u8>> {
+fn track(config: &Config, id: u32) -> Result<Vec<u8>> {
     let mut name = [0u8; 32];
     name[..4].copy_from_slice(&[3, b'g', b's', b'v']);
-    let entry = boxed(
-        BRAND,
-        &[&[0, 0, 0, 0, 0, 0, 0, 1], &name, &boxed(b"gsvC", &[&config.write()?])],
-    );
-    let head = [tkhd(TRACK_ID, 0)];
+    let placed = config.placement != Placement::default();
+    let placement = match placed {
+        true => boxed(b"gsvT", &[&config.placement.write()?]),
+        false => Vec::new(),
+    };
+    let config_box = boxed(b"gsvC", &[&config.write()?]);
+    let entry = boxed(BRAND, &[&[0, 0, 0, 0, 0, 0, 0, 1], &name, &config_box, &placement]);
+    let head = [tkhd(id, 0)];
     let media = full(b"vvhd", 0, 0, &[]);
     Ok(trak(&head, config.timescale, (b"volv", b"gsv\0"), &media, &entry))
 }
@@ -161,7 +182,7 @@ pub fn fragment(
     let moof = |offset: u32| {
         let own = [1, offset + data.len() as u32, duration, payload.len() as u32, flags];
         let mut parts = full(b"mfhd", 0, 0, &[&words(&[sequence_number])]);
-        parts.extend(traf(TRACK_ID, start, 0x00_0701, &words(&own)));
+        parts.extend(traf(track_id(config.track), start, 0x00_0701, &words(&own)));
         if let Some(s) = sound {
             let each = s.samples.iter().flat_map(|(size, duration)| [*duration, *size]);
             let run: Vec<u32> = [s.samples.len() as u32, offset].into_iter().chain(each).collect();
@@ -196,9 +217,21 @@ fn check(sound: &Sound) -> Result<()> {
     )))
 }
 
-/// What precedes the fragments in a finished file: the init segment, a sidx (spec 2.5), and where a group has more than one
-/// layer a ssix (spec 2.6).
-pub fn finish(init: &[u8], config: &Config, groups: &[Reference]) -> Result<Vec<u8>> {
+/// What precedes the fragments in a finished file: the init segment, and for each track a sidx (spec 2.5), with a ssix (spec
+/// 2.6) where a group has more than one layer. The fragments of the tracks follow one behind the other.
+pub fn finish(init: &[u8], tracks: &[(&Config, Vec<Reference>)]) -> Result<Vec<u8>> {
+    let mut out = Vec::new(); // from the last index on, that of the first track
+    let mut fragments = 0; // bytes, of the tracks before
+    for (number, (config, groups)) in tracks.iter().enumerate() {
+        let own = index(track_id(number), config, groups, out.len() as u64 + fragments)?;
+        fragments += groups.iter().map(|g| g.size).sum::<u64>();
+        out = [own, out].concat();
+    }
+    Ok([init, &out].concat())
+}
+
+/// sidx and ssix of a track; `before`: bytes between them and its first fragment.
+fn index(id: u32, config: &Config, groups: &[Reference], before: u64) -> Result<Vec<u8>> {
     let per = groups.len().div_ceil(usize::from(u16::MAX)).max(1); // groups per reference
     let mut references = Vec::new();
     for run in groups.chunks(per) {
@@ -220,14 +253,14 @@ pub fn finish(init: &[u8], config: &Config, groups: &[Reference]) -> Result<Vec<
     let ssix = if layered { layer_index(groups) } else { Vec::new() };
     let count = (references.len() / 12) as u16;
     let head = [
-        words(&[TRACK_ID, config.timescale]),
+        words(&[id, config.timescale]),
         vec![0; 8], // earliest presentation time
-        (ssix.len() as u64).to_be_bytes().to_vec(),
+        (ssix.len() as u64 + before).to_be_bytes().to_vec(),
         vec![0; 2],
         count.to_be_bytes().to_vec(),
     ]
     .concat();
-    Ok([init, &full(b"sidx", 1, 0, &[&head, &references]), &ssix].concat())
+    Ok([full(b"sidx", 1, 0, &[&head, &references]), ssix].concat())
 }
 
 /// ssix (spec 2.6).

@@ -12,7 +12,8 @@ use crate::scene::{Gradients, Splats};
 use crate::tile_passes::backward_tiles;
 
 impl Rasterizer {
-    /// Gradients of the last image rendered with `training`. `grad_image` [H, W, 3] and `grad_alpha` [H, W] of the region.
+    /// Gradients of the last image rendered with `training`. `grad_image` [H, W, 3] and `grad_alpha` [H, W] of the region;
+    /// `grad_depth` likewise where depth was rendered, or empty.
     ///
     /// # Errors
     /// Wrong lengths; no forward pass with `training` before.
@@ -21,10 +22,11 @@ impl Rasterizer {
         splats: &Splats,
         grad_image: &[f32],
         grad_alpha: &[f32],
+        grad_depth: &[f32],
         out: &mut Gradients,
     ) -> Result<(), RasterError> {
         splats.check()?;
-        self.run(|s| s.backward_here(splats, grad_image, grad_alpha, out))
+        self.run(|s| s.backward_here(splats, grad_image, grad_alpha, grad_depth, out))
     }
 
     pub(crate) fn backward_here(
@@ -32,6 +34,7 @@ impl Rasterizer {
         splats: &Splats,
         grad_image: &[f32],
         grad_alpha: &[f32],
+        grad_depth: &[f32],
         out: &mut Gradients,
     ) -> Result<(), RasterError> {
         out.check(splats)?;
@@ -45,11 +48,16 @@ impl Rasterizer {
         )?;
         check_length("gradient of the image", grad_image.len(), 3 * region.pixels())?;
         check_length("gradient of alpha", grad_alpha.len(), region.pixels())?;
+        if !grad_depth.is_empty() {
+            check_length("gradient of depth", grad_depth.len(), self.depth.len())?;
+        }
         let start = Clock::start();
         self.sums.resize(self.bins.pairs.len(), Sums::ZERO);
         let pixels = Pixels {
             image: &self.image,
             alpha: &self.alpha,
+            depth: &self.depth,
+            grad_depth,
             grad_image,
             grad_alpha,
             width: region.width,

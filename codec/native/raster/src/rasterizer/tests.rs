@@ -40,7 +40,7 @@ fn draw_at(level: SimdLevel, n: usize, log_scale: f32, size: usize, training: bo
         region,
     };
     let mut r = Rasterizer::new(level, 0);
-    r.forward(&splats, &view, Background::new([0.1, 0.2, 0.3]), training)
+    r.forward(&splats, &view, Background::new([0.1, 0.2, 0.3]), training, training)
         .unwrap();
     let mut grads = [3, 4, 3, 1, 3, 0, 1, 1, 1].map(|d| vec![0.0; d * n]);
     if training {
@@ -68,7 +68,8 @@ fn draw_at(level: SimdLevel, n: usize, log_scale: f32, size: usize, training: bo
             sum_weight,
         };
         let slope: Vec<f32> = (0..3 * size * size).map(|i| (0.1 * i as f32).sin()).collect();
-        r.backward(&splats, &slope, &slope[..size * size], &mut out).unwrap();
+        let (grad_alpha, grad_depth) = (&slope[..size * size], &slope[size * size..2 * size * size]);
+        r.backward(&splats, &slope, grad_alpha, grad_depth, &mut out).unwrap();
     }
     let [means, ..] = grads;
     (r, means)
@@ -83,6 +84,8 @@ fn every_level_draws_and_differentiates_like_scalar() {
         let (got, other) = draw_at(level, 300, -3.0, 90, true);
         let image = got.image.iter().zip(&want.image);
         assert!(image.clone().all(|(a, b)| (a - b).abs() < 1e-4), "{}", level.name());
+        let depth = got.depth.iter().zip(&want.depth);
+        assert!(depth.clone().all(|(a, b)| (a - b).abs() < 4e-4), "{}", level.name());
         let near = other.iter().zip(&slopes).all(|(a, b)| (a - b).abs() < 1e-3 * largest);
         assert!(near, "{}", level.name());
     }

@@ -1,0 +1,93 @@
+"""Clause 2.8 of gsv.md for the reference decoder: a file with tracks -> the Gaussians that a frame of the scene shows.
+
+In float64. Spherical harmonics are rotated by what defines it: the coefficients of f(R^-1 d), found from the values of
+f at many directions.
+"""
+
+from fractions import Fraction
+
+import numpy as np
+from reference_decoder import decode, evaluate, quaternion_product, rotate
+
+
+def sh_basis(d):
+    """Clause 14: Y_1 .. Y_15 of unit directions [M, 3] -> [M, 15]."""
+    x, y, z = d.T
+    terms = (
+        -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
+        1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * z * z - x * x - y * y),
+        -1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y),
+        -0.5900435899266435 * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -0.4570457994644658 * x * (4 * z * z - x * x - y * y), 1.445305721320277 * z * (x * x - y * y),
+        -0.5900435899266435 * x * (x * x - 3 * y * y),
+    )  # fmt: skip
+    return np.stack(terms, -1)
+
+
+def pose(placement, u):
+    """The transform at time `u`: rotation (wxyz), translation, scale."""
+    keys = placement.keys
+    if not keys:
+        return np.array([1.0, 0, 0, 0]), np.zeros(3), 1.0
+    before = [key for key in keys if key[0] <= u]
+    after = [key for key in keys if key[0] > u]
+    if not before or not after:
+        return (before[-1] if before else after[0])[1:]
+    (a, p, from_t, from_s), (b, q, to_t, to_s) = before[-1], after[0]
+    f = float(Fraction(u - a) / (b - a))
+    d = p @ q
+    q, d = (-q, -d) if d < 0 else (q, d)
+    if d > 0.9995:
+        turned = p + f * (q - p)
+    else:
+        h = np.arccos(d)
+        turned = (np.sin((1 - f) * h) * p + np.sin(f * h) * q) / np.sin(h)
+    return turned / np.linalg.norm(turned), from_t + f * (to_t - from_t), from_s + f * (to_s - from_s)
+
+
+def place(frame, rotation, translation, scale):
+    """The attributes of a frame (clause 13) with the transform."""
+    rng = np.random.default_rng(0)
+    directions = rng.standard_normal((100, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    count = frame["shN"].shape[1]
+    back = rotate(rotation * [1, -1, -1, -1], directions)
+    values = np.einsum("mk,nkc->nmc", sh_basis(back)[:, :count], frame["shN"])
+    turned = np.einsum("km,nmc->nkc", np.linalg.pinv(sh_basis(directions)[:, :count]), values)
+    return frame | {
+        "means": scale * rotate(rotation, frame["means"]) + translation,
+        "quats": quaternion_product(np.broadcast_to(rotation, frame["quats"].shape), frame["quats"]),
+        "log_scales": frame["log_scales"] + np.log(scale),
+        "shN": turned,
+    }
+
+
+def shown_frame(config, frames, u):
+    """The frame of a track of `frames` frames at time `u`; None: it shows nothing."""
+    p = config.placement
+    n = (u - p.offset) // config.frame_duration
+    if p.hidden or n < 0 or frames == 0 or (p.repeats and n >= p.repeats * frames):
+        return None
+    return int(n % frames)
+
+
+def scene_frame(data, index):
+    """Frame `index` of the scene: the attributes of all Gaussians that are shown, track behind track."""
+    first, _ = decode(data)
+    parts = []
+    for k in range(first.tracks):
+        config, groups = decode(data, k)
+        u = Fraction(index * first.frame_duration * config.timescale, first.timescale)
+        t = shown_frame(config, sum(sample.frames for sample, _ in groups), u)
+        for sample, group in groups:
+            if t is not None and 0 <= t < sample.frames:
+                frame = place(evaluate(group, t), *pose(config.placement, u))
+                shown = frame.pop("shown")
+                parts.append({name: values[shown] for name, values in frame.items()})
+            t = None if t is None else t - sample.frames
+    most = max((part["shN"].shape[1] for part in parts), default=0)
+    for part in parts:
+        part["shN"] = np.pad(part["shN"], ((0, 0), (0, most - part["shN"].shape[1]), (0, 0)))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
