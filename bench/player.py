@@ -92,7 +92,7 @@ DECODE = """async ([limit]) => {
             const payload = file.slice(g.offset, g.offset + g.size);
             const start = performance.now();
             const back = native.reference(payload);
-            native.decode(i, payload, config.level, back ? i - back : undefined);
+            native.decode(i, payload, config.level, back ? { reference: i - back } : {});
             const decoded = performance.now();
             for (let t = 0; t < g.frames; t++) native.frame(i, t);
             decode += decoded - start;

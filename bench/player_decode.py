@@ -6,6 +6,8 @@ Streams are those of bench.player, made where they are missing. The page decodes
 and shared in turn, from bytes that it has. A time is from the request to when every worker has its tiles ready to be
 drawn: it includes what they do twice, messages, and the wait for the slowest one. Then frames are drawn: a time is that
 of the slowest worker that projects. Medians, which other work on the machine moves; the ratios are of one run.
+The ratio of shares is of one instance that decodes all of the group and then what each of two workers does: what two
+idle cores could gain, less messages.
 """
 
 from __future__ import annotations
@@ -62,6 +64,28 @@ TIMES = """async ([runs, drawn]) => {
 }"""
 
 
+# decodes group 0 in one instance: all of it, and the share of each of two workers, in turn; least ms of each
+SHARES = """async (runs) => {
+    const { Native, load } = await import("/native.js");
+    const { share } = await import("/tiles.js");
+    const native = await Native.create(await load(new URL("/native.wasm.gz", location.href)));
+    const file = new Uint8Array(await (await fetch("/stream.gsv")).arrayBuffer());
+    native.push(file);
+    const { config, groups } = native.describe();
+    const payload = file.slice(groups[0].offset, groups[0].offset + groups[0].size);
+    const index = native.index(payload);
+    const times = [null, share(index, 0, 2), share(index, 1, 2)].map((wanted) => ({ wanted, ms: Infinity }));
+    for (let run = 0; run < runs; run++) {
+        for (const own of times) {
+            const start = performance.now();
+            native.decode(0, payload, config.level, { wanted: own.wanted, keepLeading: false });
+            own.ms = Math.min(own.ms, performance.now() - start);
+        }
+    }
+    return times.map(({ ms }) => ms);
+}"""
+
+
 def measure(browsers: Browsers, path: Path) -> dict:
     """The figures of one stream."""
     stream = open_stream(path)
@@ -71,6 +95,8 @@ def measure(browsers: Browsers, path: Path) -> dict:
     browser.goto(f"{server.url}?size={SIZE}&autoplay=off")
     browser.wait(f"{PLAYER}.camera && {PLAYER}.stats.gaussians > 0")
     found = browser.page.evaluate(TIMES, [RUNS, DRAWN])
+    browser.goto(server.url + "?src=none.gsv")
+    whole, *shares = browser.page.evaluate(SHARES, RUNS)
     server.shutdown()
     all_, frames = str(found["all"]), stream.groups[0]["frames"]
     entry = {"frames": frames, "gaussians": stream.group(0).count, "tiles": sum(map(len, stream.group(0).tiles()))}
@@ -79,7 +105,7 @@ def measure(browsers: Browsers, path: Path) -> dict:
         one, shared = (statistics.median(found[what][n]) for n in ("1", all_))
         entry |= {f"{what}_ms_alone": round(one / per, 2), f"{what}_ms_shared": round(shared / per, 2)}
         entry[f"{what}_ratio"] = round(one / shared, 2)
-    return entry
+    return entry | {"decode_ratio_of_shares": round(whole / max(shares), 2)}
 
 
 def entries(folder: Path, names: list[str]) -> Iterator[dict]:

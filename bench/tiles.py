@@ -93,19 +93,23 @@ def copies(q: QuantizedGroup) -> QuantizedGroup:
     )
 
 
-def planes_of_view(group, share: float) -> np.ndarray:
-    """[5, 4] planes (inside: n x + d >= 0) of a pinhole camera above the copies that looks down on about `share` of the
-    Gaussians."""
+def lens_of_view(group, share: float) -> tuple[np.ndarray, float]:
+    """Eye [3] of a pinhole camera above the copies that looks down (-y) on about `share` of the Gaussians, and the
+    tangent of half its angle."""
     means = group.frame(0)["means"]
     low, high = means.min(0), means.max(0)
     eye = (low + high) / 2 + np.array([0.11, 0, 0.07]) * (high - low)
     eye[1] = high[1] + (high - low).max()
     for slope in np.geomspace(2, 0.01, 200):
-        normals = np.array([[1, -slope, 0], [-1, -slope, 0], [0, -slope, 1], [0, -slope, -1], [0, -1, 0]])
-        planes = np.column_stack([normals, -normals @ eye])
-        if _inside(means[::50], planes).mean() <= share:
+        if _inside(means[::50], planes_of_view(eye, slope)).mean() <= share:
             break
-    return planes
+    return eye, float(slope)
+
+
+def planes_of_view(eye: np.ndarray, slope: float) -> np.ndarray:
+    """[5, 4] planes (inside: n x + d >= 0) of the camera of `lens_of_view`."""
+    normals = np.array([[1, -slope, 0], [-1, -slope, 0], [0, -slope, 1], [0, -slope, -1], [0, -1, 0]])
+    return np.column_stack([normals, -normals @ eye])
 
 
 def _inside(points: np.ndarray, planes: np.ndarray) -> np.ndarray:
@@ -123,7 +127,7 @@ def view(q: QuantizedGroup) -> dict:
     """Bytes and time of a view of a tenth of the copies, beside all of them."""
     payload, _ = _native.encode_group(copies(q))
     whole = _native.DecodedGroup(payload, LEVEL)
-    planes = planes_of_view(whole, 0.1)
+    planes = planes_of_view(*lens_of_view(whole, 0.1))
     wanted = [[touched(tile, planes) for tile in own] for own in whole.tiles()]
     fetched = bytearray(len(payload))
     total = 0

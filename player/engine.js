@@ -4,20 +4,22 @@
 //                                                                 \--visible Gaussians--> GPU, on a canvas above
 //                                                                 \--an answer--> `ask`, for scenes of other programs
 //
-// A group of many tiles is shared by the workers of a set: each decodes and keeps its tiles alone, and nothing is copied.
+// A group of many tiles is shared by the workers of a set: each decodes and keeps its tiles alone, and nothing is copied. Of a
+// large group only the tiles in view are fetched and decoded, and others when the view comes to them (parts.js).
 
 import { AdaptiveSource } from "./abr.js";
 import { ALL, AUTO, Native, load } from "./native.js";
 import { LayerChoice } from "./layers.js";
 import { Renderer } from "./renderer.js";
 import { Source } from "./source.js";
-import { Scene, placed } from "./tracks.js";
-import { joined, order, share, sharing } from "./tiles.js";
+import { Whole, joined, order, sharing } from "./tiles.js";
+import { Scene, placed, unplaced } from "./tracks.js";
 
 const AHEAD = 10; // seconds of payloads to fetch ahead
 const SETS = 2; // of group workers
 const SHARES_MAX = 4; // workers of a set; the others start when a group has tiles for them
 const RASTER_WORKERS_MAX = 8;
+const PIECES_MAX = 100; // of a group in a worker, see SLOTS of player.rs
 
 // A script from another origin cannot be a worker, but a worker may import it. Bundlers know a worker by these words, and
 // are to leave `script` alone.
@@ -31,10 +33,16 @@ function start(script = "./worker.js") {
 }
 
 export class Engine extends EventTarget {
-  groups = new Map(); // group -> {state: fetching | decoding | ready, set, pieces, left, header, layers, abort}
-  // set: workers that hold it; pieces: how many of them do; left: how many of these still decode; order: see tiles.js
+  // bytes of a group, or of the one that it is predicted from, above which only its tiles in view are fetched and decoded
+  static partly = 1 << 20;
+  groups = new Map(); // group -> {state: fetching | decoding | ready, set, pieces, left, header, layers, abort, content, flags}
+  // set: workers that hold it; pieces: how many of them do; left: what these have yet to decode; order: see tiles.js; content: a
+  // Whole or Parts; of Parts flags: tiles that were asked for, orders: how often; waiting: orders of each worker
+  view = null; // () => what is to be seen: a view of the renderer, null for all, undefined if it is not known yet; without it
+  // large groups are decoded whole, too; of the tracks of a scene the host has it
+  pose = null; // that of the track in a scene, see tracks.js
   failed = new Map(); // group -> message
-  layers = AUTO; // number of layers of each group to fetch and draw
+  layers; // number of layers of each group to fetch and draw
   choice = new LayerChoice();
   #chosen = new Map(); // sync group -> number of layers, of it and of the groups predicted from it
   stats = { decode: 0, project: 0, blend: 0, gaussians: 0, link: 0 };
@@ -49,7 +57,7 @@ export class Engine extends EventTarget {
   // one, too
   constructor(canvas, src, { track = 0, host = null } = {}) {
     super();
-    this.host = host;
+    Object.assign(this, { host, layers: host?.layers ?? AUTO });
     this.source = /\.mpd($|[?#])/.test(src) ? new AdaptiveSource(src) : new Source(src, track);
     this.source.addEventListener("received", ({ detail: { bytes, ms } }) => {
       if (bytes > 20_000) this.stats.link = (8e-3 * bytes) / ms;
@@ -132,8 +140,8 @@ export class Engine extends EventTarget {
     const parts = this.scene?.parts(t) ?? [{ engine: this, t }];
     const shown = parts.map((part) => part.engine.groups.get(part.engine.groupOf(part.t)));
     const pieces = shown.reduce((n, group) => n + group.pieces, 0);
-    const gaussians = shown.reduce((n, group) => n + group.header.gaussians, 0);
-    const how = this.renderer.begin({ t, view, gaussians, pieces }, this.source.config.background);
+    const image = { t, view, gaussians: this.gaussians(t), pieces, divided: pieces > 1 || shown[0].flags !== null };
+    const how = this.renderer.begin(image, this.source.config.background);
     let first = 0;
     parts.forEach(({ engine, t: own, pose }, i) => {
       const from = first;
@@ -183,6 +191,27 @@ export class Engine extends EventTarget {
     return this.groups.get(i)?.state === "ready";
   }
 
+  // Gaussians of frame t that are there.
+  gaussians(t) {
+    const parts = this.scene?.parts(t) ?? [{ engine: this, t }];
+    return parts.reduce((n, part) => n + (part.engine.groups.get(part.engine.groupOf(part.t))?.header?.gaussians ?? 0), 0);
+  }
+
+  // What is to be seen of this track, as of `view`, where it was made.
+  sight() {
+    const view = (this.host ?? this).view();
+    return view && this.pose ? unplaced(view, this.pose) : view;
+  }
+
+  // Flags of the tiles of a group that are to be seen, as soon as that is known.
+  async #seen(content, layers, signal) {
+    while (this.sight() === undefined && !this.closed) {
+      await new Promise(requestAnimationFrame);
+      signal?.throwIfAborted();
+    }
+    return content.seen(this.sight(), layers);
+  }
+
   // Starts decoding group i, then the next one, then fetching those after it; releases all others.
   want(i, loop) {
     const { groups } = this.source;
@@ -192,6 +221,7 @@ export class Engine extends EventTarget {
     if (next !== null) decoded.push(next);
     for (const [k, g] of this.groups) {
       if (!decoded.includes(k)) this.#release(k, g);
+      else if (g.flags && g.state === "ready" && !g.left) this.#grow(k, g);
     }
     const busy = [...this.groups.values()].filter((g) => g.state !== "ready").length;
     if (!this.groups.has(i)) {
@@ -215,7 +245,7 @@ export class Engine extends EventTarget {
 
   // Gives a group up, unless it is being decoded.
   #release(k, g) {
-    if (g.state === "decoding") return;
+    if (g.state === "decoding" || g.left > 0) return;
     g.abort?.abort(new DOMException("not needed any more", "AbortError"));
     g.set?.forEach((worker) => worker.postMessage({ type: "release", group: k }));
     this.groups.delete(k);
@@ -250,48 +280,88 @@ export class Engine extends EventTarget {
     if (this.failed.has(i)) return;
     const abort = new AbortController();
     const layers = this.#layersOf(i);
-    const entry = { state: "fetching", layers, abort };
+    const entry = { state: "fetching", layers, abort, left: 0, waiting: [], flags: null };
     this.groups.set(i, entry);
     try {
-      const payload = await this.source.payload(i, abort.signal, layers);
-      const reference = await this.#reference(i, payload, abort.signal, layers);
+      const content = (entry.content = await this.#fetch(i, layers, abort.signal));
+      if (content.seen) {
+        if (!this.bounds) this.#say("bounds", (this.bounds = content.bounds)); // who hears it knows the view
+        entry.flags = await this.#seen(content, layers, abort.signal);
+        await content.fetch(entry.flags, layers, abort.signal);
+      }
       if (this.groups.get(i) !== entry) return;
       // the idle set, else the one that holds fewer groups
       const held = (set) => [...this.groups.values()].reduce((n, g) => n + (g.set !== set ? 0 : g.state === "ready" ? 1 : 9), 0);
       entry.set = this.#sets.reduce((a, b) => (held(b) < held(a) ? b : a));
       entry.state = "decoding";
-      this.#share(i, entry, payload, reference);
+      entry.pieces = sharing(content.index, layers, this.shares);
+      entry.order = order(content.index, layers, entry.pieces);
+      this.#share(i, entry, entry.flags);
     } catch (e) {
       if (this.groups.get(i) !== entry || abort.signal.aborted) return;
       this.#fail(i, e.message);
     }
   }
 
-  // Gives the tiles of group i to the workers of its set.
-  #share(i, entry, payload, reference) {
-    const { native } = this.source;
-    const { set, layers } = entry;
-    const index = native.index(payload, reference?.payload);
-    const n = (entry.pieces = entry.left = sharing(index, layers, this.shares));
-    entry.order = order(index, layers, n);
-    const before = reference && n > 1 ? native.index(reference.payload) : null;
-    const [level, bounds] = [this.source.level(i), !this.bounds];
+  // Gives the tiles of group i with flags, all if null, to the workers of its set; more: to those that have others already.
+  #share(i, entry, flags, more = false) {
+    const { set, layers, content, pieces: n } = entry;
     for (let k = 0; k < n; k++) {
       if (!set[k]) this.#join((set[k] = start()));
-      const wanted = n > 1 ? share(index, k, n) : null;
-      const own = before ? { ...reference, key: `${reference.key}, ${k} of ${n}`, wanted: share(before, k, n) } : reference;
-      set[k].postMessage({ type: "decode", group: i, payload, level, layers, reference: own, wanted, bounds });
+      entry.waiting[k] = content.orders(flags, layers, k, n, more);
+      entry.left += entry.waiting[k].length;
+      this.#next(i, entry, k);
     }
+    entry.orders = (entry.orders ?? 0) + entry.left;
   }
 
-  // {key, payload} of the reference of a predicted group; null if group i is independent.
-  async #reference(i, payload, signal, layers) {
-    const back = this.source.native.reference(payload);
-    if (!back) return null;
-    const r = i - back;
-    if (r < 0 || this.source.groups[i].sync) throw new Error("it refers to a group that is not in the file");
-    const bytes = await this.source.payload(r, signal, layers);
-    return { key: `${this.source.key(r)}, ${layers} layers`, payload: bytes };
+  // Gives worker k of a set what it is to decode next of group i: one order at a time, so that it can draw in between.
+  #next(i, { set, layers, waiting }, k) {
+    const order = waiting[k]?.shift();
+    if (order) set[k].postMessage({ type: "decode", group: i, level: this.source.level(i), layers, bounds: !this.bounds, ...order });
+  }
+
+  // Fetches and decodes the tiles that have come into view.
+  async #grow(i, entry) {
+    const { content, flags, layers, abort } = entry;
+    if (entry.growing) return;
+    const more = content.seen(this.sight(), layers).map((seen, j) => seen & ~flags[j]);
+    if (!more.includes(1)) return;
+    if (entry.orders > PIECES_MAX * entry.pieces) return this.#release(i, entry); // decoded anew, in one piece
+    entry.growing = true;
+    try {
+      await content.fetch(more, layers, abort.signal);
+      if (this.groups.get(i) !== entry) return;
+      more.forEach((flag, j) => (flags[j] |= flag));
+      this.#share(i, entry, more, true);
+    } catch (e) {
+      if (this.groups.get(i) === entry && !abort.signal.aborted) this.#fail(i, e.message);
+    }
+    entry.growing = false;
+  }
+
+  // Group i, and what it is predicted from: whole, or described, to be fetched by its parts.
+  async #fetch(i, layers, signal) {
+    const { source } = this;
+    const { native } = source;
+    const partly = (this.host ?? this).view && source.ranged && this.#bytes(i, layers) > Engine.partly;
+    const one = (k) => (partly ? source.parts(k, signal) : source.payload(k, signal, layers));
+    const own = await one(i);
+    const back = native.reference(own.head ?? own);
+    if (back && (back > i || source.groups[i].sync)) throw new Error("it refers to a group that is not in the file");
+    const before = back ? await one(i - back) : null;
+    const key = `${source.key(i - back)}, ${layers} layers`;
+    if (!partly) return new Whole(native, own, before && { key, payload: before });
+    own.describe(native, before, key);
+    return own;
+  }
+
+  // Bytes of the layers of group i, or of the sync group before it, if they are more.
+  #bytes(i, layers) {
+    const { groups } = this.source;
+    let start = i;
+    while (start > 0 && !groups[start].sync) start--;
+    return Math.max(...[i, start].map((k) => groups[k].ends?.[layers - 1] ?? groups[k].size));
   }
 
   // Payloads of the next seconds, one at a time.
@@ -301,7 +371,9 @@ export class Engine extends EventTarget {
     try {
       let seconds = 0;
       for (let k = this.#after(i, loop); k !== null && k > i && seconds < AHEAD; k = this.#after(k, false)) {
-        await this.source.payload(k, undefined, this.#layersOf(k));
+        const layers = this.#layersOf(k);
+        const content = await this.#fetch(k, layers);
+        await content.fetch?.(await this.#seen(content, layers), layers);
         seconds += this.source.groups[k].frames / this.fps;
       }
     } catch {
@@ -313,7 +385,7 @@ export class Engine extends EventTarget {
   #fail(i, message) {
     if (this.failed.has(i)) return; // another worker has told already
     const entry = this.groups.get(i);
-    if (entry) this.#release(i, { ...entry, state: "failed" });
+    if (entry) this.#release(i, { ...entry, state: "failed", left: 0 });
     this.failed.set(i, message);
     const g = this.source.groups[i];
     const frames = `${g.start_frame}–${g.start_frame + g.frames - 1}`;
@@ -328,9 +400,9 @@ export class Engine extends EventTarget {
   #onDecoded(entry, m) {
     const { header, group } = m;
     entry.ms = Math.max(entry.ms ?? 0, m.ms);
-    (entry.means ??= []).push(header.means);
+    if (header.means) (entry.means ??= []).push(header.means);
     entry.header = { ...header, gaussians: header.gaussians + (entry.header?.gaussians ?? 0), means: undefined };
-    if (--entry.left) return;
+    if (--entry.left || entry.state === "ready") return;
     this.stats.decode = entry.ms / header.frames;
     this.source.decoded?.(group, this.stats.decode);
     this.bounds ??= this.source.native.bounds(...entry.means);
@@ -347,6 +419,7 @@ export class Engine extends EventTarget {
     const entry = this.groups.get(m.group);
     if (m.type === "decoded") {
       if (!entry?.left) return worker.postMessage({ type: "release", group: m.group });
+      this.#next(m.group, entry, entry.set.indexOf(worker));
       this.#onDecoded(entry, m);
     } else if (m.type === "projected") {
       this.renderer.onProjected(m);

@@ -83,17 +83,18 @@ export class Native {
   // Groups
 
   // reference: the slot of the reference of a predicted group; layers: number to decode; wanted: flags of the tiles to decode,
-  // all if null; keepLeading: whether the tiles that they start from stay when they are not wanted.
-  decode(slot, payload, level, reference = NONE, layers = ALL, wanted = null, keepLeading = true) {
+  // all if null; keepLeading: whether the tiles that they start from stay when they are not wanted; packed: the payload has no
+  // bytes of other tiles.
+  decode(slot, payload, level, { reference = NONE, layers = ALL, wanted = null, keepLeading = true, packed = false } = {}) {
     this.put(payload);
     if (wanted) this.bytes(this.x.wanted(wanted.length), wanted.length).set(wanted);
-    this.check(this.x.decode(slot, level, reference, layers, keepLeading));
+    this.check(this.x.decode(slot, level, reference, layers, keepLeading, packed));
     return JSON.parse(this.text());
   }
 
   // How many groups back a payload refers; 0: it is independent.
   reference(payload) {
-    this.put(head(payload));
+    this.put(payload.subarray(0, headerSize(payload)));
     const back = this.x.reference();
     this.check(back >= 0);
     return back;
@@ -101,6 +102,7 @@ export class Native {
 
   // The tiles and units of a payload, see text.rs; before: the payload of its reference, if it is predicted.
   index(payload, before = null) {
+    const head = (bytes) => bytes.subarray(0, headerSize(bytes));
     const [own, other] = [head(payload), before ? head(before) : new Uint8Array(0)];
     const both = new Uint8Array(other.length + own.length);
     both.set(other);
@@ -110,14 +112,10 @@ export class Native {
     return JSON.parse(this.text());
   }
 
-  frame(slot, t) {
-    this.check(this.x.frame(slot, t));
-  }
-
-  // Places the evaluated frame by a transform; with a scale of 0 nothing is shown.
-  place(pose) {
+  // pose: the transform that places the frame, with a scale of 0 nothing is shown; without one it is where it was made.
+  frame(slot, t, pose = []) {
     this.#floats(pose);
-    this.x.place();
+    this.check(this.x.frame(slot, t));
   }
 
   // An attribute of the evaluated frame: 0 means, 1 quats, 2 log scales, 3 logit opacities, 4 sh0, 5 shN.
@@ -184,9 +182,9 @@ export class Native {
   }
 }
 
-// The header of a group with the eight bytes before it, of which the first four tell its size.
-function head(payload) {
+// Bytes of the header of a group with the eight before it, of which the first four tell it.
+export function headerSize(payload) {
   const size = payload.length < 8 ? 0 : new DataView(payload.buffer, payload.byteOffset).getUint32(0);
   if (size > HEADER_MAX) throw new Error(`the header of a group has ${size} bytes, expected at most ${HEADER_MAX}`);
-  return payload.subarray(0, 8 + size);
+  return 8 + size;
 }

@@ -29,6 +29,7 @@ export class GsvPlayer extends HTMLElement {
   #last = 0; // time of the last tick
   #moved = 0; // time of the last camera motion
   #drawn = ""; // the last request
+  #begun = false;
   #scale = null; // of a moving image per side, measured
   #adapted = 0;
   #times = []; // of the images of the last second
@@ -154,15 +155,17 @@ export class GsvPlayer extends HTMLElement {
     this.$(".notes").replaceChildren();
     this.$(".busy").hidden = false;
     Object.assign(this, { camera: null, header: null, paused: true, shown: null });
-    [this.#position, this.#scale, this.#drawn] = [0, null, ""];
+    [this.#position, this.#scale, this.#drawn, this.#begun] = [0, null, "", false];
     const engine = (this.engine = new Engine(this.$("canvas"), this.getAttribute("src")));
     engine.layers = this.#layers;
+    engine.view = () => (engine.gpu?.head ? null : this.camera ? this.#view(true) : undefined);
     const { source } = engine;
     const on = (target, type, f) => target.addEventListener(type, (e) => this.engine === engine && f(e.detail));
     on(engine, "damaged", (d) => this.#damaged(d));
     on(engine, "nogpu", (why) => this.#note("gpu", `The GPU cannot be used (${why}): the CPU draws.`));
     on(engine, "fatal", (message) => this.#fail("The player has stopped", `${message}.`));
-    on(engine, "decoded", ({ header }) => this.#begin(engine, header));
+    on(engine, "bounds", () => this.#begin(engine));
+    on(engine, "decoded", ({ header }) => ((this.header = header), this.#begin(engine)));
     on(engine, "picture", (detail) => this.#pictured(detail));
     on(engine, "silent", (why) => this.#note("sound", `The sound cannot be played (${why}).`));
     on(source, "retry", (why) => this.#note("link", `Connection lost (${why}). Trying again…`, true));
@@ -173,7 +176,6 @@ export class GsvPlayer extends HTMLElement {
       this.#request = requestAnimationFrame(() => this.#tick());
       await engine.open();
       if (this.engine !== engine) return;
-      if (engine.scene && this.header) this.#begin(engine, this.header);
       if (source.config.audio) this.#hear(engine);
       if (source.missing) {
         const all = this.frameCount + source.missing;
@@ -208,28 +210,35 @@ export class GsvPlayer extends HTMLElement {
     this.#note("live", source.complete ? null : unfinished);
   }
 
-  // The first group is decoded.
-  #begin(engine, header) {
-    this.header = header;
+  // Begins when what the first frame shows is decoded, and looks at it when its size is known.
+  #begin(engine) {
     const { scene } = engine;
-    if (this.camera || (scene && !scene.ready(0))) return;
+    const { header } = this;
+    if (!this.camera) this.#look(engine);
+    if (this.#begun || !header || (scene && !scene.ready(this.frame))) return;
+    this.#begun = true;
     this.#list(scene);
     const layers = this.$("[data-set=layers]");
     layers.hidden = header.layers < 2;
     const choices = Array.from({ length: header.layers - 1 }, (_, k) => new Option(`${k + 1} of ${header.layers} layers`, k + 1));
     layers.replaceChildren(new Option("Auto layers", "auto"), new Option("All layers", "all"), ...choices);
     layers.value = { [ALL]: "all", [AUTO]: "auto" }[this.#layers] ?? String(Math.min(this.#layers, header.layers - 1));
+    if (this.hasAttribute("autoplay")) this.play();
+    this.dispatchEvent(new CustomEvent("ready"));
+  }
+
+  #look(engine) {
     const { config } = engine.source;
+    const bounds = engine.scene ? engine.scene.bounds(this.frame) : engine.bounds;
+    if (!bounds) return;
     const color = /^#?([0-9a-f]{6})$/i.exec(this.getAttribute("background") ?? "")?.[1];
     if (color) config.background = [0, 2, 4].map((i) => parseInt(color.slice(i, i + 2), 16) / 255);
-    this.camera = new Camera(scene?.bounds(0) ?? engine.bounds, config.up, config.cameras);
+    this.camera = new Camera(bounds, config.up, config.cameras);
     this.camera.use(config.cameras.findIndex((c) => c.name === this.getAttribute("camera")));
     const select = this.$("[data-set=view]");
     select.replaceChildren(new Option("Free view", "orbit"), ...config.cameras.map((c, i) => new Option(c.name, i)));
     select.hidden = !config.cameras.length;
     select.value = this.camera.reference ? String(config.cameras.indexOf(this.camera.reference)) : "orbit";
-    if (this.hasAttribute("autoplay")) this.play();
-    this.dispatchEvent(new CustomEvent("ready"));
   }
 
   // The clock
@@ -251,6 +260,7 @@ export class GsvPlayer extends HTMLElement {
     if (group === null) return;
     if (scene) scene.want(this.frame, this.#loops);
     else engine.want(group, this.#loops);
+    if (!this.#begun) this.#begin(engine); // also when a track that it waited for is lost
     const decoded = () => (scene ? scene.ready(this.frame) : engine.ready(engine.groupOf(this.frame)));
     const ready = (scene ? decoded() : engine.ready(group)) && this.camera;
     if (ready && !this.paused) this.#advance(passed);
@@ -319,10 +329,11 @@ export class GsvPlayer extends HTMLElement {
 
   #draw(now) {
     const view = this.#view(this.paused && now - this.#moved > STILL);
-    const what = `${this.frame} ${view} ${this.engine.layers} ${this.engine.onGpu}`;
+    const { engine } = this;
+    const what = `${this.frame} ${view} ${engine.layers} ${engine.onGpu} ${engine.gaussians(this.frame)}`;
     if (what === this.#drawn) return;
     this.#drawn = what;
-    this.engine.draw(this.frame, view);
+    engine.draw(this.frame, view);
   }
 
   #pictured(detail) {

@@ -1,7 +1,5 @@
 // Images: drawn by raster workers in bands, and shown when the last band has arrived; or by the GPU, on a canvas above.
 
-import { Gpu, gpuName } from "./gpu.js";
-
 const IN_FLIGHT = 2; // images in progress: one is projected while the one before is blended
 const TILE = 16; // rows of a tile of the rasterizer
 
@@ -30,8 +28,10 @@ export class Renderer {
   // See Engine.use. `bounds`: box of the scene, 6 numbers.
   async use(how, bounds, background) {
     this.#how = how;
-    if (how === "cpu" || (how === "auto" && gpuName() === null)) return this.#leaveGpu();
-    if (this.gpu) return;
+    if (how === "cpu") return this.#leaveGpu();
+    const { Gpu, gpuName } = await import("./gpu.js"); // after the first picture
+    if (how === "auto" && gpuName() === null) return this.#leaveGpu();
+    if (this.gpu || this.#closed || this.#how !== how) return;
     const canvas = document.createElement("canvas");
     canvas.hidden = true;
     const [low, high] = [bounds.slice(0, 3), bounds.slice(3)];
@@ -67,17 +67,18 @@ export class Renderer {
     return this.#images.size < IN_FLIGHT;
   }
 
-  // Registers an image {t, view, gaussians, pieces}, which as many group workers project; what they must be asked for.
+  // Registers an image {t, view, gaussians, pieces, divided}: as many group workers project it; divided: in several pieces.
+  // Returns what they must be asked for.
   begin(image, background) {
     const id = this.#next++;
     const gpu = this.gpu;
     this.#images.set(id, { ...image, gpu, packed: [], parts: [], blend: 0 });
     this.#projected.set(id, { left: image.pieces, load: null, ms: 0 });
     if (gpu) return { type: "pack", origin: gpu.origin, all: gpu.head !== null, id };
-    return { type: "draw", background, id, ends: image.pieces > 1 ? this.#ends(image.view[1]) : [] };
+    return { type: "draw", background, id, ends: image.divided ? this.#ends(image.view[1]) : [] };
   }
 
-  // Workers that project parts of an image must agree on its bands: by the load of the image before.
+  // Pieces of an image must agree on its bands: by the load of the image before.
   #ends(height) {
     const rows = Math.ceil(height / TILE);
     return this.divide(this.#load.length === rows ? this.#load : new Float32Array(rows).fill(1));

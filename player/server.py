@@ -33,6 +33,7 @@ FILES = {
     "abr.js": "text/javascript; charset=utf-8",
     "layers.js": "text/javascript; charset=utf-8",
     "sound.js": "text/javascript; charset=utf-8",
+    "parts.js": "text/javascript; charset=utf-8",
     "tracks.js": "text/javascript; charset=utf-8",
     "tiles.js": "text/javascript; charset=utf-8",
     "worker.js": "text/javascript; charset=utf-8",

@@ -1,5 +1,5 @@
 // A .gsv file behind a URL: the places of its groups, and their bytes by HTTP Range, sound included. With an index of layers
-// (ssix) only the requested layers are fetched.
+// (ssix) only the requested layers are fetched, and of groups in parts only what is asked for (parts.js).
 //
 // A finished file has an index (sidx), so one small request finds all groups; without it the headers of the fragments are
 // walked, and a growing file is polled. A server that ignores Range sends the whole file, which is then kept. All request
@@ -8,6 +8,7 @@
 import { ALL } from "./native.js";
 
 const HEAD = 1 << 16; // first request
+const SMALL = 1 << 18; // bytes of a file that is fetched as a whole
 const STEP = 1 << 12; // a moof and the header of its mdat
 const CACHE = 48 << 20; // bytes of payloads that are kept
 const SILENCE = 15_000; // ms without a byte after which a connection counts as broken
@@ -31,7 +32,7 @@ export class Source extends EventTarget {
   complete = false; // no more groups will come
   settled = false; // not complete, but it has not grown for a while
   received = 0;
-  #cache = new Map(); // group -> {bytes, size, sound}
+  #cache = new Map(); // group -> {bytes, size, sound} or {parts, sound}
   #head = new Uint8Array(); // first bytes of a finished file
   #whole = null; // all bytes so far, from a server without Range
   #closing = new AbortController();
@@ -55,7 +56,7 @@ export class Source extends EventTarget {
 
   // Resolves when the first group is known.
   async open(create) {
-    const [native, head] = await Promise.all([create(), this.#read(0, HEAD)]);
+    const [native, head] = await Promise.all([create(), this.#start()]);
     this.native = native; // whose demuxer is used
     native.track(this.track);
     if (!head.length) throw new StreamError("The file is empty.");
@@ -73,6 +74,12 @@ export class Source extends EventTarget {
       this.#walk().catch((e) => this.#say("error", e));
       while (!this.groups.length && !this.complete) await new Promise((done) => this.addEventListener("groups", done, { once: true }));
     }
+  }
+
+  // The first bytes of the file, before the decoder is there to ask for more.
+  async #start() {
+    const head = await this.#read(0, HEAD);
+    return this.total > HEAD && this.total <= SMALL && !this.#whole ? this.#read(0, this.total, undefined, head) : head;
   }
 
   level() {
@@ -98,8 +105,7 @@ export class Source extends EventTarget {
     const size = g.ends?.[layers - 1] ?? g.size;
     const kept = this.#cache.get(i);
     if (kept && kept.size >= size) {
-      this.#cache.delete(i);
-      this.#cache.set(i, kept); // least recently used ones are dropped first
+      this.#keep(i, kept);
       return kept.bytes;
     }
     const at = g.audio?.offset ?? g.offset;
@@ -112,6 +118,27 @@ export class Source extends EventTarget {
     return bytes;
   }
 
+  // Whether the server answers ranges.
+  get ranged() {
+    return !this.#whole;
+  }
+
+  // Group i, of which parts are fetched.
+  async parts(i, signal) {
+    const g = this.groups[i];
+    let { parts, sound } = this.#cache.get(i) ?? {};
+    if (!parts) {
+      const { FIRST, Parts } = await import("./parts.js");
+      const bytes = await this.#read(g.offset, g.offset + Math.min(FIRST, g.size), signal);
+      const { audio, offset } = g.indexed ? this.#inside(g, bytes) : g;
+      sound = audio && { ...audio, bytes: await this.#read(audio.offset, offset, signal) };
+      const read = (start, end, until) => this.#read(offset + start, offset + end, until);
+      parts = await Parts.open(read, bytes.subarray(offset - g.offset), signal);
+    }
+    this.#keep(i, { parts, sound });
+    return parts;
+  }
+
   // {time, samples: [size, duration] of each, bytes}: the sound that came with group i.
   sound(i) {
     return this.#cache.get(i)?.sound;
@@ -121,15 +148,17 @@ export class Source extends EventTarget {
     this.dispatchEvent(new CustomEvent(type, { detail }));
   }
 
+  // Least recently used groups are dropped first.
   #keep(i, entry) {
     this.#cache.delete(i);
     this.#cache.set(i, entry);
+    const held = ({ bytes, parts }) => (bytes ?? parts).length;
     let size = 0;
-    for (const { bytes } of this.#cache.values()) size += bytes.length;
-    for (const [k, { bytes }] of this.#cache) {
+    for (const entry of this.#cache.values()) size += held(entry);
+    for (const [k, entry] of this.#cache) {
       if (size <= CACHE || k === i) break;
       this.#cache.delete(k);
-      size -= bytes.length;
+      size -= held(entry);
     }
   }
 
@@ -205,10 +234,10 @@ export class Source extends EventTarget {
     }
   }
 
-  // Bytes start .. end of the file, fewer where it ends.
-  async #read(start, end, signal) {
+  // Bytes start .. end of the file, fewer where it ends; head: its first bytes.
+  async #read(start, end, signal, head = this.#head) {
     if (this.#whole) return this.#whole.subarray(start, end);
-    const parts = [this.#head.subarray(start, end)];
+    const parts = [head.subarray(start, end)];
     let [at, since, wait] = [start + parts[0].length, performance.now(), 250];
     while (at < end && (this.total === null || at < this.total || start >= this.total)) {
       const before = at;
@@ -282,7 +311,7 @@ export class Source extends EventTarget {
     }
     const range = /bytes (\d+)-(\d+)\/(\d+|\*)/.exec(response.headers.get("content-range") ?? "");
     if (range && range[3] !== "*") this.total = Number(range[3]);
-    const chunks = [];
+    const [chunks, before] = [[], this.received];
     const reader = response.body.getReader();
     for (;;) {
       const { done, value } = await reader.read();
@@ -293,7 +322,7 @@ export class Source extends EventTarget {
       else chunks.push(value);
     }
     const bytes = Number(response.headers.get("content-length") ?? 0);
-    this.#say("received", { bytes, ms: performance.now() - began });
+    this.#say("received", { bytes: this.received - before, ms: performance.now() - began }); // with what came beside it
     // another origin hides Content-Range, but not Content-Length
     if (status === 206 && !range && bytes && bytes < end - start) {
       this.total = start + bytes;

@@ -3,6 +3,22 @@
 const [COUNT] = [0]; // places in the description of a tile
 const EACH = 4; // tiles of a worker at least: all decode the leading tiles, from which the others start
 
+// A group that is here as a whole. reference: {key, payload}, null if it is independent
+export class Whole {
+  constructor(native, payload, reference) {
+    this.index = native.index(payload, reference?.payload);
+    const before = reference && native.index(reference.payload);
+    Object.assign(this, { payload, reference, before });
+  }
+
+  orders(_flags, _layers, k, n) {
+    const { payload, reference, before } = this;
+    if (n === 1) return [{ payload, reference, wanted: null }];
+    const own = reference && { ...reference, key: `${reference.key}, ${k} of ${n}`, wanted: share(before, k, n) };
+    return [{ payload, reference: own, wanted: share(this.index, k, n) }];
+  }
+}
+
 // How many workers, at most `most`, share the first `layers` layers.
 export function sharing(index, layers, most) {
   const tiles = index.tiles.slice(0, layers).flat().filter((tile) => tile[COUNT] > 0);

@@ -10,6 +10,29 @@ export function placed({ placement: p }) {
   return Boolean(p && (p.name || p.hidden || p.offset || p.repeats !== 1 || p.keys));
 }
 
+// A point where a transform places it.
+function moved([w, x, y, z, a, b, c, s], [px, py, pz]) {
+  const [tx, ty, tz] = [2 * (y * pz - z * py), 2 * (z * px - x * pz), 2 * (x * py - y * px)];
+  return [
+    a + s * (px + w * tx + y * tz - z * ty),
+    b + s * (py + w * ty + z * tx - x * tz),
+    c + s * (pz + w * tz + x * ty - y * tx),
+  ];
+}
+
+// A view of the scene as a view of a track that its transform has not placed: world-to-camera with the transform before it.
+export function unplaced(view, pose) {
+  const [origin, ...axes] = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]].map((p) => moved(pose, p));
+  const own = Array.from(view);
+  for (const row of [6, 10, 14]) {
+    const along = (p) => p.reduce((sum, v, i) => sum + view[row + i] * v, 0);
+    axes.forEach((axis, j) => (own[row + j] = along(axis) - along(origin)));
+    own[row + 3] += along(origin);
+  }
+  if (!pose[7]) own[18] = Infinity; // nothing is nearer than that
+  return own;
+}
+
 export class Scene {
   tracks = []; // {engine, name, hidden}
   opened = false;
@@ -29,7 +52,7 @@ export class Scene {
     };
     const opened = engines.map(async (engine, i) => {
       if (!i) return add(engine, i);
-      for (const type of ["damaged", "fatal", "decoded"]) engine.addEventListener(type, (e) => say(type, e.detail));
+      for (const type of ["damaged", "fatal", "bounds", "decoded"]) engine.addEventListener(type, (e) => say(type, e.detail));
       try {
         await engine.open();
         return add(engine, i);
@@ -86,11 +109,15 @@ export class Scene {
 
   // Starts fetching and decoding what frame t shows, and what comes next.
   want(t, loop) {
-    for (const { engine, t: own } of this.#wanted(t)) engine.want(engine.groupOf(own), loop || engine.source.config.placement.repeats !== 1);
+    for (const { engine, t: own, pose } of this.parts(t)) {
+      engine.pose = pose;
+      engine.want(engine.groupOf(own), loop || engine.source.config.placement.repeats !== 1);
+    }
   }
 
   // Without anything to show the first track has the workers that draw the background.
   #wanted(t) {
+    if (!this.opened) return [{ engine: this.host, t: 0 }];
     const shown = this.#shown(t);
     return shown.length ? shown : [{ engine: this.host, t: 0, pose: NOTHING }];
   }
@@ -102,27 +129,24 @@ export class Scene {
 
   // What is drawn in frame t: {engine, t, pose}.
   parts(t) {
-    return this.#wanted(t).map((p) => ({ pose: p.engine.source.native.pose(this.#time(p.engine, t)), ...p }));
+    return this.#wanted(t).map((p) => ({ pose: this.#pose(p.engine, t), ...p }));
   }
 
-  // The box of the tracks that have been decoded, where frame t shows them.
+  #pose(engine, t) {
+    return engine.source.native.pose(this.#time(engine, t));
+  }
+
+  // The box of the tracks where frame t shows them, null until those of all are known.
   bounds(t) {
-    const boxes = this.#wanted(t).filter(({ engine }) => engine.bounds).map(({ engine }) => {
-      const [w, x, y, z, a, b, c, s] = engine.source.native.pose(this.#time(engine, t));
-      const box = engine.bounds;
+    const engines = this.#wanted(t).map(({ engine }) => engine);
+    if (!this.opened || engines.some(({ bounds }) => !bounds)) return null;
+    const boxes = engines.map((engine) => {
+      const [box, pose] = [engine.bounds, this.#pose(engine, t)];
       const corners = Array.from({ length: 8 }, (_, i) => [0, 1, 2].map((axis) => box[axis + 3 * ((i >> axis) & 1)]));
-      const moved = corners.map(([px, py, pz]) => {
-        const [tx, ty, tz] = [2 * (y * pz - z * py), 2 * (z * px - x * pz), 2 * (x * py - y * px)];
-        return [
-          a + s * (px + w * tx + y * tz - z * ty),
-          b + s * (py + w * ty + z * tx - x * tz),
-          c + s * (pz + w * tz + x * ty - y * tx),
-        ];
-      });
-      const over = (f) => [0, 1, 2].map((axis) => f(...moved.map((p) => p[axis])));
+      const places = corners.map((p) => moved(pose, p));
+      const over = (f) => [0, 1, 2].map((axis) => f(...places.map((p) => p[axis])));
       return [...over(Math.min), ...over(Math.max)];
     });
-    if (!boxes.length) return this.host.bounds;
     return boxes.reduce((a, b) => a.map((v, i) => (i < 3 ? Math.min(v, b[i]) : Math.max(v, b[i]))));
   }
 }

@@ -22,90 +22,101 @@ self.onmessage = async ({ data }) => {
 };
 
 function groupWorker(native, { ports }) {
-  const slots = new Map(); // group -> slot
+  const groups = new Map(); // group -> slots of its pieces
   const spare = ports.map(() => []); // buffers that came back
   ports.forEach((port, i) => (port.onmessage = ({ data }) => spare[i].length < 3 && spare[i].push(data)));
-  let shown = "";
 
   let kept = { slot: NONE }; // {key, slot} of the last reference
 
   function spareSlot() {
+    const used = new Set([kept.slot, ...[...groups.values()].flat()]);
     let slot = 0;
-    while (slot === kept.slot || [...slots.values()].includes(slot)) slot++;
+    while (used.has(slot)) slot++;
     return slot;
   }
 
   // The slot of a reference, decoded if it is not the last one.
-  function keep({ key, payload, wanted }, level, layers) {
+  function keep({ key, payload, wanted, packed }, level, layers) {
     if (kept.key !== key) {
       if (kept.slot !== NONE) native.x.release(kept.slot);
       kept = { slot: NONE };
       const slot = spareSlot();
-      native.decode(slot, payload, level, NONE, layers, wanted);
+      native.decode(slot, payload, level, { layers, wanted, packed });
       kept = { key, slot };
     }
     return kept.slot;
   }
 
-  function decode({ group, payload, level, bounds, layers, reference, wanted }) {
+  // A group, or a piece of one that comes in pieces.
+  function decode({ group, payload, level, bounds, layers, reference: before, wanted, packed }) {
     const start = performance.now();
-    const from = reference ? keep(reference, level, layers) : NONE;
+    const reference = before ? keep(before, level, layers) : NONE;
     const slot = spareSlot();
-    const header = native.decode(slot, payload, level, from, layers, wanted, false);
-    slots.set(group, slot);
-    shown = "";
+    const header = native.decode(slot, payload, level, { reference, layers, wanted, keepLeading: false, packed });
+    groups.set(group, [...(groups.get(group) ?? []), slot]);
     if (bounds) {
-      evaluate(group, 0);
+      native.frame(slot, 0);
       header.means = native.attribute(0);
     }
-    return { type: "decoded", group, header, ms: performance.now() - start };
+    const buffers = header.means ? [header.means.buffer] : [];
+    self.postMessage({ type: "decoded", group, header, ms: performance.now() - start }, buffers);
   }
 
-  // pose: of the track, see tracks.js; without one it is where it was made.
-  function evaluate(group, t, pose) {
-    const what = `${group} ${t} ${pose}`;
-    if (shown === what) return;
-    native.frame(slots.get(group), t);
-    if (pose) native.place(pose);
-    shown = what;
+  // Appends bytes to the buffer of band i.
+  function append(band, i, bytes) {
+    const length = band.length + bytes.length;
+    let buffer = band.buffer ?? spare[i].pop();
+    if (!buffer || buffer.byteLength < length) {
+      const before = band.length && new Uint8Array(buffer, 0, band.length);
+      buffer = new ArrayBuffer(Math.ceil(length * 1.2));
+      if (before) new Uint8Array(buffer).set(before);
+    }
+    new Uint8Array(buffer, band.length).set(bytes);
+    Object.assign(band, { length, buffer });
   }
 
+  // pose: of the track, see tracks.js.
   function draw({ id, group, t, pose, view, background, ends, piece, pieces }) {
     const start = performance.now();
-    evaluate(group, t, pose);
-    const { bands, load } = native.project(view, ports.length, ({ i, bands, first, rows, splats }) => {
-      let buffer = spare[i].pop();
-      if (!buffer || buffer.byteLength < splats.length) buffer = new ArrayBuffer(Math.ceil(splats.length * 1.2));
-      new Uint8Array(buffer, 0, splats.length).set(splats);
-      const own = { piece, pieces, length: splats.length, buffer };
-      ports[i].postMessage({ id, bands, first, rows, width: view[0], background, own }, [buffer]);
-    }, ends);
-    return { type: "projected", id, bands, load, ms: performance.now() - start };
+    const places = [];
+    let load = null;
+    for (const slot of groups.get(group)) {
+      native.frame(slot, t, pose);
+      const drawn = native.project(view, ports.length, ({ i, bands, first, rows, splats }) => {
+        places[i] ??= { bands, first, rows, own: { piece, pieces, length: 0, buffer: null } };
+        append(places[i].own, i, splats);
+      }, ends);
+      load = load ? load.map((v, i) => v + drawn.load[i]) : drawn.load;
+    }
+    places.forEach((place, i) => {
+      ports[i].postMessage({ id, ...place, width: view[0], background }, [place.own.buffer]);
+    });
+    self.postMessage({ type: "projected", id, load, ms: performance.now() - start }, [load.buffer]);
   }
 
   function pack({ id, group, t, pose, view, origin, all, piece }) {
     const start = performance.now();
-    evaluate(group, t, pose);
-    const { buffer } = native.pack(view, origin, all).slice();
+    const parts = groups.get(group).map((slot) => (native.frame(slot, t, pose), native.pack(view, origin, all).slice()));
+    const { buffer } = parts.length === 1 ? parts[0] : joined(parts);
     self.postMessage({ type: "packed", id, piece, buffer, ms: performance.now() - start }, [buffer]);
   }
 
+  // Of a group in one piece: who asks for all of a group has it so.
   function attributes({ id, group, t }) {
-    evaluate(group, t);
+    native.frame(groups.get(group)[0], t);
     const values = [0, 1, 2, 3, 4, 5].map((which) => native.attribute(which));
     self.postMessage({ type: "attributes", id, values }, values.map((v) => v.buffer));
   }
 
   self.onmessage = ({ data }) => {
     try {
-      if (data.type === "decode") self.postMessage(decode(data));
-      else if (data.type === "draw") self.postMessage(draw(data));
+      if (data.type === "decode") decode(data);
+      else if (data.type === "draw") draw(data);
       else if (data.type === "pack") pack(data);
       else if (data.type === "attributes") attributes(data);
-      else if (data.type === "release" && slots.has(data.group)) {
-        native.x.release(slots.get(data.group));
-        slots.delete(data.group);
-        shown = "";
+      else if (data.type === "release") {
+        groups.get(data.group)?.forEach((slot) => native.x.release(slot));
+        groups.delete(data.group);
       }
     } catch (e) {
       // a trap leaves the instance in an unknown state
@@ -113,6 +124,12 @@ function groupWorker(native, { ports }) {
       self.postMessage({ type: "failed", group: data.group, id: data.id, message: e.message, fatal });
     }
   };
+}
+
+function joined(parts) {
+  const out = new Uint8Array(parts.reduce((n, part) => n + part.length, 0));
+  parts.reduce((at, part) => (out.set(part, at), at + part.length), 0);
+  return out;
 }
 
 function rasterWorker(native) {

@@ -102,7 +102,6 @@ def test_it_plays_loops_and_ends(browser, server):
 
 def test_keys_and_buttons(browser, server):
     load(browser, server.url, size="160x120", autoplay="off")
-    browser.eval(f"{part('.stage')}.focus()")
     frame = lambda: browser.eval(f"{PLAYER}.frame")  # noqa: E731
     show(browser, 7)
     browser.key("ArrowRight")
@@ -277,7 +276,7 @@ def test_every_vector_decodes_to_the_frames_of_the_native_decoder(browser, serve
         const out = [];
         for (const [i, g] of groups.entries()) {
             const back = native.reference(payload(g));
-            native.decode(i, payload(g), config.level, back ? i - back : undefined);
+            native.decode(i, payload(g), config.level, back ? { reference: i - back } : {});
             native.frame(i, g.frames >> 1);
             for (let a = 0; a < 6; a++) { native.x.attribute(a); out.push(base64(native.output())); }
         }

@@ -1,5 +1,6 @@
 """The player's page and groups of many tiles: shared by workers, and with headers of any length."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +12,20 @@ from synthetic import encode_sequence
 from test_player import run_wasm
 
 from gscodec import _native
-from gscodec.decode import open_stream
+from gscodec.decode import open_scene, open_stream
+from gscodec.decode.scene import Track
 from gscodec.encode.encode import stream_config
 from gscodec.encode.settings import EncodeSettings
+from gscodec.encode.tracks import TrackPlan, write_tracks
 from gscodec.encode.writer import StreamWriter
+from gscodec.model.camera import Camera, look_at
+from gscodec.model.placement import Placement
+from gscodec.model.rotations import rotvec_to_quat
 from gscodec.render.image import render_image
 
 LEVEL, SIDE = 4, 4  # log2 of the side of a tile
+HEAD = 1 << 16  # bytes that the page reads first of any file
+UP = np.array([0, 1.0, 0])
 
 
 @pytest.fixture(scope="module")
@@ -79,3 +87,93 @@ def test_a_group_of_thousands_of_tiles(browser, server, other, tmp_path):
     assert (tiles, whole, back, shown) == (1172, True, 0, 300_000)
     assert header > 1 << 14
     assert "expected at most 4194304" in message
+
+
+# whether the tiles of a group of each track that are in view are decoded
+ALL_THERE = f"""(({{ engine }}) => (engine.scene?.tracks ?? [{{ engine }}]).every(({{ engine }}) => {{
+    const {{ content, flags, left, layers }} = engine.groups.get(GROUP);
+    return !left && content.seen(engine.sight(), layers).every((seen, j) => !seen || flags[j]);
+}}))({PLAYER})"""
+
+
+def open_partly(browser, server, url: str) -> None:
+    """Opens a stream of which the page fetches only what is in view, whatever its size."""
+    browser.goto(f"{server.url}?autoplay=off&loop=off&layers=all&size=160x120")
+    browser.eval("import('/engine.js').then(({ Engine }) => (Engine.partly = 0))")
+    browser.eval(f"{PLAYER}.setAttribute('camera', 'first'), {PLAYER}.setAttribute('src', {json.dumps(url)})")
+    browser.wait(f"{PLAYER}.camera && {PLAYER}.stats.gaussians > 0")
+
+
+def compare(browser, stream, t: int, camera: Camera) -> int:
+    """Compares a picture by `camera` with that of the whole group, once all is there; Gaussians that were decoded."""
+    k = [camera.K[i] for i in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2))]
+    c = {"width": camera.width, "height": camera.height, "near": 0.01, "k": k}
+    c |= {"viewmat": camera.viewmat[:3].flatten().tolist()}
+    browser.eval(f"{PLAYER}.camera.reference = {json.dumps(c)}")
+    show(browser, t)
+    browser.wait(ALL_THERE.replace("GROUP", str(t // LENGTH)))
+    show(browser, t)
+    want = render_image(stream.frame(t), camera, tuple(stream.config["background"]))
+    assert want.std() > 5
+    assert psnr(canvas(browser), want) >= 40, t
+    return browser.eval(f"{PLAYER}.stats.gaussians")
+
+
+def test_only_the_tiles_in_view_are_decoded(browser, server, other, tiled):
+    """Of predicted and independent groups; what the view turns to is added."""
+    stream, (url, _) = open_stream(tiled), other(tiled.read_bytes())
+    open_partly(browser, server, url)
+    means = stream.frame(0).means
+    K = np.array([[900.0, 0, 80], [0, 900, 60], [0, 0, 1]])
+    ends = means[means[:, 0].argmin()], means[means[:, 0].argmax()]
+    views = [Camera("", K, look_at(e - [0, 0, 5], e, UP), 160, 120) for e in ends]
+    for t in (4 * LENGTH + 1, LENGTH + 2, 3 * LENGTH):  # predicted, predicted, independent
+        some, more = (compare(browser, stream, t, view) for view in views)
+        assert some < more <= len(stream.frame(t))
+    assert browser.errors == []
+
+
+def test_of_the_tracks_of_a_scene_only_the_tiles_in_view_are_decoded(browser, server, other, tiled, tmp_path):
+    """Each track comes in parts, by the view of where it is placed; the transform moves every piece of it."""
+    key = (0, tuple(rotvec_to_quat(np.array([0, 0.5, 0.3])).tolist()), (3.0, 0.5, 0.0), 0.5)
+    placements = Placement("one"), Placement("other", keys=(key, (60, (1.0, 0.0, 0.0, 0.0), (-3.0, 0.0, 1.0), 0.8)))
+    stream = open_scene(tiled).tracks[0].stream
+    write_tracks(tmp_path / "scene.gsv", [TrackPlan.of(Track(stream, placement)) for placement in placements])
+    scene, (url, _) = open_scene(tmp_path / "scene.gsv"), other((tmp_path / "scene.gsv").read_bytes())
+    open_partly(browser, server, url)
+    K = np.array([[900.0, 0, 80], [0, 900, 60], [0, 0, 1]])
+    for t in (4 * LENGTH + 1, LENGTH + 2, 3 * LENGTH):  # predicted, predicted, independent
+        means = scene.frame(t).means
+        ends = means[means[:, 0].argmin()], means[means[:, 0].argmax()]
+        some, more = (compare(browser, scene, t, Camera("", K, look_at(e - [0, 0, 5], e, UP), 160, 120)) for e in ends)
+        assert some < more <= len(means), t
+    assert browser.errors == []
+
+
+def test_only_the_tiles_in_view_are_fetched(browser, server, other, tmp_path):
+    """From amid a hollow ball: few bytes for a view, as many more for the opposite one, and none for what is there."""
+    group = surface_group(80_000)
+    small = replace(group.channels["log_scales"], steps=np.full(3, 0.1, np.float32))
+    group = replace(group, tile_side_log2=SIDE, channels=group.channels | {"log_scales": small})
+    middle = group.origin + 128
+    views = [
+        Camera("first", np.array([[200.0, 0, 80], [0, 200, 60], [0, 0, 1]]), look_at(middle, middle + d, UP), 160, 120)
+        for d in ([1.0, 0, 0], [-1.0, 0, 0])
+    ]
+    path = tmp_path / "ball.gsv"
+    writer = StreamWriter(path, stream_config(fps=25, sh_degree=0, gaussians=80_000, frames=1, cameras=views[:1]), {})
+    writer.append(_native.encode_group(group)[0], 1)
+    writer.finish()
+    stream, (url, handler) = open_stream(path), other(path.read_bytes())
+    open_partly(browser, server, url)
+    counts, fetched = [], []
+    for view in (*views, views[0]):
+        counts.append(compare(browser, stream, 0, view))
+        asked = [tuple(map(int, value[6:].split("-"))) for value in handler.log]
+        fetched.append(sum(end + 1 - start for start, end in asked) / path.stat().st_size)
+    assert counts[0] < 0.2 * 80_000
+    assert fetched[0] < 0.2 + HEAD / path.stat().st_size
+    assert counts[0] < counts[1] < 0.4 * 80_000
+    assert fetched[0] + 0.05 < fetched[1] < fetched[0] + 0.2
+    assert fetched[2] < fetched[1] + 0.1, "what is here is not fetched again"
+    assert browser.errors == []

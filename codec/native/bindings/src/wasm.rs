@@ -98,10 +98,10 @@ pub extern "C" fn describe(first: usize) {
 
 /// Input: the payload of a group, or its start up to the end of the first `layers` layers. The group goes to `slot`; the
 /// reference of a predicted group is in the slot `reference`. `keep_leading`: tiles that were not wanted, but decoded for their
-/// models, stay. Output: its header as JSON.
+/// models, stay. `packed`: the bytes of tiles that are not decoded are not there. Output: its header as JSON.
 #[unsafe(no_mangle)]
-pub extern "C" fn decode(slot: usize, level: u8, reference: usize, layers: usize, keep_leading: bool) -> bool {
-    with(|p| p.decode(slot, level, reference, layers, keep_leading))
+pub extern "C" fn decode(slot: usize, level: u8, reference: u8, layers: u8, keep_leading: bool, packed: bool) -> bool {
+    with(|p| p.decode(slot, [level, reference, layers], keep_leading, packed))
 }
 
 /// Input: the header of a group with the eight bytes before it; that of its reference in the first `first` bytes, if it is
@@ -122,16 +122,11 @@ pub extern "C" fn release(slot: usize) {
     with(|p| p.release(slot));
 }
 
-/// Evaluates frame `t` of the group in `slot`.
+/// Evaluates frame `t` of the group in `slot`, unless it is the last one that was evaluated of it. Input: a transform as of `pose`
+/// that places it, with a scale of 0 nothing is shown; or nothing.
 #[unsafe(no_mangle)]
 pub extern "C" fn frame(slot: usize, t: u16) -> bool {
     with(|p| p.frame(slot, t))
-}
-
-/// Places the evaluated frame. Input: a transform as of `pose`; with a scale of 0 nothing is shown.
-#[unsafe(no_mangle)]
-pub extern "C" fn place() {
-    with(Player::place);
 }
 
 /// Input: means as f32. Output: their box from the 1st to the 99th percentile, 6 f32.

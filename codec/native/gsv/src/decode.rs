@@ -41,6 +41,8 @@ pub struct Decoding<'a> {
     /// Whether tiles that were decoded for their models only are part of the group (spec 3.4). Where they are not, as in a share
     /// of a group whose other tiles somebody else holds, they are not decoded either in layers of which nothing is wanted.
     pub keep_leading: bool,
+    /// Whether the payload has no bytes of the tiles that are not decoded: what is behind them follows at once.
+    pub packed: bool,
 }
 
 impl<'a> Decoding<'a> {
@@ -52,6 +54,7 @@ impl<'a> Decoding<'a> {
             layers: ALL_LAYERS,
             tiles: None,
             keep_leading: true,
+            packed: false,
         }
     }
 
@@ -126,7 +129,8 @@ fn header_of(first: &Unit, how: &Decoding) -> Result<Header> {
 fn open<'a>(payload: &'a [u8], how: &Decoding) -> Result<(Header, Vec<Unit<'a>>)> {
     how.level.cap("group", "bytes", payload.len() as u64, how.level.bytes)?;
     let header = read_header(payload, how)?;
-    let mut units = unit::scan(payload, how.layers, |layer, tile| how.wants(&header, layer, tile))?;
+    let wanted = |layer, tile| how.wants(&header, layer, tile);
+    let mut units = unit::scan(payload, how.layers, how.packed, wanted)?;
     for u in units.iter_mut().filter(|u| u.kind == Some(UnitType::Tile)) {
         let unasked = !how.asks(u.layer.into(), u.index.into());
         if let (true, Some(Error::Bitstream { expected, .. })) = (unasked, &mut u.damage) {

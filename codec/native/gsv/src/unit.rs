@@ -124,7 +124,7 @@ const HEAD: usize = 8; // length and checksum of the group header
 
 /// Splits a group payload; damage is an error.
 pub fn split(payload: &[u8], layers: usize) -> Result<Vec<Unit<'_>>> {
-    let mut units = scan(payload, layers, |_, _| true)?;
+    let mut units = scan(payload, layers, false, |_, _| true)?;
     match units.iter_mut().find_map(|u| u.damage.take()) {
         Some(damage) => Err(damage),
         None => Ok(units),
@@ -134,11 +134,12 @@ pub fn split(payload: &[u8], layers: usize) -> Result<Vec<Unit<'_>>> {
 /// Splits a group payload and marks damaged units (spec 3): a wrong CRC, or cut off by the end of the payload.
 ///
 /// Returns the units of the first `layers` layers only; the payload may end anywhere behind them. Of the tiles only those for
-/// which `wanted(layer, index)` holds; the bytes of the others are not looked at.
+/// which `wanted(layer, index)` holds; the bytes of the others are not looked at, and are not there where the payload is
+/// `packed`.
 ///
 /// # Errors
 /// The header is damaged, or its directory breaks a rule.
-pub fn scan(payload: &[u8], layers: usize, wanted: impl Fn(u8, u16) -> bool) -> Result<Vec<Unit<'_>>> {
+pub fn scan(payload: &[u8], layers: usize, packed: bool, wanted: impl Fn(u8, u16) -> bool) -> Result<Vec<Unit<'_>>> {
     let first = first(payload)?;
     let at_header = |e: Error| e.at(HEAD, "unit 0 (group_header)");
     let (_, directory) = Header::open(first.payload).map_err(at_header)?;
@@ -166,10 +167,11 @@ pub fn scan(payload: &[u8], layers: usize, wanted: impl Fn(u8, u16) -> bool) -> 
         if usize::from(entry.layer) >= layers {
             return Ok(checked(units));
         }
-        let size = entry.size as usize;
+        let read = kind != Some(Tile) || wanted(entry.layer, entry.index);
+        let size = if read || !packed { entry.size as usize } else { 0 };
         let own = payload.get(offset..).and_then(|rest| rest.get(..size));
         let rest = payload.len().saturating_sub(offset);
-        if kind != Some(Tile) || wanted(entry.layer, entry.index) {
+        if read {
             let mut unit = Unit {
                 number: i + 1,
                 kind,

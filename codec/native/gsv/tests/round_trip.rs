@@ -117,8 +117,8 @@ proptest! {
     }
 }
 
-/// Any tiles alone are what they are in the whole group, also where the other bytes are not there; so are those of a group
-/// that is predicted from a part.
+/// Any tiles alone are what they are in the whole group, also where the other bytes are zero or left out; so are those of a
+/// group that is predicted from a part.
 #[test]
 fn tiles_come_alone() {
     let g = group(&tiled());
@@ -137,14 +137,20 @@ fn tiles_come_alone() {
             tiles: Some(&wanted),
             ..Decoding::at(&LEVELS[0])
         };
-        let mut holes = payload.clone();
+        let (mut holes, mut packed) = (payload.clone(), Vec::new());
         let lead = |u: &unit::Unit| u.index == 0 || wanted[usize::from(u.layer)][usize::from(u.index)];
         for u in unit::split(&payload, ALL_LAYERS).unwrap() {
+            let own = if packed.is_empty() { 0 } else { u.offset }..u.offset + u.size;
             if u.kind == Some(unit::UnitType::Tile) && !lead(&u) {
-                holes[u.offset..u.offset + u.size].fill(0);
+                holes[own].fill(0);
+            } else {
+                packed.extend_from_slice(&payload[own]);
             }
         }
         let part = decode_group(&holes, &how).unwrap();
+        let alone = Decoding { packed: true, ..how };
+        same(&decode_group(&packed, &alone).unwrap(), &part);
+        assert!(packed.len() == payload.len() || decode_group(&packed, &how).is_err());
         part.validate(None).unwrap();
         for (k, own) in wanted.iter().enumerate() {
             for (t, asked) in own.iter().enumerate() {

@@ -5,7 +5,7 @@ use crate::error::{RasterError, check_length};
 use crate::region::Region;
 
 /// N Gaussians, parameters before activation (exp, sigmoid and normalisation happen inside).
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Default)]
 pub struct Splats<'a> {
     pub means: &'a [f32],           // [N, 3]
     pub quats: &'a [f32],           // [N, 4] wxyz, any length but zero

@@ -51,6 +51,7 @@ impl DecodedGroup {
                 layers: layers.max(1),
                 tiles: tiles.as_deref(),
                 keep_leading: true,
+                packed: false,
             };
             let (group, damage) = if strict {
                 (decode_group(&bytes, &how)?, Vec::new())

@@ -23,7 +23,7 @@ pub struct UnitReport {
 /// The units of a payload. A tile is told as its streams and, as `tile`, the sizes of these.
 pub fn units(payload: &[u8], h: &Header, reference: Option<&Header>, layers: usize) -> Result<Vec<UnitReport>> {
     let mut out = Vec::new();
-    for u in unit::scan(payload, layers, |_, _| true)? {
+    for u in unit::scan(payload, layers, false, |_, _| true)? {
         let tile = (u.kind == Some(UnitType::Tile)).then_some(u.index);
         let streams = tile.map_or(Vec::new(), |t| {
             Stream::of(h, usize::from(u.layer), usize::from(t), reference)

@@ -18,7 +18,14 @@ use std::fmt::Display;
 /// Most pixels of an image, 4096 x 4096: a failed allocation would end the instance.
 const MAX_PIXELS: usize = 1 << 24;
 /// Slots for decoded groups and parts of them.
-const SLOTS: usize = 32;
+const SLOTS: usize = 255;
+
+/// A group, and the frame of it that was evaluated last.
+struct Slot {
+    group: Evaluator,
+    frame: Frame,
+    at: Option<(u16, Vec<f32>)>, // which frame it is, and its transform
+}
 
 pub struct Player {
     pub demuxer: Demuxer,
@@ -26,9 +33,8 @@ pub struct Player {
     /// Which tiles `decode` decodes, one byte each, layer by layer; empty: all.
     pub wanted: Vec<u8>,
     pub output: Vec<u8>,
-    groups: [Option<Evaluator>; SLOTS],
-    frame: Frame,
-    sh_k: usize,
+    groups: Vec<Option<Slot>>,
+    shown: usize, // slot of the evaluated frame
     raster: Rasterizer,
     bands: Bands,
     splats: Vec<Projected>,
@@ -42,9 +48,8 @@ impl Default for Player {
             input: Vec::new(),
             wanted: Vec::new(),
             output: Vec::new(),
-            groups: Default::default(),
-            frame: Frame::default(),
-            sh_k: 0,
+            groups: (0..SLOTS).map(|_| None).collect(),
+            shown: 0,
             raster: Rasterizer::new(SimdLevel::best(), 0),
             bands: Bands::default(),
             splats: Vec::new(),
@@ -71,21 +76,23 @@ impl Player {
         self.output = text::describe(&self.demuxer, first).into_bytes();
     }
 
-    /// Decodes the input to `slot`. The reference of a predicted group is in the slot `reference`. `keep_leading`: as of
-    /// `Decoding`.
-    pub fn decode(&mut self, slot: usize, level: u8, reference: usize, layers: usize, keep_leading: bool) -> bool {
+    /// Decodes the input to `slot`. The reference of a predicted group is in the slot `reference`. `keep_leading`, `packed`: as
+    /// of `Decoding`.
+    pub fn decode(&mut self, slot: usize, how: [u8; 3], keep_leading: bool, packed: bool) -> bool {
+        let [level, reference, layers] = how;
         let wanted = std::mem::take(&mut self.wanted);
         let decoded = Level::get(level).and_then(|caps| {
             let mut how = Decoding {
                 level: &caps,
                 reference: self
                     .groups
-                    .get(reference)
+                    .get(usize::from(reference))
                     .and_then(Option::as_ref)
-                    .map(Evaluator::group),
-                layers,
+                    .map(|slot| slot.group.group()),
+                layers: usize::from(layers),
                 tiles: None,
                 keep_leading,
+                packed,
             };
             if wanted.is_empty() {
                 return decode_group(&self.input, &how);
@@ -103,7 +110,11 @@ impl Player {
             Err(e) => self.done(Err::<(), _>(e)),
             Ok(group) => {
                 self.output = text::header(&group.header, group.positions.len()).into_bytes();
-                *place = Some(Evaluator::new(group));
+                *place = Some(Slot {
+                    group: Evaluator::new(group),
+                    frame: Frame::default(),
+                    at: None,
+                });
                 true
             }
         }
@@ -135,22 +146,26 @@ impl Player {
     }
 
     pub fn frame(&mut self, slot: usize, t: u16) -> bool {
-        let Some(Some(group)) = self.groups.get(slot) else {
+        let Some(Some(Slot { group, frame, at })) = self.groups.get_mut(slot) else {
             self.output = b"no group in this slot".to_vec();
             return false;
         };
-        group.frame(t, &mut self.frame);
-        self.sh_k = sh_coefficients(group.group().header.sh_degree);
-        for (logit, shown) in self
-            .frame
-            .logit_opacities
-            .iter_mut()
-            .zip(group.visible(t).into_iter().flatten())
-        {
+        self.shown = slot;
+        let now = (t, numbers(&self.input));
+        if at.as_ref() == Some(&now) {
+            return true;
+        }
+        group.frame(t, frame);
+        let visible = group.visible(t).into_iter().flatten();
+        for (logit, shown) in frame.logit_opacities.iter_mut().zip(visible) {
             if !shown {
                 *logit = f32::NEG_INFINITY; // the projection leaves it out
             }
         }
+        if let Some(transform) = now.1.first_chunk() {
+            place(frame, *transform);
+        }
+        *at = Some(now);
         true
     }
 
@@ -158,20 +173,6 @@ impl Player {
         let pose = self.demuxer.config().map_or(Pose::default(), |c| c.placement.pose(u));
         let ([w, x, y, z], [a, b, c]) = (pose.rotation, pose.translation);
         self.output = floats(&[w, x, y, z, a, b, c, pose.scale]);
-    }
-
-    pub fn place(&mut self) {
-        let [w, x, y, z, a, b, c, scale] = *numbers(&self.input).first_chunk().unwrap_or(&[0.0; 8]);
-        if scale > 0.0 {
-            let pose = Pose {
-                rotation: [w, x, y, z],
-                translation: [a, b, c],
-                scale,
-            };
-            pose.apply(self.frame.as_mut());
-        } else {
-            self.frame.logit_opacities.fill(f32::NEG_INFINITY); // the projection leaves them out
-        }
     }
 
     pub fn bounds(&mut self) {
@@ -192,7 +193,9 @@ impl Player {
     }
 
     pub fn attribute(&mut self, which: usize) {
-        let f = &self.frame;
+        let Some(Some(Slot { frame: f, .. })) = self.groups.get(self.shown) else {
+            return self.output.clear();
+        };
         self.output = floats(match which {
             0 => f.means.as_flattened(),
             1 => f.quats.as_flattened(),
@@ -204,11 +207,11 @@ impl Player {
     }
 
     pub fn project(&mut self, bands: usize) -> usize {
-        let (f, input) = (&self.frame, numbers(&self.input));
-        let view = view(&input);
+        let input = numbers(&self.input);
+        let (view, shown) = (view(&input), self.groups.get(self.shown));
         let given: Vec<usize> = input.iter().skip(VIEW).map(|v| *v as usize).collect();
         let size = [view.width, view.height];
-        let drawn = self.raster.project(&splats(f, self.sh_k), &view);
+        let drawn = self.raster.project(&splats(shown), &view);
         let drawn = drawn.map(|projected| match given.is_empty() {
             true => self.bands.split(projected, size, bands).len(),
             false => self.bands.split_at(projected, size, &given).len(),
@@ -226,10 +229,14 @@ impl Player {
     }
 
     pub fn pack(&mut self, origin: [f32; 3], all: bool) -> bool {
-        let f = &self.frame;
+        let shown = self.groups.get(self.shown);
         self.output.clear();
-        let drawn = self.raster.project(&splats(f, self.sh_k), &view(&numbers(&self.input)));
-        let packed = drawn.map(|projected| pack::pack(f, projected, origin, all, &mut self.output));
+        let drawn = self.raster.project(&splats(shown), &view(&numbers(&self.input)));
+        let packed = drawn.map(|projected| {
+            if let Some(Some(slot)) = shown {
+                pack::pack(&slot.frame, projected, origin, all, &mut self.output);
+            }
+        });
         self.done(packed)
     }
 
@@ -279,7 +286,12 @@ fn describe_units(before: &[u8], own: &[u8]) -> Result<String, Error> {
     ))
 }
 
-fn splats(f: &Frame, sh_k: usize) -> Splats<'_> {
+/// The frame of a slot; none without one.
+fn splats(slot: Option<&Option<Slot>>) -> Splats<'_> {
+    let Some(Some(Slot { frame: f, group, .. })) = slot else {
+        return Splats::default();
+    };
+    let sh_k = sh_coefficients(group.group().header.sh_degree);
     Splats {
         means: f.means.as_flattened(),
         quats: f.quats.as_flattened(),
@@ -288,6 +300,20 @@ fn splats(f: &Frame, sh_k: usize) -> Splats<'_> {
         sh0: &f.sh0,
         sh_n: &f.sh_n,
         sh_k,
+    }
+}
+
+/// Places a frame by a transform as of `Player::pose`.
+fn place(frame: &mut Frame, [w, x, y, z, a, b, c, scale]: [f32; 8]) {
+    if scale > 0.0 {
+        let pose = Pose {
+            rotation: [w, x, y, z],
+            translation: [a, b, c],
+            scale,
+        };
+        pose.apply(frame.as_mut());
+    } else {
+        frame.logit_opacities.fill(f32::NEG_INFINITY); // the projection leaves them out
     }
 }
 
