@@ -49,9 +49,9 @@ ci: venv tools neon fuzz
 
 # Programs that tests use, and that a developer may lack: their tests are skipped then.
 tools: venv
-	@command -v npm >/dev/null || $(APT) npm >/dev/null
-	@command -v qemu-aarch64 >/dev/null && command -v aarch64-linux-gnu-gcc >/dev/null \
-		|| $(APT) qemu-user gcc-aarch64-linux-gnu libc6-dev-arm64-cross >/dev/null
+	@command -v npm >/dev/null || { $(APT) npm >/dev/null; }
+	@{ command -v qemu-aarch64 && command -v aarch64-linux-gnu-gcc; } >/dev/null \
+		|| { $(APT) qemu-user gcc-aarch64-linux-gnu libc6-dev-arm64-cross >/dev/null; }
 	npm install --silent --no-audit --no-fund --prefix $(TOOLS) @playcanvas/splat-transform@3
 	$(BIN)/python -m pip install --quiet --editable '.[ray]'
 
