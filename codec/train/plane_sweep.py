@@ -3,11 +3,19 @@
 In: views of one frame. Out: points and colours. Each view is compared with its neighbours over planes parallel to its
 image (Collins 1996) by normalised cross-correlation in small windows, so that exposure does not matter. The better half
 of the neighbours makes the score, because the others may not see the surface (Kang et al. 2001). A depth is kept where
-the correlation is high and another depth map agrees. A shell of far points is added around the scene, for parts without
-texture and therefore without depth (sky, dark): stage has 26.7 dB with it, 25.7 without, 23.8 with random points.
+the correlation is high and another depth map agrees.
+
+Two views that look from directions far apart see a surface at such different slants that windows parallel to one image
+never match. A view without near neighbours is compared with the nearest ones there are over planes of several
+directions (Gallup et al. 2007): level ones (floor, table) and upright ones.
+
+A shell of far points is added around the scene, for parts without texture and therefore without depth (sky, dark):
+stage has 26.7 dB with it, 25.7 without, 23.8 with random points.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -43,8 +51,15 @@ def sweep(
     centre = meeting_point(cameras)
     distance = np.median([np.linalg.norm(c.center - centre) for c in cameras])
     inverse = np.linspace(1 / (settings.far * distance), 1 / (settings.near * distance), settings.planes)
-    near = [_neighbours(cameras, i, settings) for i in range(len(cameras))]
-    depths = [_depth(cameras, greys, where[i], i, near[i], inverse, settings) for i in range(len(cameras))]
+    near, depths = [], []
+    for i, camera in enumerate(cameras):
+        s, neighbours, normals = settings, _neighbours(cameras, i, settings), [camera.viewmat[2, :3]]
+        if len(neighbours) < s.scored_neighbours:
+            s = replace(s, axis_cosine_min=-1.0, scored_neighbours=1, correlation_min=s.lone_correlation_min)
+            neighbours = _neighbours(cameras, i, s)
+            normals += world_normals(cameras, s.upright_planes)
+        near.append(neighbours)
+        depths.append(_depth(cameras, greys, where[i], i, neighbours, _planes(camera, normals, inverse), s))
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for i, camera in enumerate(cameras):
         y, x = np.nonzero(depths[i])
@@ -84,6 +99,22 @@ def _neighbours(cameras, i: int, settings: PlaneSweepSettings) -> list[int]:
     return order[: settings.neighbours]
 
 
+def world_normals(cameras, upright: int) -> list[np.ndarray]:
+    """Unit normals of level planes and of `upright` upright ones, evenly around; up is up in the mean image."""
+    up = -np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
+    up /= max(np.linalg.norm(up), 1e-9)
+    side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    side /= max(np.linalg.norm(side), 1e-9)
+    angles = np.pi * np.arange(upright) / max(upright, 1)
+    return [up, *(np.cos(a) * side + np.sin(a) * np.cross(up, side) for a in angles)]
+
+
+def _planes(camera, normals: list[np.ndarray], inverse: np.ndarray) -> list[np.ndarray]:
+    """Planes n . x = 1 in the camera's axes, as n [3]: of each normal on both sides of the camera; `inverse`: [P],
+    1 / distance."""
+    return [side * d * (camera.viewmat[:3, :3] @ n) for n in normals for side in (1, -1) for d in inverse]
+
+
 def unproject(camera, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Points [N, 3] of pixels at a depth."""
     rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1) @ np.linalg.inv(camera.K).T
@@ -99,12 +130,15 @@ def _agree(points: np.ndarray, camera, depths: np.ndarray, tolerance: float) -> 
     return on & (there > 0) & (np.abs(there - depth) < tolerance * depth)
 
 
-def _plane(camera, other, inverse_depth: float) -> np.ndarray:
-    """Homography [3, 3] from `camera` to `other`, of a plane parallel to the image of `camera`, on OpenCV's pixel grids
-    (centres at whole numbers)."""
+def _ray_map(camera, other, plane: np.ndarray) -> np.ndarray:
+    """[3, 3], from rays of `camera` to those of `other` by way of a plane n . x = 1 in the axes of `camera`."""
     R = other.viewmat[:3, :3] @ camera.viewmat[:3, :3].T
-    t = other.viewmat[:3, 3] - R @ camera.viewmat[:3, 3]
-    H = other.K @ (R + np.outer(t, [0, 0, inverse_depth])) @ np.linalg.inv(camera.K)
+    return R + np.outer(other.viewmat[:3, 3] - R @ camera.viewmat[:3, 3], plane)
+
+
+def _homography(camera, other, ray_map: np.ndarray) -> np.ndarray:
+    """Homography [3, 3] from `camera` to `other`, on OpenCV's pixel grids (centres at whole numbers)."""
+    H = other.K @ ray_map @ np.linalg.inv(camera.K)
     centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
     return np.linalg.inv(centre) @ H @ centre
 
@@ -118,14 +152,14 @@ def _windows(grey: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _depth(
-    cameras, greys, where: np.ndarray, i: int, near: list[int], inverse: np.ndarray, settings: PlaneSweepSettings
+    cameras, greys, where: np.ndarray, i: int, near: list[int], planes: list[np.ndarray], settings: PlaneSweepSettings
 ) -> np.ndarray:
     """Depth of view `i`, [H, W], 0 where it is unknown.
 
     Args:
         where: [H, W] bool, pixels whose depth is searched.
         near: indices of the neighbours.
-        inverse: [P], 1 / depth of the planes.
+        planes: n [3] of each plane n . x = 1 in the axes of the camera.
     """
     import cv2
 
@@ -139,18 +173,26 @@ def _depth(
     mean, deviation = _windows(grey, settings.window)
     best, depth = np.full(grey.shape, -1, np.float32), np.zeros(grey.shape, np.float32)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    for d in inverse:
+    y, x = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.K).T
+    slant = settings.slant_cosine_min * np.linalg.norm(rays, axis=2)
+    for plane in planes:
+        inverse_depth = rays @ plane
+        faces = (inverse_depth > slant * np.linalg.norm(plane)) & (inverse_depth * camera.near < 1)
+        if not faces.any():
+            continue
         scores = np.empty((len(near), *grey.shape), np.float32)
         for score, j in zip(scores, near, strict=True):
-            plane = _plane(camera, cameras[j], d)
-            seen = cv2.warpPerspective(greys[j], plane, grey.shape[::-1], flags=flags, borderValue=-1)
+            ray_map = _ray_map(camera, cameras[j], plane)
+            H = _homography(camera, cameras[j], ray_map)
+            seen = cv2.warpPerspective(greys[j], H, grey.shape[::-1], flags=flags, borderValue=-1)
             mean_seen, deviation_seen = _windows(seen, settings.window)
             score[:] = cv2.blur(grey * seen, (settings.window, settings.window)) - mean * mean_seen
             score /= deviation * np.maximum(deviation_seen, settings.contrast_min)
-            score[seen < 0] = -1
+            score[(seen < 0) | ~faces | (rays @ ray_map[2] <= 0)] = -1
         score = np.sort(scores, 0)[-settings.scored_neighbours :].mean(0)
         better = score > best
-        best[better], depth[better] = score[better], 1 / d
+        best[better], depth[better] = score[better], 1 / inverse_depth[better]
     depth[(best < settings.correlation_min) | (deviation < settings.contrast_min) | ~where[part]] = 0
     whole[part] = depth
     return whole

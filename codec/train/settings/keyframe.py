@@ -47,6 +47,9 @@ class PlaneSweepSettings:
     neighbours: int = 4  # cameras that a view is compared with
     scored_neighbours: int = 2  # best ones, whose mean is the score: the others may not see the surface
     axis_cosine_min: float = 0.5  # between optical axes of neighbours: 60 degrees
+    lone_correlation_min: float = 0.75  # where one view, from far aside, is all there is to compare with
+    upright_planes: int = 6  # directions of upright planes, for a view without near neighbours
+    slant_cosine_min: float = 0.15  # between a ray and the normal of a plane
     window: int = 7  # pixels, side of the correlated windows
     correlation_min: float = 0.6  # normalised; below it a depth is not believed
     depth_tolerance: float = 0.03  # relative difference of depth at which two views agree
