@@ -25,7 +25,7 @@ def test_light_that_comes_on_ends_a_group_and_not_the_subject():
     dark = blob(200)
     lit = dataclasses.replace(dark, sh0=dark.sh0 + 0.6)
     capture = capture_of(GaussianSequence(25.0, [DenseGroup([g]) for g in (dark,) * 5 + (lit,) * 2]))
-    first, second = train_groups(capture, dataclasses.replace(TINY, gop=8))
+    first, second = train_groups(capture, dataclasses.replace(TINY, gop=8, finetune_steps=30))
     assert (len(first), len(second)) == (5, 2)
     assert second.parents is not None
     np.testing.assert_array_equal(first.frame(0).sh0, first.frame(4).sh0)
