@@ -13,7 +13,7 @@ from gscodec.capture.capture import Capture
 from gscodec.capture.images import View
 from gscodec.capture.points import Points
 from gscodec.encode.settings import EncodeSettings
-from gscodec.model.camera import meeting_point
+from gscodec.model.camera import Camera, look_at, meeting_point
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.model.gaussians import PARAMETERS
 from gscodec.render.cpu import CpuBackend
@@ -58,6 +58,22 @@ def test_sweep_finds_a_textured_wall():
     behind, _ = shell(views, TINY.plane_sweep)
     assert len(behind) > 5
     assert (behind[:, 1] > 8).all()
+
+
+def test_sweep_finds_a_floor_seen_from_sides_far_apart():
+    """Windows parallel to an image never match between views that are more than 60 degrees apart; level ones do."""
+    wall, turned = splat_wall(height=4.0), np.sqrt(0.5).astype(np.float32)
+    floor = dataclasses.replace(wall, means=wall.means[:, [0, 2, 1]], quats=wall.quats * turned)
+    K = np.array([[150.0, 0, 64], [0, 150.0, 48], [0, 0, 1]])
+    eyes = [(2.2 * np.cos(a), 2.2 * np.sin(a), 2.6) for a in (0.1, 2.2, 4.3)]
+    cameras = [Camera(f"cam{i}", K, look_at(e, np.zeros(3), [0, 0, 1]), 128, 96) for i, e in enumerate(eyes)]
+    views = [(c, render_image(floor, c, (0, 0, 0)), None) for c in cameras]
+    settings = dataclasses.replace(TINY.plane_sweep, axis_cosine_min=0.8)
+    points, _ = sweep(views, 1000, 0, settings)
+    assert len(points) == 1000
+    assert (np.abs(points[:, 2]) < 0.15).mean() > 0.7, "two views agree by chance, too"
+    parallel = dataclasses.replace(settings, scored_neighbours=0)  # no view is without near neighbours then
+    assert len(sweep(views, 1000, 0, parallel)[0]) == 0
 
 
 def test_initial_points_do_without_shell_or_sweep():

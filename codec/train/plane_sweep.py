@@ -15,8 +15,6 @@ stage has 26.7 dB with it, 25.7 without, 23.8 with random points.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ..model.camera import fibonacci_directions, meeting_point
@@ -55,7 +53,7 @@ def sweep(
     for i, camera in enumerate(cameras):
         s, neighbours, normals = settings, _neighbours(cameras, i, settings), [camera.viewmat[2, :3]]
         if len(neighbours) < s.scored_neighbours:
-            s = replace(s, axis_cosine_min=-1.0, scored_neighbours=1, correlation_min=s.lone_correlation_min)
+            s = s.of_lone_view()
             neighbours = _neighbours(cameras, i, s)
             normals += world_normals(cameras, s.upright_planes)
         near.append(neighbours)
@@ -179,17 +177,21 @@ def _depth(
     for plane in planes:
         inverse_depth = rays @ plane
         faces = (inverse_depth > slant * np.linalg.norm(plane)) & (inverse_depth * camera.near < 1)
-        if not faces.any():
+        if np.count_nonzero(faces) < settings.window**2:
             continue
         scores = np.empty((len(near), *grey.shape), np.float32)
         for score, j in zip(scores, near, strict=True):
             ray_map = _ray_map(camera, cameras[j], plane)
             H = _homography(camera, cameras[j], ray_map)
             seen = cv2.warpPerspective(greys[j], H, grey.shape[::-1], flags=flags, borderValue=-1)
+            inside = (seen >= 0) & faces & (rays @ ray_map[2] > 0)
+            score[:] = -1
+            if not inside.any():
+                continue
             mean_seen, deviation_seen = _windows(seen, settings.window)
             score[:] = cv2.blur(grey * seen, (settings.window, settings.window)) - mean * mean_seen
             score /= deviation * np.maximum(deviation_seen, settings.contrast_min)
-            score[(seen < 0) | ~faces | (rays @ ray_map[2] <= 0)] = -1
+            score[~inside] = -1
         score = np.sort(scores, 0)[-settings.scored_neighbours :].mean(0)
         better = score > best
         best[better], depth[better] = score[better], 1 / inverse_depth[better]

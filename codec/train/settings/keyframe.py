@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from .learning_rates import LearningRates, keyframe_rates
 
@@ -48,6 +48,7 @@ class PlaneSweepSettings:
     scored_neighbours: int = 2  # best ones, whose mean is the score: the others may not see the surface
     axis_cosine_min: float = 0.5  # between optical axes of neighbours: 60 degrees
     lone_correlation_min: float = 0.75  # where one view, from far aside, is all there is to compare with
+    lone_window: int = 11  # pixels, there: two views agree by chance more often than three
     upright_planes: int = 6  # directions of upright planes, for a view without near neighbours
     slant_cosine_min: float = 0.15  # between a ray and the normal of a plane
     window: int = 7  # pixels, side of the correlated windows
@@ -55,6 +56,11 @@ class PlaneSweepSettings:
     depth_tolerance: float = 0.03  # relative difference of depth at which two views agree
     contrast_min: float = 2.0  # grey levels, standard deviation in a window: below it a window has no texture
     shell_points: int = 500  # on the whole sphere; 0: no shell
+
+    def of_lone_view(self) -> PlaneSweepSettings:
+        """The settings for a view that has fewer near neighbours than are scored: one from any side decides."""
+        lone = {"window": self.lone_window, "correlation_min": self.lone_correlation_min}
+        return replace(self, axis_cosine_min=-1.0, scored_neighbours=1, **lone)
 
 
 @dataclass(frozen=True)
