@@ -122,6 +122,7 @@ def encode_groups(
     cameras: CamerasAt = lambda _: (),
     refine_by_pictures: RefineByPictures | None = None,
     on_group: Callable[[EncodeReport], None] | None = None,
+    keep_part: bool = False,
 ) -> EncodeReport:
     """Writes a stream from the groups that `groups(done, frames)` yields: those after the `done` groups, `frames`
     frames, that an earlier run left in the file.
@@ -130,6 +131,7 @@ def encode_groups(
         cameras: frame -> cameras for training, from which the subject was captured: sensitivity is measured from them.
         refine_by_pictures: (group, first frame, quantizer) of a capture: the last stage of training, for groups that
             have a calibration.
+        keep_part: a complete stream, too, leaves what a later run goes on from, which then has nothing to do.
 
     Ctrl-C finishes the file with the groups done and returns with `interrupted` set; the next run goes on.
     """
@@ -144,7 +146,7 @@ def encode_groups(
         writer.abandon()
         raise
     if writer.groups:
-        writer.finish(keep_part=report.interrupted)
+        writer.finish(keep_part=keep_part or report.interrupted)
     else:
         writer.abandon()
     report.frames, report.groups = writer.frames, writer.groups
