@@ -63,6 +63,10 @@ def encode(
             show_default="one track",
         ),
     ] = None,
+    reuse_geometry: Annotated[
+        Path | None,
+        typer.Option("--reuse-geometry", metavar="OLD.gsv", help="Take all but colours from OLD.gsv; SEQ has others."),
+    ] = None,
     from_maps: Annotated[
         bool, typer.Option("--from-maps", help="SEQ is a folder of attribute maps, of decode --maps.")
     ] = False,
@@ -75,12 +79,14 @@ def encode(
     if from_maps:
         _from_maps(seq, out, audio)
         return
+    from ..encode.reuse_geometry import color_bytes
     from ..encode.settings import EncodeSettings
     from .sources import TrainOptions
 
     with Bar() as bar:
         settings = EncodeSettings(quality, _bits(bitrate), keep_all, random_access, layers, refine)
-        result = encode_input(seq, out, settings, TrainOptions(preset, frames, gop, motion, ray), bar, audio, tracks)
+        options = TrainOptions(preset, frames, gop, motion, ray)
+        result = encode_input(seq, out, settings, options, bar, audio, tracks, reuse_geometry)
     if report:
         report.write_text(json.dumps(result.to_json(), indent=1))
     if tracks:
@@ -90,6 +96,8 @@ def encode(
         print("stopped before the first group was done; nothing is left behind", file=sys.stderr)
         raise typer.Exit(130)
     _print_stream(out, result)
+    if reuse_geometry:
+        stdout.print(f"{color_bytes(result)} bytes of colours are new, geometry and motion are of {reuse_geometry}")
     if result.interrupted:
         print("stopped early: the file holds the groups done, the same command goes on", file=sys.stderr)
         raise typer.Exit(130)
@@ -157,11 +165,13 @@ def encode_input(
     bar: Bar,
     audio: Path | None = None,
     tracks: str | None = None,
+    reuse_geometry: Path | None = None,
 ) -> EncodeReport | TracksReport:
     """Encodes a capture or splats at `source`, and the sound of the file `audio`, into the file `out`.
 
     Args:
         tracks: how a capture is split into tracks (`split_capture`); None: it is not.
+        reuse_geometry: a stream of which all but the colours is taken.
 
     Raises:
         UsageError, CaptureError: see the message.
@@ -170,6 +180,7 @@ def encode_input(
     from ..encode.encode import StreamOutput, encode_groups
     from ..splats import detect_input
     from .encode_tracks import encode_tracks
+    from .reuse_geometry import encode_reusing
     from .sources import capture_source, say_lengths, splat_source
 
     if options.gop < 1:
@@ -188,6 +199,10 @@ def encode_input(
     def made_by(opened: Source) -> dict:
         return {"program": program(), "input": inputs(source), "settings": asdict(opened.settings) | opened.made_of}
 
+    if tracks and reuse_geometry:
+        raise UsageError("--tracks and --reuse-geometry exclude each other: recolour the tracks one by one")
+    if reuse_geometry:
+        return encode_reusing(source, kind, reuse_geometry, out, settings, options, bar, sound)
     if tracks:
         both = (audio, sound) if sound else None
         return encode_tracks(source, out, settings, options, tracks, bar, made_by=made_by, audio=both)

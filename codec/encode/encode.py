@@ -7,7 +7,8 @@ run that stops goes on where it stopped, to the same bytes.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -138,8 +139,16 @@ def encode_groups(
     writer = StreamWriter(output.path, output.config, output.fingerprint, output.audio)
     coder = GroupCoder(settings, float(output.config["fps"]), cameras, refine_by_pictures)
     report = EncodeReport(seconds={"input": 0.0, "code": 0.0})
-    try:
+    with completed(writer, report, keep_part=keep_part):
         _code_all(groups(writer.groups, writer.frames), coder, writer, report, on_group)
+    return report
+
+
+@contextmanager
+def completed(writer: StreamWriter, report: EncodeReport, *, keep_part: bool = False) -> Iterator[None]:
+    """Around the loop that appends groups: finishes the file, also after Ctrl-C, and counts it in `report`."""
+    try:
+        yield
     except KeyboardInterrupt:
         report.interrupted = True
     except BaseException:
@@ -150,8 +159,7 @@ def encode_groups(
     else:
         writer.abandon()
     report.frames, report.groups = writer.frames, writer.groups
-    report.bytes = Path(output.path).stat().st_size if writer.groups else 0
-    return report
+    report.bytes = writer.out.stat().st_size if writer.groups else 0
 
 
 def _code_all(groups: Iterable[ParametricGroup], coder: GroupCoder, writer: StreamWriter, report, on_group) -> None:
