@@ -1,7 +1,7 @@
 """Colours of a group anew, by the pictures of a capture: its geometry and its motion stay as they are.
 
-In: a group, pictures. Out: the group with other sh0, shN and trajectories of these. First one affine map of all of them:
-a grade or another light mostly is one, and so what no camera sees changes as well. Then Adam on harmonics and on the
+In: a group, pictures. Out: the group in new colours, its trajectories included. First one affine map of all colours,
+since a grade or another light mostly is one; what no camera sees changes with it. Then Adam on harmonics and on the
 lowest temporal frequencies, for every Gaussian.
 """
 
