@@ -80,6 +80,11 @@ def plate_finder(capture: Capture, index: int, plates: Path) -> Callable[[int], 
     if plate.shape[:2] != (feed.height, feed.width):
         height, width = plate.shape[:2]
         raise CaptureError(f"{path}: {width}x{height}, expected {feed.width}x{feed.height} as the images of its camera")
+    return unlike_finder(feed, plate)
+
+
+def unlike_finder(feed: Footage, plate: np.ndarray) -> Callable[[int], Likely]:
+    """t -> what differs from `plate`, [H, W, 3] u8 of the same camera, without its shadow."""
     empty = _small(plate)
 
     def find(t: int) -> Likely:

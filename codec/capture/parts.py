@@ -1,27 +1,29 @@
 """A capture in two: what stands still, as one frame, and what does not, as a subject with masks.
 
 Capture -> Parts, for a file of several tracks. Cameras must stand still. The still part is the median over time of each
-camera's pictures, of a pixel those where no mask covers it; what a mask always covers is filled in from around it:
-other cameras see it. Masks are those of the capture, or found by movement (mask_finders.py).
+camera's pictures. By masks it is that of the pixels beside them, and what a mask always covers is filled in from around
+it: other cameras see it. By motion the subject is what differs from the median (mask_finders.py): whatever stands still
+for most of the time is in the still part, and both together are the pictures.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from threading import Lock
 
 import numpy as np
 
 from ..errors import CaptureError, UsageError, require
 from .capture import Capture
 from .images import View
-from .mask_finders import GROW, disc, moving_finder
+from .mask_finders import GROW, disc, unlike_finder
 from .masks import FRAMES_LEAST, mask_of
 
 WAYS = ("masks", "motion")
 SAMPLES = 31  # frames of which the median is taken
+NO_ROOM = "its images have an alpha channel, so that nothing is known of the room; encode it without --tracks"
 FILL = 3.0  # pixels, radius of what fills a hole in
 
 
@@ -53,10 +55,11 @@ def split_capture(capture: Capture, by: str) -> Parts:
         raise CaptureError(
             f"{capture.name}: its cameras move, so that no picture stays; --tracks needs cameras that rest"
         )
-    subject = _masked(capture) if by == "masks" else _moving(capture)
-    read = cache(lambda i, _: View(still_picture(subject, i)))
+    source = _masked(capture) if by == "masks" else _unmasked(capture)
+    still = cache(lambda i: still_picture(source, i))
+    subject = source if by == "masks" else _unlike(source, still)
     room = replace(capture, frame_count=1, first_frame=0, has_alpha=False, has_depth=False, poses=None, footage=())
-    return Parts(replace(room, read=read), subject)
+    return Parts(replace(room, read=lambda i, _: View(still(i))), subject)
 
 
 def _masked(capture: Capture) -> Capture:
@@ -67,38 +70,37 @@ def _masked(capture: Capture) -> Capture:
             f"or --tracks motion"
         )
     if any(f.has_alpha and not f.masks for f in capture.footage):
-        raise CaptureError(
-            f"{capture.name}: its images have an alpha channel, so that nothing is known of the room; "
-            f"encode it without --tracks"
-        )
+        raise CaptureError(f"{capture.name}: {NO_ROOM}")
     return capture
 
 
-def _moving(capture: Capture) -> Capture:
-    """The capture with masks of what moves; those that it has are not looked at."""
+def _unmasked(capture: Capture) -> Capture:
+    """The whole pictures of a capture that is long enough to see what moves."""
     if capture.frame_count < FRAMES_LEAST:
         raise CaptureError(
             f"{capture.name}: {capture.frame_count} frames, expected {FRAMES_LEAST} or more to see what moves"
         )
-    locks = [Lock() for _ in capture.cameras]
-    finder = cache(lambda i: moving_finder(_Footage(capture, i), capture.frame_count, capture.fps))
+    if any(f.has_alpha and not f.masks for f in capture.footage):
+        raise CaptureError(f"{capture.name}: {NO_ROOM}")
+    read = lambda i, t: replace(capture.view(i, t), alpha=None)  # noqa: E731
+    poses = None if capture.poses is None else capture.camera
+    return replace(capture, first_frame=0, has_alpha=False, read=read, poses=poses, footage=())
 
-    @cache
-    def packed(i: int, t: int) -> bytes:
-        with locks[i]:  # the first frame of a camera looks at all of them
-            find = finder(i)
-        return _packed(mask_of(capture.view(i, t).rgb, find(t)))
+
+def _unlike(capture: Capture, still: Callable[[int], np.ndarray]) -> Capture:
+    """The capture with masks of what differs from the still pictures."""
+    finder = cache(lambda i: unlike_finder(_Footage(capture, i), still(i)))
+    packed = cache(lambda i, t: _packed(mask_of(capture.view(i, t).rgb, finder(i)(t))))
 
     def read(i: int, t: int) -> View:
         return replace(capture.view(i, t), alpha=_unpacked(packed(i, t)))
 
-    poses = None if capture.poses is None else capture.camera
-    return replace(capture, first_frame=0, has_alpha=True, read=read, poses=poses, footage=())
+    return replace(capture, has_alpha=True, read=read)
 
 
 @dataclass(frozen=True)
 class _Footage:
-    """The undistorted pictures of one camera, as `moving_finder` reads them."""
+    """The undistorted pictures of one camera, as `unlike_finder` reads them."""
 
     capture: Capture
     index: int

@@ -26,6 +26,7 @@ from .sources import Source, TrainOptions, say_few_cameras, say_lengths, trained
 if TYPE_CHECKING:
     from ..capture import Capture
 
+ROOM_LONGER = 2.0  # times the steps of a keyframe: no group is fine-tuned after it, and it is shown in all frames
 FOREVER = 0  # Placement.repeats
 SUBJECT = {"masks": "subject", "motion": "moving"}  # name of its track
 
@@ -90,7 +91,7 @@ def encode_tracks(
     def coded(part: Capture, track: str, own: TrainOptions, sound: AudioTrack | None) -> EncodeReport:
         bar.say(f"track {track}: {part.frame_count} frame{'s' * (part.frame_count > 1)}")
         path = work / f"{track}.gsv"
-        opened = trained_source(part, path, settings, own, bar)
+        opened = trained_source(part, path, settings, own, bar, longer=ROOM_LONGER if track == "room" else 1)
         opened = replace(opened, made_of=opened.made_of | {"tracks": by, "track": track})
         return encode_groups(
             opened.groups,

@@ -220,14 +220,27 @@ def _recipe(options: TrainOptions, settings: EncodeSettings):
     return train_settings(options.preset, settings.quality, motion=options.motion, gop=options.gop)
 
 
-def trained_source(capture: Capture, out: Path, settings: EncodeSettings, options: TrainOptions, bar: Bar) -> Source:
-    """An opened capture, or a part of one; `out`: the stream, beside which checkpoints lie."""
+def trained_source(
+    capture: Capture,
+    out: Path,
+    settings: EncodeSettings,
+    options: TrainOptions,
+    bar: Bar,
+    *,
+    longer: float = 1.0,
+) -> Source:
+    """An opened capture, or a part of one.
+
+    Args:
+        out: the stream, beside which checkpoints lie. longer: times the usual steps of a keyframe.
+    """
     from ..train.checkpoint import Checkpoint
     from ..train.refinement import PictureRefinement
     from ..train.settings import LOSS
 
     limit_torch_threads()
     recipe = _recipe(options, settings)
+    recipe = replace(recipe, keyframe_steps=round(longer * recipe.keyframe_steps))
     settings = replace(settings, loss=LOSS[options.preset])
     work, trained = out.with_name(out.name + ".work"), capture.indices("train")
     return Source(

@@ -81,7 +81,7 @@ def encode_recolored(
             kept = {str(k): np.frombuffer(c.payload, np.uint8) for k, c in known.items()}
             writer.append(payload, q.frames, sync=old.groups[i]["sync"], state=kept)
             report.seconds["code"] += time.perf_counter() - mark
-            _account(report, units, len(q))
+            _account(report, units, old.groups[i] | {"bytes": len(payload), "predicted": bool(q.reference)}, len(q))
             if on_group:
                 report.frames = writer.frames
                 on_group(report)
@@ -104,7 +104,10 @@ def _known(writer: StreamWriter, old: Stream) -> dict[int, _Coded]:
     return known
 
 
-def _account(report: EncodeReport, units: list[dict], gaussians: int) -> None:
+def _account(report: EncodeReport, units: list[dict], group: dict, gaussians: int) -> None:
+    entry = {"frame": group["start_frame"], "ended": ""} | {n: group[n] for n in ("frames", "bytes", "predicted")}
+    report.group_list.append(entry)
+    report.predicted += entry["predicted"]
     report.gaussians = max(report.gaussians, gaussians)
     for u in units:
         name = u["type"] if not u.get("attribute") else f"{u['type']} {u['attribute']}"
