@@ -7,14 +7,22 @@ import cv2
 import numpy as np
 import pytest
 from interrupting import gscodec
+from synthetic import blob, encode_sequence, moved
 from test_tracks import fails, payloads
 
 from bench.procedural import Scene, placed, write_transforms
 from gscodec.capture import open_capture
 from gscodec.capture.parts import split_capture
-from gscodec.decode import open_scene
+from gscodec.decode import open_scene, open_stream
+from gscodec.encode.encode import stream_config
+from gscodec.encode.settings import EncodeSettings
+from gscodec.encode.split import split_stream
+from gscodec.encode.subjects import find_subjects
 from gscodec.errors import CaptureError
 from gscodec.metrics.image import psnr
+from gscodec.model.camera import Camera, look_at
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.model.gaussians import concatenate
 from gscodec.render.image import render_image
 
 FRAMES = 6
@@ -123,6 +131,49 @@ def test_a_damaged_subject_leaves_the_room(scene, tmp_path):
     with pytest.warns(UserWarning, match="a track is left out where it is damaged"):
         assert len(open_scene(path).frame(0)) == len(opened.tracks[1].stream.frame(0))
     assert payloads(open_scene(path).tracks[1].stream) == payloads(opened.tracks[1].stream)
+
+
+def pair(apart):
+    """12 frames of a blob that stands and one that moves away: `apart` at first, groups predicted from each other."""
+    still, other = blob(200, 1), blob(100, 2)
+    frames = [concatenate([still, moved(other, [0, 0.1 * t, 0], [apart + 0.2 * t, 0, 0])]) for t in range(12)]
+    same = np.arange(len(frames[0]))
+    return GaussianSequence(30.0, [DenseGroup(frames[k : k + 4], None, same if k else None) for k in (0, 4, 8)])
+
+
+@pytest.mark.parametrize("apart", [4.0, 2.1], ids=["apart", "touching at first"])
+def test_subjects_that_part_are_told_apart_and_split_without_loss(apart, tmp_path):
+    whole = tmp_path / "whole.gsv"
+    config = stream_config(fps=30, sh_degree=0, gaussians=300, frames=4)
+    encode_sequence(pair(apart), whole, config, EncodeSettings(quality=60, refine=0))
+    stream = open_stream(whole)
+    assert [stream.group(i).reference for i in range(3)] == [0, 1, 2]
+    labels = find_subjects(stream)
+    assert [np.bincount(own).tolist() for own in labels] == [[200, 100]] * 3
+    outs = [tmp_path / "0.gsv", tmp_path / "1.gsv"]
+    split_stream(stream, labels, outs)
+    parts = [open_stream(path) for path in outs]
+    assert sum(g["size"] for p in parts for g in p.groups) < 1.25 * sum(g["size"] for g in stream.groups)
+    for t in (0, 5, 11):
+        a, b = stream.frame(t), concatenate([p.frame(t) for p in parts])
+        own = labels[t // 4]
+        a = a.take(np.concatenate([np.flatnonzero(own == k) for k in range(2)]))
+        for name in ("means", "log_scales", "logit_opacities", "sh0"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        assert psnr(render_image(a, side()), render_image(b, side())) > 40
+
+
+def side():
+    K = np.array([[60.0, 0, 48], [0, 60, 32], [0, 0, 1]])
+    return Camera("c", K, look_at(np.array([2.0, 0.5, -7]), np.array([2.0, 0, 0]), np.array([0, 1.0, 0])), 96, 64)
+
+
+def test_one_subject_stays_one(tmp_path):
+    path = tmp_path / "a.gsv"
+    sequence = GaussianSequence(30.0, [DenseGroup([moved(blob(200), [0, 0, 0], [0.1 * t, 0, 0]) for t in range(4)])])
+    config = stream_config(fps=30, sh_degree=0, gaussians=200, frames=4)
+    encode_sequence(sequence, path, config, EncodeSettings(quality=60, refine=0))
+    assert not find_subjects(open_stream(path))[0].any()
 
 
 def test_what_cannot_be_split_is_said(folder, tmp_path):

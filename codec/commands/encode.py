@@ -125,12 +125,12 @@ def _print_stream(out: Path | str, result: EncodeReport) -> None:
 def _print_tracks(out: Path, result: TracksReport) -> None:
     for name, report in result.tracks.items():
         if report.groups:
-            _print_stream(f"track {name}", report)
+            _print_stream(name, report)
     if not result.bytes:
         print("stopped before the first group of the subject was done; the same command goes on", file=sys.stderr)
         raise typer.Exit(130)
-    r = result.to_json()
-    stdout.print(f"{out}: {r['frames']} frames, {r['bytes']} bytes, {r['kb_per_frame']:.2f} kB/frame")
+    r, sizes = result.to_json(), ", ".join(f"{name} {size}" for name, size in result.sizes.items())
+    stdout.print(f"{out}: {r['frames']} frames, {r['bytes']} bytes ({sizes}), {r['kb_per_frame']:.2f} kB/frame")
     if result.interrupted:
         print("stopped early: the file holds the groups done, the same command goes on", file=sys.stderr)
         raise typer.Exit(130)

@@ -1,8 +1,8 @@
 """`gscodec encode --tracks`: a capture -> one file in which the still room and the subject are tracks.
 
-capture/parts.py splits the capture, each part is trained and coded as a stream of its own in OUT.gsv.tracks/, and the
-streams are joined as `mux` does it. The room is one frame that repeats forever. The subject is the first track: it has
-the clock of the scene and its sound.
+capture/parts.py splits the capture, each part is trained and coded as a stream of its own in OUT.gsv.tracks/. Subjects
+that never touch become tracks of their own (encode/subjects.py), and the streams are joined as `mux` does it. The room
+is one frame that repeats forever. The first track is a subject: it has the clock of the scene and its sound.
 """
 
 from __future__ import annotations
@@ -36,11 +36,13 @@ class TracksReport:
     """What came out.
 
     Attributes:
-        tracks: name -> report of it, in the order of the file; the bytes are those of its own stream.
+        tracks: name -> report of what was trained and coded; the bytes are those of its own stream.
+        sizes: name of each track of the file -> bytes of its groups.
         frames: of the scene. bytes: of the file; 0: nothing is written.
     """
 
     tracks: dict[str, EncodeReport]
+    sizes: dict[str, int]
     frames: int
     bytes: int
 
@@ -52,6 +54,7 @@ class TracksReport:
     def to_json(self) -> dict:
         """The report with its rate."""
         own = {"frames": self.frames, "bytes": self.bytes, "kb_per_frame": self.bytes / max(self.frames, 1) / 1000}
+        own |= {"sizes": self.sizes}
         return own | {"tracks": {name: r.to_json() for name, r in self.tracks.items()}}
 
 
@@ -121,17 +124,35 @@ def _check(settings: EncodeSettings, options: TrainOptions) -> None:
         )
 
 
-def _joined(work: Path, out: Path, reports: dict[str, EncodeReport], clock: str) -> TracksReport:
-    """Writes the scene of what is there of each track; nothing without the track `clock`."""
+def _joined(work: Path, out: Path, reports: dict[str, EncodeReport], subject: str) -> TracksReport:
+    """Writes the scene of what is there of each part; nothing without the track `subject`."""
     from ..decode import open_stream
     from ..decode.scene import Track
 
-    plans = []
-    for name, report in reports.items():
-        if report.groups:
-            placement = Placement(name, repeats=FOREVER if name == "room" else 1)
-            plans.append(TrackPlan.of(Track(open_stream(work / f"{name}.gsv"), placement)))
-    first = reports.get(clock)
+    first = reports.get(subject)
     if not (first and first.groups):
-        return TracksReport(reports, 0, 0)
-    return TracksReport(reports, first.frames, write_tracks(out, plans))
+        return TracksReport(reports, {}, 0, 0)
+    paths = {subject: work / f"{subject}.gsv"} if first.interrupted else _subjects(work, subject)
+    paths["room"] = work / "room.gsv"
+    streams = {name: open_stream(path) for name, path in paths.items()}
+    placements = {name: Placement(name, repeats=FOREVER if name == "room" else 1) for name in paths}
+    size = write_tracks(out, [TrackPlan.of(Track(s, placements[name])) for name, s in streams.items()])
+    sizes = {name: sum(g["size"] for g in s.groups) for name, s in streams.items()}
+    return TracksReport(reports, sizes, first.frames, size)
+
+
+def _subjects(work: Path, name: str) -> dict[str, Path]:
+    """Name and stream of each subject of the stream `name`: of itself if there is one."""
+    from ..decode import open_stream
+    from ..encode.split import can_split, split_stream
+    from ..encode.subjects import find_subjects
+
+    path = work / f"{name}.gsv"
+    stream = open_stream(path)
+    labels = find_subjects(stream) if can_split(stream) else []
+    count = max((int(own.max(initial=0)) for own in labels), default=0) + 1
+    if count == 1:
+        return {name: path}
+    parts = {f"{name}{k + 1}": work / f"{name}{k + 1}.gsv" for k in range(count)}
+    split_stream(stream, labels, list(parts.values()))
+    return parts

@@ -13,7 +13,8 @@ import numpy as np
 from ..decode.stream import Stream
 from ..encode.audio import AudioTrack
 from ..encode.encode import EncodeReport
-from ..encode.reuse_geometry import Colors, encode_recolored, recolored_writer
+from ..encode.reuse_geometry import Colors, encode_recolored
+from ..encode.rewriting import sound_of, writer_like
 from ..encode.settings import EncodeSettings
 from ..errors import CaptureError, UsageError, require
 from ..fingerprint import inputs, program
@@ -59,7 +60,7 @@ def encode_reusing(
         trained = capture.indices("train")
         more = {"cameras": lambda t: [capture.camera(i, t) for i in trained], "refine_by_pictures": refinement}
     on_group = lambda r: bar.update("encode", r.frames, stream.frame_count)  # noqa: E731
-    writer = recolored_writer(stream, out, made_by, audio)
+    writer = writer_like(stream, out, made_by, audio or sound_of(stream))
     return encode_recolored(stream, colors, writer, settings, on_group=on_group, **more)
 
 

@@ -18,7 +18,6 @@ from ..decode.parametric import parametric_group
 from ..decode.stream import Stream
 from ..model.parametric_group import ParametricGroup
 from .adaptive_rounding import AdaptiveRounding
-from .audio import AudioTrack, GroupSound
 from .coder import CamerasAt, RefineByPictures
 from .encode import EncodeReport, completed
 from .measure import measure_group
@@ -117,21 +116,3 @@ def _account(report: EncodeReport, units: list[dict], group: dict, gaussians: in
 def color_bytes(report: EncodeReport) -> int:
     """Bytes of colours in the groups that a report counts."""
     return sum(size for name, size in report.units.items() if name.rpartition(" ")[2] in COLORS)
-
-
-def sound_of(stream: Stream) -> GroupSound | None:
-    """The sound of a stream, group by group; None: it has none."""
-    if "audio" not in stream.config:
-        return None
-    runs = {}
-    for i, g in enumerate(stream.groups):
-        if "audio" in g:
-            _, media_time, samples = g["audio"]
-            runs[g["start_frame"]] = media_time, samples, stream.sound(i)
-    return GroupSound(stream.config["audio"], runs)
-
-
-def recolored_writer(old: Stream, out, made_by: dict, audio: AudioTrack | None = None) -> StreamWriter:
-    """The file OUT.gsv with what the head of `old` says, and its sound unless there is another one."""
-    config = {k: v for k, v in old.config.items() if k not in ("track", "placement", "audio")}
-    return StreamWriter(out, config, made_by, audio or sound_of(old))
