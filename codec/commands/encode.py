@@ -59,7 +59,7 @@ def encode(
         str | None,
         typer.Option(
             metavar="masks|motion",
-            help="A room once and a subject over it as tracks: what masks show, or what moves.",
+            help="A still room, coded once, and subjects in it as tracks: what masks show, or what moves.",
             show_default="one track",
         ),
     ] = None,
