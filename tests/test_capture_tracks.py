@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from interrupting import gscodec
 from synthetic import blob, encode_sequence, moved
-from test_tracks import fails, payloads
+from test_tracks import fails, payloads, run
 
 from bench.procedural import Scene, placed, write_transforms
 from gscodec.capture import open_capture
@@ -96,6 +96,12 @@ def test_the_room_is_coded_once_and_the_tracks_are_the_scene(folder, scene):
     assert (still.stream.frame_count, still.placement.repeats, len(still.stream.groups)) == (1, 0, 1)
     assert len(subject.stream.groups) == 2
     assert opened.frame_count == FRAMES
+    assert len(opened.cameras) == len(whole.cameras)
+    assert not still.stream.cameras, "they are written once"
+    alone = scene.with_name("room.gsv")
+    run("edit", scene, "-o", alone, "--drop", "subject")
+    assert [c.name for c in open_scene(alone).cameras] == [c.name for c in whole.cameras]
+    alone.unlink()
     for t in (0, FRAMES - 1):
         assert len(opened.frame(t)) == len(subject.stream.frame(t)) + len(still.stream.frame(0))
     i = whole.indices("test")[0]
