@@ -51,6 +51,7 @@ def _rows() -> Iterator[tuple[str, ...]]:
     for file, what, module in (
         ("points.json", "sparse points", "sparse_points"),
         ("depth.json", "depth images", "depth"),
+        ("tracks.json", "a capture in tracks", "capture_tracks"),
     ):
         yield what, file, f"`python -m bench.{module}`", _commits(_entries(file)), "-"
 

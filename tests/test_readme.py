@@ -117,6 +117,16 @@ def test_table_of_depth_images():
         assert all(map(agrees, figures, values)), (name, figures, values)
 
 
+def test_table_of_a_capture_in_tracks():
+    found = {e["stream"]: e for e in result("tracks")["entries"]}
+    table = rows("basketball, 320 x 180")
+    assert len(table) == len(found) == 2
+    for name, *figures in table:
+        e = found["one" if name == "one track" else "tracks"]
+        assert all(map(agrees, figures, (e["kb_per_frame"], e["kb_per_frame_later"], e["psnr"], e["ssim"]))), name
+    assert found["tracks"]["room_share_later"] <= 0.05
+
+
 def test_the_table_of_sources_is_that_of_the_results():
     page = sources.PAGE.read_text()
     assert sources.with_table(page) == page, "run python -m bench.sources"

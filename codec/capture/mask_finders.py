@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from ..errors import CaptureError, require
 from .capture import Capture
-from .images import SUFFIXES, read_image
-from .rig import Feed, numbered
+from .images import SUFFIXES, View, read_image
+from .rig import numbered
 
 SIDE = 512  # pixels, longest side of the pictures in which masks are found
 CHANGE = 10.0  # of 255, least difference of a pixel that has changed
@@ -33,6 +33,19 @@ SHADOW = (0.45, 0.97)  # brightness of a shadow, times that of the plate
 SHADOW_TINT = 0.06  # difference of its channels, of that
 BIN = 12  # levels of Lab in a bin of the colour histograms
 MOVES_ALL = 0.6  # share of a picture; if more of it moves, the camera does
+
+
+class Footage(Protocol):
+    """The pictures of one camera, such as a `Feed`.
+
+    Attributes:
+        path: for messages.
+    """
+
+    path: Path
+
+    def picture(self, t: int) -> View:
+        """Frame `t`, without a mask that is no part of it."""
 
 
 class Likely(NamedTuple):
@@ -67,6 +80,11 @@ def plate_finder(capture: Capture, index: int, plates: Path) -> Callable[[int], 
     if plate.shape[:2] != (feed.height, feed.width):
         height, width = plate.shape[:2]
         raise CaptureError(f"{path}: {width}x{height}, expected {feed.width}x{feed.height} as the images of its camera")
+    return unlike_finder(feed, plate)
+
+
+def unlike_finder(feed: Footage, plate: np.ndarray) -> Callable[[int], Likely]:
+    """t -> what differs from `plate`, [H, W, 3] u8 of the same camera, without its shadow."""
     empty = _small(plate)
 
     def find(t: int) -> Likely:
@@ -86,7 +104,7 @@ def _shadow(ratio: np.ndarray) -> np.ndarray:
     return (dark > SHADOW[0]) & (dark < SHADOW[1]) & (np.ptp(ratio, -1) < SHADOW_TINT * dark)
 
 
-def moving_finder(feed: Feed, frames: int, fps: float) -> Callable[[int], Likely]:
+def moving_finder(feed: Footage, frames: int, fps: float) -> Callable[[int], Likely]:
     """t -> what moves around frame t, as far as it does not look like what is there without it.
 
     Raises:
@@ -110,7 +128,7 @@ def moving_finder(feed: Feed, frames: int, fps: float) -> Callable[[int], Likely
     return find
 
 
-def _moving(feed: Feed, frames: int, fps: float) -> list[np.ndarray]:
+def _moving(feed: Footage, frames: int, fps: float) -> list[np.ndarray]:
     """[h, w] u8 of each frame: pixels that move."""
     lag = min(max(1, round(LAG * fps)), (frames - 1) // 2)
     kept: dict[int, np.ndarray] = {}
@@ -133,7 +151,7 @@ def _moving(feed: Feed, frames: int, fps: float) -> list[np.ndarray]:
     return moving
 
 
-def _uncovered(feed: Feed, possible: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _uncovered(feed: Footage, possible: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """[h, w, 3] f32 mean of the frames in which a pixel is away from movement, [h, w] bool where they are enough."""
     count = np.sum([~p for p in possible], 0)
     total = np.zeros((*count.shape, 3), np.float32)

@@ -20,6 +20,7 @@ from .capture import Capture
 from .mask_finders import GROW, SMALL, Likely, disc, moving_finder, plate_finder, without_specks
 
 ROUNDS = 3  # of GrabCut
+FRAMES_LEAST = 3  # in which something can be seen to move
 
 
 def make_masks(
@@ -53,7 +54,7 @@ def make_masks(
         try:
             found = 0
             for t in range(capture.frame_count):
-                alpha = _mask_of(feed.picture(t).rgb, likely(t))
+                alpha = mask_of(feed.picture(t).rgb, likely(t))
                 found += bool(alpha.any())
                 written.append(_write_part(feed.mask_files[t], alpha))
         except BaseException:
@@ -85,13 +86,14 @@ def _check(capture: Capture, plates: Path | None, overwrite: bool) -> None:
         raise UsageError(f"{there}: there are masks already; delete them, or say --overwrite to replace them")
     if capture.moves:
         raise CaptureError(f"{capture.name}: its cameras move, so that everything does; make masks with another tool")
-    if plates is None and capture.frame_count < 3:
+    if plates is None and capture.frame_count < FRAMES_LEAST:
         raise CaptureError(
-            f"{capture.name}: {capture.frame_count} frames, expected 3 or more to see what moves, or --plate DIR"
+            f"{capture.name}: {capture.frame_count} frames, expected {FRAMES_LEAST} or more to see what moves, "
+            f"or --plate DIR"
         )
 
 
-def _mask_of(rgb: np.ndarray, found: Likely) -> np.ndarray:
+def mask_of(rgb: np.ndarray, found: Likely) -> np.ndarray:
     """[H, W] u8 mask of a picture."""
     cv2 = require("cv2", "making masks")
     likely, possible, sure = found

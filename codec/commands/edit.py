@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -51,6 +52,8 @@ def edit(
         plans[i] = plans[i].cut(own)
     dropped = {find(first.tracks, name) for name in drop or ()}
     kept = [p for i, p in enumerate(plans) if i not in dropped]
+    if kept and not kept[0].config["cameras"]:  # the first track had those of all
+        kept[0] = replace(kept[0], config=kept[0].config | {"cameras": first.config["cameras"]})
     size = write_tracks(out, kept)
     if kept[0].has_sound and "audio" not in kept[0].config:
         stdout.print("the files to join have sound of different forms, which is left out")

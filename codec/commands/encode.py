@@ -19,10 +19,8 @@ from .options import Frames, Gop, Motion, Preset, Quality, RandomAccess, Sequenc
 if TYPE_CHECKING:
     from ..encode.encode import EncodeReport
     from ..encode.settings import EncodeSettings
-    from .sources import TrainOptions
-
-LENGTHS_DIFFER = 0.1  # seconds between the ends of sound and video that nobody notices
-
+    from .encode_tracks import TracksReport
+    from .sources import Source, TrainOptions
 
 ENDED = {  # ParametricGroup.ended
     "cut": "it cannot be tracked",
@@ -57,6 +55,18 @@ def encode(
     ray: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Train on this Ray cluster; its machines see SEQ too.")
     ] = None,
+    tracks: Annotated[
+        str | None,
+        typer.Option(
+            metavar="masks|motion",
+            help="A still room, coded once, and subjects in it as tracks: what masks show, or what moves.",
+            show_default="one track",
+        ),
+    ] = None,
+    reuse_geometry: Annotated[
+        Path | None,
+        typer.Option("--reuse-geometry", metavar="OLD.gsv", help="Take all but colours from OLD.gsv; SEQ has others."),
+    ] = None,
     from_maps: Annotated[
         bool, typer.Option("--from-maps", help="SEQ is a folder of attribute maps, of decode --maps.")
     ] = False,
@@ -69,17 +79,31 @@ def encode(
     if from_maps:
         _from_maps(seq, out, audio)
         return
+    from ..encode.reuse_geometry import color_bytes
     from ..encode.settings import EncodeSettings
     from .sources import TrainOptions
 
     with Bar() as bar:
         settings = EncodeSettings(quality, _bits(bitrate), keep_all, random_access, layers, refine)
-        result = encode_input(seq, out, settings, TrainOptions(preset, frames, gop, motion, ray), bar, audio)
+        options = TrainOptions(preset, frames, gop, motion, ray)
+        result = encode_input(seq, out, settings, options, bar, audio, tracks, reuse_geometry)
     if report:
         report.write_text(json.dumps(result.to_json(), indent=1))
+    if tracks:
+        _print_tracks(out, result)
+        return
     if result.groups == 0:
         print("stopped before the first group was done; nothing is left behind", file=sys.stderr)
         raise typer.Exit(130)
+    _print_stream(out, result)
+    if reuse_geometry:
+        stdout.print(f"{color_bytes(result)} bytes of colours are new, geometry and motion are of {reuse_geometry}")
+    if result.interrupted:
+        print("stopped early: the file holds the groups done, the same command goes on", file=sys.stderr)
+        raise typer.Exit(130)
+
+
+def _print_stream(out: Path | str, result: EncodeReport) -> None:
     r = result.to_json()
     stdout.print(
         f"{out}: {r['frames']} frames, {r['gaussians']} Gaussians, {r['bytes']} bytes, "
@@ -96,6 +120,17 @@ def encode(
         stdout.print(
             f"quality {result.quality:.1f}, at which coding costs at most {result.loss} dB against very fine steps"
         )
+
+
+def _print_tracks(out: Path, result: TracksReport) -> None:
+    for name, report in result.tracks.items():
+        if report.groups:
+            _print_stream(name, report)
+    if not result.bytes:
+        print("stopped before the first group of the subject was done; the same command goes on", file=sys.stderr)
+        raise typer.Exit(130)
+    r, sizes = result.to_json(), ", ".join(f"{name} {size}" for name, size in result.sizes.items())
+    stdout.print(f"{out}: {r['frames']} frames, {r['bytes']} bytes ({sizes}), {r['kb_per_frame']:.2f} kB/frame")
     if result.interrupted:
         print("stopped early: the file holds the groups done, the same command goes on", file=sys.stderr)
         raise typer.Exit(130)
@@ -123,9 +158,20 @@ def _bits(rate: str | None) -> float | None:
 
 
 def encode_input(
-    source: Path, out: Path, settings: EncodeSettings, options: TrainOptions, bar: Bar, audio: Path | None = None
-) -> EncodeReport:
+    source: Path,
+    out: Path,
+    settings: EncodeSettings,
+    options: TrainOptions,
+    bar: Bar,
+    audio: Path | None = None,
+    tracks: str | None = None,
+    reuse_geometry: Path | None = None,
+) -> EncodeReport | TracksReport:
     """Encodes a capture or splats at `source`, and the sound of the file `audio`, into the file `out`.
+
+    Args:
+        tracks: how a capture is split into tracks (`split_capture`); None: it is not.
+        reuse_geometry: a stream of which all but the colours is taken.
 
     Raises:
         UsageError, CaptureError: see the message.
@@ -133,7 +179,9 @@ def encode_input(
     from ..encode.audio import read_audio
     from ..encode.encode import StreamOutput, encode_groups
     from ..splats import detect_input
-    from .sources import capture_source, splat_source
+    from .encode_tracks import encode_tracks
+    from .reuse_geometry import encode_reusing
+    from .sources import capture_source, say_lengths, splat_source
 
     if options.gop < 1:
         raise UsageError(f"--gop {options.gop} is out of range, expected at least 1 frame in a group")
@@ -143,19 +191,31 @@ def encode_input(
     kind = detect_input(source)
     if kind == "splats" and options.cluster:
         raise UsageError(f"--ray {options.cluster}: {source} holds splats, which need no training; leave --ray away")
+    if kind == "splats" and tracks:
+        raise UsageError(f"--tracks {tracks}: {source} holds splats, expected a capture; gscodec mux joins streams")
     sound = read_audio(audio) if audio else None
     out.parent.mkdir(parents=True, exist_ok=True)
+
+    def made_by(opened: Source) -> dict:
+        return {"program": program(), "input": inputs(source), "settings": asdict(opened.settings) | opened.made_of}
+
+    if tracks and reuse_geometry:
+        raise UsageError("--tracks and --reuse-geometry exclude each other: recolour the tracks one by one")
+    if reuse_geometry:
+        return encode_reusing(source, kind, reuse_geometry, out, settings, options, bar, sound)
+    if tracks:
+        both = (audio, sound) if sound else None
+        return encode_tracks(source, out, settings, options, tracks, bar, made_by=made_by, audio=both)
     if kind == "splats":
         opened = splat_source(source, settings, options.frames, options.gop, bar)
         on_group = lambda r: bar.update("encode", r.frames, opened.frames)  # noqa: E731
     else:
         opened, on_group = capture_source(source, out, settings, options, bar), None
     if sound:
-        _compare_lengths(audio, sound.seconds, opened.frames / opened.config["fps"], bar)
-    made_by = {"program": program(), "input": inputs(source), "settings": asdict(opened.settings) | opened.made_of}
+        say_lengths(audio, sound, opened.frames / opened.config["fps"], bar)
     report = encode_groups(
         opened.groups,
-        StreamOutput(out, opened.config, made_by, sound),
+        StreamOutput(out, opened.config, made_by(opened), sound),
         opened.settings,
         cameras=opened.cameras,
         refine_by_pictures=opened.refine_by_pictures,
@@ -164,11 +224,3 @@ def encode_input(
     if not report.interrupted or not report.groups:  # without a group there is nothing to go on from
         opened.finish()
     return report
-
-
-def _compare_lengths(path: Path, sound: float, video: float, bar: Bar) -> None:
-    """Says what becomes of sound that is not as long as the video, in seconds."""
-    if sound > video + LENGTHS_DIFFER:
-        bar.say(f"--audio {path}: {sound:.2f} s of sound, cut to the {video:.2f} s of the video")
-    elif sound < video - LENGTHS_DIFFER:
-        bar.say(f"--audio {path}: {sound:.2f} s of sound, the rest of the {video:.2f} s of the video is silent")

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,7 +23,12 @@ from ..model.parametric_group import ParametricGroup
 from ..progress import Bar
 from .inputs import open_frames
 
+if TYPE_CHECKING:
+    from ..capture import Capture
+    from ..encode.audio import AudioTrack
+
 AXES = ("x", "y", "z")
+LENGTHS_DIFFER = 0.1  # seconds between the ends of sound and video that nobody notices
 UP_UNKNOWN = "-y"  # what 3DGS trainers leave where nothing is known
 
 
@@ -185,23 +191,60 @@ def _moved_parents(parents: np.ndarray | None, place: np.ndarray | None) -> np.n
 def capture_source(path: Path, out: Path, settings: EncodeSettings, options: TrainOptions, bar: Bar) -> Source:
     """A capture that is trained group by group, while the group before is coded and safe on disk."""
     require("torch", "training a capture")
+    capture = open_frames(path, options.frames)
+    say_few_cameras(capture, path, bar)
+    source = trained_source(capture, out, settings, options, bar)
+    if not options.cluster:
+        return source
+    recipe = _recipe(options, settings)
+    return replace(source, groups=partial(_cluster_groups, path, source.settings, options, recipe, bar))
+
+
+def say_few_cameras(capture: Capture, path: Path, bar: Bar) -> None:
+    """Says so where there is one training camera."""
+    if len(capture.indices("train")) == 1:
+        bar.say(f"{path}: 1 training camera, from other sides the scene will be wrong; expected two or more")
+
+
+def say_lengths(path: Path, sound: AudioTrack, video: float, bar: Bar) -> None:
+    """Says what becomes of the sound of the file `path` where it is not as long as the video, in seconds."""
+    if sound.seconds > video + LENGTHS_DIFFER:
+        bar.say(f"--audio {path}: {sound.seconds:.2f} s of sound, cut to the {video:.2f} s of the video")
+    elif sound.seconds < video - LENGTHS_DIFFER:
+        bar.say(f"--audio {path}: {sound.seconds:.2f} s of sound, the rest of the {video:.2f} s of the video is silent")
+
+
+def _recipe(options: TrainOptions, settings: EncodeSettings):
+    from ..train.settings import train_settings
+
+    return train_settings(options.preset, settings.quality, motion=options.motion, gop=options.gop)
+
+
+def trained_source(
+    capture: Capture,
+    out: Path,
+    settings: EncodeSettings,
+    options: TrainOptions,
+    bar: Bar,
+    *,
+    longer: float = 1.0,
+) -> Source:
+    """An opened capture, or a part of one.
+
+    Args:
+        out: the stream, beside which checkpoints lie. longer: times the usual steps of a keyframe.
+    """
     from ..train.checkpoint import Checkpoint
     from ..train.refinement import PictureRefinement
-    from ..train.settings import LOSS, train_settings
+    from ..train.settings import LOSS
 
     limit_torch_threads()
-    capture = open_frames(path, options.frames)
-    recipe = train_settings(options.preset, settings.quality, motion=options.motion, gop=options.gop)
+    recipe = _recipe(options, settings)
+    recipe = replace(recipe, keyframe_steps=round(longer * recipe.keyframe_steps))
     settings = replace(settings, loss=LOSS[options.preset])
     work, trained = out.with_name(out.name + ".work"), capture.indices("train")
-    if len(trained) == 1:
-        bar.say(f"{path}: 1 training camera, from other sides the scene will be wrong; expected two or more")
-    if options.cluster:
-        groups = partial(_cluster_groups, path, settings, options, recipe, bar)
-    else:
-        groups = partial(_local_groups, capture, recipe, settings.random_access, work, bar)
     return Source(
-        groups,
+        partial(_local_groups, capture, recipe, settings.random_access, work, bar),
         stream_config(
             fps=capture.fps,
             sh_degree=recipe.sh_degree,

@@ -9,7 +9,7 @@ single frame, sizes move too, and its rotations are coded again; of a predicted 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -39,17 +39,25 @@ class AdaptiveRounding:
 
     Args:
         quantized: the group. reference: what it is predicted from.
+        only: attributes that may move; None: all that can.
     """
 
-    def __init__(self, quantized: Quantized, settings: EncodeSettings, reference: ReferenceGroup | None = None):
+    def __init__(
+        self,
+        quantized: Quantized,
+        settings: EncodeSettings,
+        reference: ReferenceGroup | None = None,
+        only: Sequence[str] | None = None,
+    ):
         self._quantized, self._settings, self._reference = quantized, settings, reference
-        self._still = quantized.form.frames == 1 and reference is None
+        self._still = quantized.form.frames == 1 and reference is None and only is None
         canonical = MOVING_STILL if self._still else MOVING_CANONICAL if reference is None else ()
-        moving = [n for n in canonical if n in quantized.integers.channels]
+        may = lambda n: only is None or n in only  # noqa: E731
+        moving = [n for n in canonical if n in quantized.integers.channels and may(n)]
         self._variables: list[CanonicalVariable | TrajectoryVariable] = [
             trajectory_variable(n, quantized, settings)
             for n in MOVING_OVER_TIME
-            if n in quantized.integers.trajectories
+            if n in quantized.integers.trajectories and may(n)
         ] + [CanonicalVariable(n, quantized, settings) for n in moving]
 
     @property

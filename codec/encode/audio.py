@@ -64,6 +64,26 @@ class AudioTrack:
         return (self._times[a], self.samples[a:b], self.data[self._offsets[a] : self._offsets[b]]) if a < b else None
 
 
+@dataclass(frozen=True)
+class GroupSound:
+    """Sound of which each group has its own samples already, as `AudioTrack` without its times.
+
+    Attributes:
+        config: as of `AudioTrack`.
+        runs: first frame of a group -> media time, (size, duration) of each sample, bytes.
+    """
+
+    config: dict
+    runs: dict[int, tuple[int, list[tuple[int, int]], bytes]]
+
+    @property
+    def digest(self) -> str:
+        return hashlib.sha256(repr((self.config, self.runs)).encode()).hexdigest()[:16]
+
+    def between(self, start: int, end: int, fps: tuple[int, int]) -> tuple[int, list[tuple[int, int]], bytes] | None:
+        return self.runs.get(start)
+
+
 def read_audio(path: Path) -> AudioTrack:
     """The first audio track of a sound or video file.
 

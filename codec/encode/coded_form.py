@@ -116,7 +116,7 @@ def coded_form(group: ParametricGroup, lineage: np.ndarray, known: CodedForm | N
         old = lineage >= 0
         order[old], rotation[old] = known.axis_order[lineage[old]], known.axis_rotation[lineage[old]]
         rest[old], rotations[old] = known.rest[lineage[old]], known.rotations[lineage[old]]
-    values, trajectories = _appearance(group, order)
+    values, trajectories = appearance(group, order)
     index = np.arange(len(group.canonical))
     return CodedForm(group, index, lineage, rest, rotations, order, rotation, values, trajectories, means, quats)
 
@@ -139,7 +139,7 @@ def _recentered(group: ParametricGroup, means: np.ndarray, quats: np.ndarray) ->
     return rest.astype(np.float64), quat_normalize(canonical).astype(np.float32)
 
 
-def _appearance(group: ParametricGroup, order: np.ndarray) -> tuple[dict, dict]:
+def appearance(group: ParametricGroup, order: np.ndarray) -> tuple[dict, dict]:
     """Canonical values and trajectories of APPEARANCE; the constant part of a trajectory is canonical."""
     values, trajectories, g = {}, {}, group.canonical
     for name in APPEARANCE:

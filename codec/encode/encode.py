@@ -7,7 +7,8 @@ run that stops goes on where it stopped, to the same bytes.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -122,6 +123,7 @@ def encode_groups(
     cameras: CamerasAt = lambda _: (),
     refine_by_pictures: RefineByPictures | None = None,
     on_group: Callable[[EncodeReport], None] | None = None,
+    keep_part: bool = False,
 ) -> EncodeReport:
     """Writes a stream from the groups that `groups(done, frames)` yields: those after the `done` groups, `frames`
     frames, that an earlier run left in the file.
@@ -130,26 +132,34 @@ def encode_groups(
         cameras: frame -> cameras for training, from which the subject was captured: sensitivity is measured from them.
         refine_by_pictures: (group, first frame, quantizer) of a capture: the last stage of training, for groups that
             have a calibration.
+        keep_part: a complete stream, too, leaves what a later run goes on from, which then has nothing to do.
 
     Ctrl-C finishes the file with the groups done and returns with `interrupted` set; the next run goes on.
     """
     writer = StreamWriter(output.path, output.config, output.fingerprint, output.audio)
     coder = GroupCoder(settings, float(output.config["fps"]), cameras, refine_by_pictures)
     report = EncodeReport(seconds={"input": 0.0, "code": 0.0})
-    try:
+    with completed(writer, report, keep_part=keep_part):
         _code_all(groups(writer.groups, writer.frames), coder, writer, report, on_group)
+    return report
+
+
+@contextmanager
+def completed(writer: StreamWriter, report: EncodeReport, *, keep_part: bool = False) -> Iterator[None]:
+    """Around the loop that appends groups: finishes the file, also after Ctrl-C, and counts it in `report`."""
+    try:
+        yield
     except KeyboardInterrupt:
         report.interrupted = True
     except BaseException:
         writer.abandon()
         raise
     if writer.groups:
-        writer.finish(keep_part=report.interrupted)
+        writer.finish(keep_part=keep_part or report.interrupted)
     else:
         writer.abandon()
     report.frames, report.groups = writer.frames, writer.groups
-    report.bytes = Path(output.path).stat().st_size if writer.groups else 0
-    return report
+    report.bytes = writer.out.stat().st_size if writer.groups else 0
 
 
 def _code_all(groups: Iterable[ParametricGroup], coder: GroupCoder, writer: StreamWriter, report, on_group) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,30 +12,10 @@ from .. import _native
 from ..bitstream.hilbert_layout import HilbertLayout
 from ..bitstream.quantized_group import QuantizedChannels, QuantizedGroup, QuantizedNodes, QuantizedTrajectories
 from ..errors import UsageError, require
-from .audio import AudioTrack
+from .audio import AudioTrack, GroupSound
 from .writer import StreamWriter
 
 FORMAT, SOUND = "gscodec maps 2", "sound.bin"  # those of decode/maps.py
-
-
-@dataclass(frozen=True)
-class _Sound:
-    """The sound of maps, as `AudioTrack` without its times: each group has its own samples already.
-
-    Attributes:
-        config: as of `AudioTrack`.
-        runs: first frame of a group -> media time, (size, duration) of each sample, bytes.
-    """
-
-    config: dict
-    runs: dict[int, tuple[int, list[tuple[int, int]], bytes]]
-
-    @property
-    def digest(self) -> str:
-        return hashlib.sha256(repr((self.config, self.runs)).encode()).hexdigest()[:16]
-
-    def between(self, start: int, end: int, fps: tuple[int, int]) -> tuple[int, list[tuple[int, int]], bytes] | None:
-        return self.runs.get(start)
 
 
 def encode_maps(folder: Path, out: Path, audio: AudioTrack | None = None) -> tuple[int, int]:
@@ -72,7 +51,7 @@ def encode_maps(folder: Path, out: Path, audio: AudioTrack | None = None) -> tup
     return sum(q.frames for q in groups), out.stat().st_size
 
 
-def _sound(folder: Path, config: dict | None, groups: list[dict]) -> _Sound | None:
+def _sound(folder: Path, config: dict | None, groups: list[dict]) -> GroupSound | None:
     """The sound beside the maps; None where there is none."""
     if config is None:
         return None
@@ -85,7 +64,7 @@ def _sound(folder: Path, config: dict | None, groups: list[dict]) -> _Sound | No
         at, frame = at + size, frame + g["frames"]
     if at != len(data):
         raise ValueError(f"{SOUND} has {len(data)} bytes, expected {at} as maps.json says")
-    return _Sound(config | {"entry": bytes.fromhex(config["entry"])}, runs)
+    return GroupSound(config | {"entry": bytes.fromhex(config["entry"])}, runs)
 
 
 def _payloads(groups: list[QuantizedGroup]) -> list[bytes]:

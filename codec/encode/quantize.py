@@ -113,8 +113,8 @@ def _channels(form, plan, layers, reference, settings) -> dict[str, QuantizedCha
         offsets, q = np.zeros(len(steps), np.float32), np.zeros((len(steps), len(form.rest)), np.int32)
         if name != "quats":
             values = companding.compand(form.values[name], curves)
-            offsets = old.offsets if old else _medians(values)
-            q = _integers(name, values, offsets, plan, layers, settings)
+            offsets = old.offsets if old else medians(values)
+            q = canonical_integers(name, values, offsets, plan, layers, settings)
         if old:
             q[:, known] = old.values[:, form.lineage[known]]
         rows = None if curves is None else np.array([c.row() for c in curves], np.float32)
@@ -122,7 +122,7 @@ def _channels(form, plan, layers, reference, settings) -> dict[str, QuantizedCha
     return {n: out[n] for n in CANONICAL if n in out}
 
 
-def _integers(name: str, values: np.ndarray, offsets: np.ndarray, plan: Plan, layers, settings) -> np.ndarray:
+def canonical_integers(name: str, values: np.ndarray, offsets: np.ndarray, plan: Plan, layers, settings) -> np.ndarray:
     """[C, N] i32 for companded values [N, C], of what the layers code themselves; 0 elsewhere."""
     parameters = plan.parameters
     shift, steps = parameters.shifts[name][plan.layer], parameters.steps[name]
@@ -136,7 +136,7 @@ def _integers(name: str, values: np.ndarray, offsets: np.ndarray, plan: Plan, la
     return q
 
 
-def _medians(values: np.ndarray) -> np.ndarray:
+def medians(values: np.ndarray) -> np.ndarray:
     """[C] f32 offsets, so that small integers are common."""
     return (np.median(values, axis=0) if len(values) else np.zeros(values.shape[1])).astype(np.float32)
 

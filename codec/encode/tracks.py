@@ -98,7 +98,8 @@ class TrackPlan:
 
 
 def write_tracks(out: Path, plans: Sequence[TrackPlan]) -> int:
-    """Writes a file of these tracks; returns its bytes. Sound is that of the first track.
+    """Writes a file of these tracks; returns its bytes. Sound is that of the first track, and cameras that all have are
+    written with it alone.
 
     Raises:
         UsageError: there is no track, or a predicted group has lost its reference.
@@ -110,6 +111,8 @@ def write_tracks(out: Path, plans: Sequence[TrackPlan]) -> int:
     configs = [p.config | {"track": k, "placement": p.placement.to_config()} for k, p in enumerate(plans)]
     for config in configs[1:]:
         config.pop("audio", None)
+        if repr(config["cameras"]) == repr(configs[0]["cameras"]):
+            config["cameras"] = []  # those of the scene are those of its first track (spec 2.8)
     init = _native.init_segment(configs[0], configs[1:])
     body = out.with_name(out.name + ".body")
     try:

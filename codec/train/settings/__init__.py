@@ -23,6 +23,7 @@ from .keyframe import (
     VisualHullSettings,
 )
 from .learning_rates import LearningRates
+from .recolor import RecolorSettings
 from .tracking import (
     ChangeDetectionSettings,
     DeformationGraphSettings,
@@ -50,6 +51,7 @@ __all__ = [
     "LearningRates",
     "MotionFieldSettings",
     "PlaneSweepSettings",
+    "RecolorSettings",
     "RefinementSettings",
     "RelocalizationSettings",
     "RoomSettings",

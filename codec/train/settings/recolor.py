@@ -1,0 +1,30 @@
+"""Settings of colours that are fitted anew over the geometry of a stream."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class RecolorSettings:
+    """Fit of colours (`train/recolor.py`).
+
+    Attributes:
+        passes: times that each training picture of a frame is used; frame_pictures: pictures of a frame at most;
+            steps_least: of a group, however short it is.
+        map_pictures: from which the affine map of all colours is found. opaque: alpha above which a pixel counts for
+            it; pixels_least: fewer leave the colours as they are. prior: share of a pixel that speaks for no change.
+        rates: learning rates of the harmonics at the first step; over_time: of coefficients, times those.
+        frequencies: temporal ones of sh0 in a group, with the constant, if the stream has no more.
+    """
+
+    passes: int = 4
+    frame_pictures: int = 40
+    steps_least: int = 200
+    map_pictures: int = 24
+    opaque: float = 0.95
+    pixels_least: int = 100
+    prior: float = 1e-4
+    rates: dict[str, float] = field(default_factory=lambda: {"sh0": 0.02, "shN": 0.004})
+    over_time: float = 0.25
+    frequencies: int = 3
