@@ -14,7 +14,7 @@ from ..errors import UsageError
 from ..fingerprint import inputs, program
 from ..model.gaussians import GOP
 from ..progress import Bar
-from .options import Frames, Gop, Motion, Preset, Quality, RandomAccess, SequencePath, StreamPath, stdout
+from .options import Frames, Gop, Motion, Preset, Quality, RandomAccess, RigPath, SequencePath, StreamPath, stdout
 
 if TYPE_CHECKING:
     from ..encode.encode import EncodeReport
@@ -57,6 +57,7 @@ def encode(
     ray: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Train on this Ray cluster; its machines see SEQ too.")
     ] = None,
+    rig: RigPath = None,
     from_maps: Annotated[
         bool, typer.Option("--from-maps", help="SEQ is a folder of attribute maps, of decode --maps.")
     ] = False,
@@ -74,7 +75,7 @@ def encode(
 
     with Bar() as bar:
         settings = EncodeSettings(quality, _bits(bitrate), keep_all, random_access, layers, refine)
-        result = encode_input(seq, out, settings, TrainOptions(preset, frames, gop, motion, ray), bar, audio)
+        result = encode_input(seq, out, settings, TrainOptions(preset, frames, gop, motion, ray, rig), bar, audio)
     if report:
         report.write_text(json.dumps(result.to_json(), indent=1))
     if result.groups == 0:
@@ -146,7 +147,7 @@ def encode_input(
     sound = read_audio(audio) if audio else None
     out.parent.mkdir(parents=True, exist_ok=True)
     if kind == "splats":
-        opened = splat_source(source, settings, options.frames, options.gop, bar)
+        opened = splat_source(source, settings, options, bar)
         on_group = lambda r: bar.update("encode", r.frames, opened.frames)  # noqa: E731
     else:
         opened, on_group = capture_source(source, out, settings, options, bar), None
