@@ -1,4 +1,4 @@
-"""A coded group with a rig -> the same in other poses. Only the unit of the poses is written anew, and the bounds of tiles.
+"""A coded group with a rig -> the same in other poses: only their unit is written anew, and the bounds of tiles.
 
 What the nodes do beside the prediction stays: it is coded in the frame that the rig carries along, and follows.
 """

@@ -49,10 +49,10 @@ pub fn code<C: Bins>(c: &mut C, joints: usize, near: &[Near], source: &Rig) -> O
         let own = source.joints.get(j).copied().unwrap_or_default();
         let place = std::array::from_fn(|axis| {
             let expected = known.map(|k: [i32; 3]| k[axis]);
-            model.value(c, JOINTS, own[axis], expected.as_slice(), [0; 2])
+            value(c, &mut model, JOINTS, own[axis], (expected.as_slice(), [0; 2]))
         });
         let own = source.bind.get(j).copied().unwrap_or_default();
-        let bind = own.map(|v| model.value(c, BIND, v, &[], [0; 2]));
+        let bind = own.map(|v| value(c, &mut model, BIND, v, (&[], [0; 2])));
         out.joints.push(place);
         out.parents.push(parent);
         out.bind.push(bind);
@@ -67,6 +67,12 @@ pub fn code<C: Bins>(c: &mut C, joints: usize, near: &[Near], source: &Rig) -> O
         }
     }
     Some(out)
+}
+
+/// Not inlined: a rig takes no time, and each copy would cost bytes of the page.
+#[inline(never)]
+fn value<C: Bins>(c: &mut C, m: &mut ValueModel, class: usize, v: i32, (near, prev): (&[i32], [i32; 2])) -> i32 {
+    m.value(c, class, v, near, prev)
 }
 
 /// Codes the weights of node `i`. None: one of them is out of range.
@@ -87,7 +93,7 @@ fn weights<C: Bins>(
             present += 1;
         }
         let told = source.weights.get(i * joints + j).copied().unwrap_or_default();
-        let weight = model.value(c, WEIGHTS, i32::from(told), &around[..present], [before, left]);
+        let weight = value(c, model, WEIGHTS, i32::from(told), (&around[..present], [before, left]));
         if model.broken || !(0..=WEIGHT_MAX).contains(&weight) {
             return None;
         }

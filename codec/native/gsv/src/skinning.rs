@@ -2,7 +2,7 @@
 //! joints' rigid motions; nothing is predicted from its result, so f32 will do.
 
 use crate::blend::Blend;
-use crate::dequantize::{IDENTITY, Quat, multiply};
+use crate::dequantize::{Quat, multiply};
 use crate::rig::CHANNELS;
 use crate::rigid_blend::{Pose, REST, RigidBlend, from_rotation_vector, matrix, pose};
 
@@ -52,14 +52,16 @@ impl Skinning {
 
     /// Where nodes that rest at `nodes` are in `poses` ([J] rotation vector and translation), and their rotations.
     pub fn carry(&self, poses: &[[f32; CHANNELS]], nodes: &[[f32; 3]]) -> (Vec<[f32; 3]>, Vec<Quat>) {
-        let (mut places, mut rotations) = (nodes.to_vec(), vec![IDENTITY; nodes.len()]);
         let moved = self.chain(poses).into_iter().zip(&self.unbind);
         let mut motions: Vec<Pose> = moved.map(|(to, from)| compose(to, *from)).map(pose_of).collect();
         motions.push(REST); // of nodes without weights
-        if self.blend.per > 0 {
-            RigidBlend::new(motions).carry(&self.blend, nodes, (&mut places, &mut rotations), |_, x, q| (x, q));
-        }
-        (places, rotations)
+        let (poses, per) = (RigidBlend::new(motions), self.blend.per.max(1));
+        let rows = self.blend.index.chunks(per).zip(self.blend.weight.chunks(per));
+        nodes
+            .iter()
+            .zip(rows)
+            .map(|(x, (index, weight))| poses.carry_one(*x, index, weight))
+            .unzip()
     }
 }
 
