@@ -12,13 +12,14 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from gscodec.capture.capture import Capture
 from gscodec.capture.images import View
-from gscodec.decode import open_stream
+from gscodec.decode import open_scene, open_stream
 from gscodec.encode.encode import StreamOutput, encode_groups, stream_config
 from gscodec.encode.settings import EncodeSettings
 from gscodec.encode.tracks import TrackPlan, write_tracks
@@ -70,12 +71,11 @@ def posed(work: Path) -> Iterator[dict]:
     """The stream of the walk in the poses of `wave`, against the figure in these poses."""
     f, frames = figure(**SPLATS), SPLATS["frames"]
     write_stream(work / "walk.gsv", f.sequence.groups, 50.0, f.rig, frames)
-    walked = open_stream(work / "walk.gsv")
     g, weights = skin(SPLATS["count"])
     truth = GaussianSequence(25.0, [DenseGroup(pose(g, weights, wave(frames)))])
-    plan = TrackPlan.of(_track(walked))
+    plan = TrackPlan.of(open_scene(work / "walk.gsv").tracks[0])
     other = Rig(f.rig.joints, f.rig.parents, wave(frames))
-    size = write_tracks(work / "wave.gsv", [TrackPlan(plan.config, plan.placement, plan.groups, other)])
+    size = write_tracks(work / "wave.gsv", [replace(plan, rig=other)])
     some = list(range(0, frames, frames // MEASURED))
     psnr = lambda path, seq: round(evaluate_splats(open_stream(path).frame, seq, some)["codec_psnr_fg"], 2)  # noqa: E731
     yield {
@@ -86,13 +86,6 @@ def posed(work: Path) -> Iterator[dict]:
         "psnr": psnr(work / "wave.gsv", truth),
         "psnr_before": psnr(work / "walk.gsv", f.sequence),
     }
-
-
-def _track(stream):
-    from gscodec.decode.scene import Track
-    from gscodec.model.placement import STILL
-
-    return Track(stream, STILL)
 
 
 def capture_of(f: Figure) -> Capture:
