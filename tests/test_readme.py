@@ -117,6 +117,12 @@ def test_table_of_depth_images():
         assert all(map(agrees, figures, values)), (name, figures, values)
 
 
+def test_what_a_rig_saves():
+    saved = result("rig")["size_at_equal_psnr_percent"]
+    text = "saves {} % of a stream of splats at equal PSNR, and {} % of a trained one"
+    assert text.format(*(round(-saved[case]) for case in ("splats", "training"))) in " ".join(README.split())
+
+
 def test_the_table_of_sources_is_that_of_the_results():
     page = sources.PAGE.read_text()
     assert sources.with_table(page) == page, "run python -m bench.sources"
