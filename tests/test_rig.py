@@ -26,7 +26,7 @@ from gscodec.fit import fit_groups
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.model.rig import Rig, RigMotion
 from gscodec.model.rig_file import read_rig
-from gscodec.model.rotations import quat_to_matrix, rotvec_to_quat
+from gscodec.model.rotations import quat_to_matrix, quat_to_rotvec, rotvec_to_quat
 from gscodec.model.skin_weights import integer_weights, skin_weights
 from gscodec.splats import write_sequence
 from gscodec.splats.parametric_file import from_arrays, to_arrays
@@ -303,6 +303,16 @@ def test_translations_of_all_joints_or_none(streams, tmp_path):
     every[:, 0] = root
     np.savez(tmp_path / "every.npz", **arrays, translations=every)
     np.testing.assert_array_equal(read_rig(tmp_path / "every.npz").poses, read_rig(streams / "rig.npz").poses)
+
+
+def test_whole_turns_make_no_jump(tmp_path):
+    poses = walk(FRAMES)
+    poses[:, 0, 1] = np.linspace(0, 3 * np.pi, FRAMES)
+    jumps = Rig(JOINTS, PARENTS, poses.copy(), *_no_skin())
+    jumps.poses[:, 0, :3] = quat_to_rotvec(rotvec_to_quat(jumps.poses[:, 0, :3]))
+    write_rig(jumps, tmp_path / "turns.npz")
+    assert np.abs(np.diff(jumps.poses[:, 0, 1])).max() > 3
+    np.testing.assert_allclose(read_rig(tmp_path / "turns.npz").poses, poses, atol=1e-4)
 
 
 TINY = TrainSettings(

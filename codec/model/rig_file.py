@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import CaptureError
 from .rig import Rig
+from .rotations import quat_to_rotvec, rotvec_to_quat
 
 JOINTS_MAX = 255
 
@@ -45,6 +46,8 @@ class _Arrays:
         if not 1 <= count <= JOINTS_MAX:
             raise CaptureError(f"{self.path}: joints_rest has {count} joints, expected 1 to {JOINTS_MAX}")
         rotations = self.take("rotations", ("T", count, 3))
+        for t in range(1, len(rotations)):  # of the equal rotation vectors the nearest one, so that poses are smooth
+            rotations[t] = quat_to_rotvec(rotvec_to_quat(rotations[t]), rotations[t - 1])
         poses = np.concatenate([rotations, self.translations(len(rotations), count)], 2)
         vertices = weights = None
         if "vertices" in self.arrays or "weights" in self.arrays:
