@@ -9,16 +9,15 @@ from ..model.rig import RigMotion
 from ..model.temporal_transform import dct_basis
 from .quantization_plan import Grid
 
-FINENESS = 0.5  # of a node's step: errors of the joints add up along the limbs, and are coded again by the nodes
+ARM = 0.25  # of the extent of the skeleton: how far from a joint an error of a step is one of the nodes' step
 ROTATION_STEP_MOST = 0.05  # radians
 MAX_VALUE = 2**24
 
 
 def quantize_rig(rig: RigMotion, grid: Grid, step: float) -> QuantizedRig:
-    """The integers of a rig of a group on `grid`; `step`: of translations of nodes, world units."""
+    """The integers of a rig of a group on `grid`; `step`: of translations of nodes, world units, and of joints."""
     extent = float(np.ptp(rig.joints, axis=0).max(initial=0.0))
-    step = float(np.float32(FINENESS * step))
-    rotation_step = float(np.float32(min(4 * step / max(extent, 1e-12), ROTATION_STEP_MOST)))
+    rotation_step = float(np.float32(min(step / max(ARM * extent, 1e-12), ROTATION_STEP_MOST)))
     steps = np.repeat([rotation_step, step], 3)
     joints = (rig.joints.astype(np.float64) - grid.origin) / grid.step
     return QuantizedRig(
