@@ -22,12 +22,14 @@ import numpy as np
 from reference_container import LEVELS, BitstreamError, LimitError, read_container, require
 from reference_entropy import MAX_VALUE, Model, SymbolModel, ValueModel
 from reference_integers import (
+    ancestors,
     class_nodes,
     class_trajectories,
     decode_channels,
     decode_deaths,
     decode_lifetimes,
     decode_positions,
+    decode_rig,
     decode_trajectories,
     dense,
     find_neighbors,
@@ -37,6 +39,7 @@ from reference_units import (
     ATTRIBUTES,
     CHANNELS,
     DEATHS,
+    JOINT_POSES,
     LAYER_CORRECTION,
     LIFETIMES,
     LOG_SCALES,
@@ -46,6 +49,7 @@ from reference_units import (
     NODE_TRAJECTORIES,
     POSITIONS,
     QUATS,
+    RIG,
     SH0,
     SHN,
     TILE,
@@ -66,6 +70,17 @@ from reference_units import (
 
 
 @dataclass
+class Rig:
+    """Clauses 11.1 and 11.2, i32."""
+
+    joints: np.ndarray  # [J, 3]
+    parents: np.ndarray  # [J]
+    bind: np.ndarray  # [J, 6]
+    weights: np.ndarray  # [M, J]
+    poses: np.ndarray  # [T, 6, J]
+
+
+@dataclass
 class Group:
     """A decoded group: the header and all of its integers, i32, of all layers and with survivors."""
 
@@ -80,6 +95,7 @@ class Group:
     node_trajectories: np.ndarray | None  # [K, 6, M]
     trajectories: dict  # attribute -> [K, C, N]
     correction: dict  # attribute -> value, of the last decoded layer
+    rig: Rig | None = None
 
 
 def make_model(kind):
@@ -194,7 +210,7 @@ def decode_group(payload, level, frames=None, reference=None, layers=256, tiles=
             total += count
             parts += [decoded[t]] if t in decoded else []
     counts = [sum(place[1] for place in own if place) for own in places]
-    node_positions, node_trajectories = None, None
+    node_positions, node_trajectories, rig = None, None, None
     if header.node_count:
         nodes = decode_positions(
             found[NODE_POSITIONS, 0, 0], header.node_count, header.grid_bits, "node_positions", Model()
@@ -204,6 +220,12 @@ def decode_group(payload, level, frames=None, reference=None, layers=256, tiles=
         unit = found[NODE_TRAJECTORIES, 0, 0]
         q = decode_trajectories(unit, K, 6, node_near, class_nodes, lambda _: None, "node_trajectories")
         node_trajectories = dense(q, K, 6)
+    if header.joint_count:
+        parents, joints, bind, weights = decode_rig(found[RIG, 0, 0], header.joint_count, node_near, "rig")
+        unit, T = found[JOINT_POSES, 0, 0], header.frames
+        q = decode_trajectories(unit, T, 6, ancestors(parents), class_nodes, lambda _: None, "joint_poses")
+        integers = (np.array(a, np.int32) for a in (joints, parents, bind, weights))
+        rig = Rig(*integers, dense(q, T, 6))
     correction = {}
     for k in range(len(counts)):
         for a in (LOG_SCALES, LOGIT_OPACITIES):
@@ -222,6 +244,7 @@ def decode_group(payload, level, frames=None, reference=None, layers=256, tiles=
         node_trajectories,
         {a: np.concatenate([part[4][a] for part in parts], 2) for a in header.trajectories},
         correction,
+        rig,
     )
 
 
@@ -269,23 +292,71 @@ def rotate(q, v):
     return v + 2 * np.cross(u, np.cross(u, v) + q[..., :1] * v)
 
 
+def rotation(r):
+    """Rotation vectors [..., 3] -> wxyz [..., 4]."""
+    angle = np.linalg.norm(r, axis=-1, keepdims=True)
+    axis = np.divide(r, angle, out=np.zeros_like(r), where=angle > 0)
+    return np.concatenate([np.cos(angle / 2), np.sin(angle / 2) * axis], -1)
+
+
+def average(q, weights, first):
+    """Clause 13.3: quaternions [N, n, 4] blended by [N, n]; the signs are those nearer to q[first]."""
+    before = np.take_along_axis(q, first[:, None, None], 1)
+    sign = np.where((q * before).sum(-1) < 0, -1, 1)
+    total = ((weights * sign)[..., None] * q).sum(1)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(length < 1e-12, before[:, 0], total / np.maximum(length, 1e-12))
+
+
+def joint_motions(places, parents, poses):
+    """Clause 13.3: G_j of poses [J, 6] as (quaternion, shift) of x -> R x + shift, for each joint."""
+    motions = []
+    for j, (g, parent, pose) in enumerate(zip(places, parents, poses, strict=True)):
+        q = rotation(pose[:3])
+        shift = g + pose[3:] - rotate(q, g)
+        if parent < j:
+            Q, S = motions[parent]
+            q, shift = quaternion_product(Q, q), rotate(Q, shift) + S
+        motions.append((q, shift))
+    return motions
+
+
+def predict_nodes(group, n, t):
+    """Clause 13.3: nodes at n [M, 3] -> y [M, 3], p [M, 4]."""
+    h, rig = group.header, group.rig
+    steps = np.repeat([h.joint_rotation_step, h.joint_translation_step], 3)
+    places = np.array(h.origin) + h.grid_step * rig.joints
+    poses = steps * np.einsum("kcj,k->jc", rig.poses.astype(float), basis(h.frames, h.frames, t))
+    now = joint_motions(places, rig.parents, poses)
+    before = joint_motions(places, rig.parents, steps * rig.bind)
+    y, turned = [], []  # by each joint alone
+    for (q, s), (q0, s0) in zip(now, before, strict=True):
+        back = q0 * [1, -1, -1, -1]
+        turned.append(quaternion_product(q, back))
+        y.append(rotate(q, rotate(back, n - s0)) + s)
+    y, turned = np.stack(y, 1), np.tile(np.array(turned), (len(n), 1, 1))
+    moved = rig.weights.any(1)
+    w = rig.weights / np.maximum(rig.weights.sum(1, keepdims=True), 1)
+    p = average(turned, w, rig.weights.argmax(1))
+    still = np.array([1.0, 0, 0, 0])
+    return np.where(moved[:, None], (w[..., None] * y).sum(1), n), np.where(moved[:, None], p, still)
+
+
 def blend_nodes(group, x0, t):
     """Clause 13.3: [N, 3] -> x_blend [N, 3], q_blend [N, 4]."""
     h = group.header
     b = basis(h.node_coefficients, h.frames, t)
     motion = np.einsum("kcm,k->mc", group.node_trajectories.astype(float), b)  # [M, 6]
     r, translation = h.rotation_step * motion[:, :3], h.translation_step * motion[:, 3:]
-    angle = np.linalg.norm(r, axis=1, keepdims=True)
-    axis = np.divide(r, angle, out=np.zeros_like(r), where=angle > 0)
-    q = np.concatenate([np.cos(angle / 2), np.sin(angle / 2) * axis], 1)  # [M, 4]
+    q = rotation(r)  # [M, 4]
     n = np.array(h.origin) + h.grid_step * group.node_positions
+    if group.rig is not None:
+        y, p = predict_nodes(group, n, t)
+        q, translation = quaternion_product(p, q), y - n + rotate(p, translation)
     j, w = node_weights(group.positions, group.node_positions.astype(np.int64), h.neighbors)
-    weight = (w / w.sum(1, keepdims=True))[..., None]  # [N, n, 1]
-    x = (weight * (rotate(q[j], x0[:, None] - n[j]) + n[j] + translation[j])).sum(1)
-    sign = np.where((q[j] * q[j[:, :1]]).sum(-1, keepdims=True) < 0, -1, 1)
-    total = (weight * sign * q[j]).sum(1)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return x, np.where(length < 1e-12, q[j[:, 0]], total / np.maximum(length, 1e-12))
+    weight = w / w.sum(1, keepdims=True)  # [N, n]
+    x = (weight[..., None] * (rotate(q[j], x0[:, None] - n[j]) + n[j] + translation[j])).sum(1)
+    return x, average(q[j], weight, np.zeros(len(j), int))
 
 
 def expand(v, low, width, slopes):
@@ -387,6 +458,12 @@ def arrays(group):
     yield "node_trajectories", group.node_trajectories
     for a in range(MEANS, SHN + 1):
         yield f"trajectories_{ATTRIBUTES[a]}", group.trajectories.get(a)
+    if group.rig is not None:
+        yield "joints", group.rig.joints
+        yield "parents", group.rig.parents
+        yield "bind", group.rig.bind
+        yield "weights", group.rig.weights
+        yield "joint_poses", group.rig.poses
 
 
 def hash_arrays(frames, grid_bits, arrays):

@@ -224,6 +224,41 @@ def class_nodes(k, c):
     return 6 * min(k, 3) + c
 
 
+# ---- 11.1 Rig -------------------------------------------------------------------------------------------------------
+
+
+def decode_rig(payload, joints, near, what):
+    """Clause 11.1: -> parents [J], joints [J, 3], bind [J, 6], weights [M, J], as lists."""
+    decoder = RangeDecoder(payload, what)
+    model = ValueModel(decoder)
+    parents, places, bind, weights = [], [], [], []
+    for j in range(joints):
+        parent = decoder.bits(8)
+        require(parent <= j, f"{what}: parent {parent} of joint {j}, expected values within its range")
+        known = [places[parent]] if parent < j else []
+        parents.append(parent)
+        places.append([model.value(0, [p[c] for p in known], 0, 0) for c in range(3)])
+        bind.append([model.value(1, [], 0, 0) for _ in range(6)])
+    for i, neighbors in enumerate(near):
+        row, left = [], 64
+        for j in range(joints):
+            w = model.value(2, [weights[n][j] for n in neighbors], row[-1] if row else 0, left)
+            require(0 <= w <= 64, f"{what}: weight {w} of node {i}, expected values within 0 to 64")
+            row.append(w)
+            left -= w
+        weights.append(row)
+    decoder.finish()
+    return parents, places, bind, weights
+
+
+def ancestors(parents):
+    """Clause 11.2: for each joint its parent, the parent of that, and so on."""
+    near = []
+    for j, parent in enumerate(parents):
+        near.append([parent, *near[parent]][:4] if parent < j else [])
+    return near
+
+
 # ---- 12. Trajectories -----------------------------------------------------------------------------------------------
 
 

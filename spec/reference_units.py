@@ -7,13 +7,15 @@ from reference_container import LEVELS, PAIRS, LimitError, Reader, require
 
 # ---- 3. Group payload -----------------------------------------------------------------------------------------------
 
-GROUP_HEADER, TILE, NODE_POSITIONS, NODE_TRAJECTORIES, LAYER_CORRECTION = range(5)
+GROUP_HEADER, TILE, NODE_POSITIONS, NODE_TRAJECTORIES, LAYER_CORRECTION, RIG, JOINT_POSES = range(7)
 UNIT_NAMES = {
     GROUP_HEADER: "group_header",
     TILE: "tile",
     NODE_POSITIONS: "node_positions",
     NODE_TRAJECTORIES: "node_trajectories",
     LAYER_CORRECTION: "layer_correction",
+    RIG: "rig",
+    JOINT_POSES: "joint_poses",
 }
 MEANS, LOG_SCALES, QUATS, LOGIT_OPACITIES, SH0, SHN = range(1, 7)
 ATTRIBUTES = {1: "means", 2: "log_scales", 3: "quats", 4: "logit_opacities", 5: "sh0", 6: "shN"}
@@ -62,7 +64,7 @@ def read_units(payload, layers=256, tiles=None):
         before = directory[number - 2][1] if number > 1 else 0
         require(before <= layer, f"{where}: layer {layer}, expected layers in increasing order")
         require(unit_type != GROUP_HEADER, f"{where}: expected no second group_header")
-        single = unit_type not in (NODE_POSITIONS, NODE_TRAJECTORIES) or index == 0
+        single = unit_type not in (NODE_POSITIONS, NODE_TRAJECTORIES, RIG, JOINT_POSES) or index == 0
         require(single, f"{where}: expected an index of 0, not {index}")
         known = unit_type != LAYER_CORRECTION or index in (LOG_SCALES, LOGIT_OPACITIES)
         require(known, f"{where}: a layer_correction of attribute {index}, expected one of attribute 2 or 4")
@@ -82,6 +84,7 @@ def check_units(units, header, layers, wanted=lambda k, t: True):
     """Clause 3.1: the units are those that the header announces -> {(type, layer, index): payload}."""
     required, optional = set(), set()
     required |= {(NODE_POSITIONS, 0, 0), (NODE_TRAJECTORIES, 0, 0)} if header.node_count else set()
+    required |= {(RIG, 0, 0), (JOINT_POSES, 0, 0)} if header.joint_count else set()
     for k, layer in enumerate(header.layers[:layers]):
         required |= {(TILE, k, t) for t, tile in enumerate(layer.tiles) if tile.count and wanted(k, t)}
         optional |= {(LAYER_CORRECTION, k, LOG_SCALES), (LAYER_CORRECTION, k, LOGIT_OPACITIES)}
@@ -180,13 +183,16 @@ class Header:
     node_coefficients: int = 0
     rotation_step: float = 0.0
     translation_step: float = 0.0
+    joint_count: int = 0
+    joint_rotation_step: float = 0.0
+    joint_translation_step: float = 0.0
 
 
 def read_opening(r):
     """Clause 4: frames, flags, reference (0: independent) and the directory."""
     frames, flags = r.u16(), r.u8()
     require(frames >= 1, "group_header: frames is 0, expected frames >= 1")
-    allowed = 0x11 if flags & 1 else 0x1A
+    allowed = 0x31 if flags & 1 else 0x3A
     require(not flags & ~allowed, f"group_header: flags are {flags:#x}, expected reserved flags to be 0")
     reference = r.u16() if flags & 1 else 0
     require(reference or not flags & 1, "group_header: reference is 0, expected a reference >= 1")
@@ -338,6 +344,12 @@ def read_group_header(payload, reference=None):
         require(valid, f"group_header: {header.node_coefficients} node coefficients, expected 1 to {frames}")
         header.rotation_step = r.f32("rotation_step", positive=True)
         header.translation_step = r.f32("translation_step", positive=True)
+    if flags & 32:
+        require(header.node_count, "group_header: a rig without nodes, expected nodes in a group with a rig")
+        header.joint_count = r.u8()
+        require(header.joint_count, "group_header: joint_count is 0, expected at least one joint")
+        header.joint_rotation_step = r.f32("rotation_step of joints", positive=True)
+        header.joint_translation_step = r.f32("translation_step of joints", positive=True)
     read_tiles(r, layers, side_log2, reference if back else None)
     require(r.position == r.end, f"group_header: {r.end - r.position} bytes left over")
     return header
@@ -376,4 +388,5 @@ def check_limits(header, level):
         len(header.trajectories) * count + sum(tile.candidates for layer in header.layers for tile in layer.tiles)
     )
     budget.spend((3 + 6 * header.node_coefficients) * header.node_count)
+    budget.spend((9 + 6 * header.frames + header.node_count) * header.joint_count)
     return budget

@@ -54,6 +54,8 @@ def native_hash(group):
     arrays = [group.positions, *(channels.get(name) for name in names[1:]), group.lifetimes]
     arrays += [nodes.positions, nodes.coefficients] if nodes else [None, None]
     arrays += [trajectories.get(name) for name in names]
+    if nodes and nodes.rig:
+        arrays += [getattr(nodes.rig, name) for name in ("joints", "parents", "bind", "weights", "poses")]
     return reference.hash_arrays(group.frames, group.grid_bits, arrays)
 
 

@@ -127,6 +127,12 @@ def test_table_of_a_capture_in_tracks():
     assert found["tracks"]["room_share_later"] <= 0.05
 
 
+def test_what_a_rig_saves():
+    saved = result("rig")["size_at_equal_psnr_percent"]
+    text = "saves {} % of a stream of splats at equal PSNR, and {} % of a trained one"
+    assert text.format(*(round(-saved[case]) for case in ("splats", "training"))) in " ".join(README.split())
+
+
 def test_the_table_of_sources_is_that_of_the_results():
     page = sources.PAGE.read_text()
     assert sources.with_table(page) == page, "run python -m bench.sources"

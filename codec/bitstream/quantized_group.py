@@ -45,14 +45,38 @@ class QuantizedTrajectories:
 
 
 @dataclass(frozen=True)
+class QuantizedRig:
+    """What predicts the motion of the nodes: J joints with parents, and their poses (clauses 11.1, 11.2).
+
+    Attributes:
+        joints: [J, 3] i32 places in the pose of rest of the skeleton, in grid steps from the origin of the grid.
+        parents: [J] u8, parent of each joint, before it; its own index: a root.
+        bind: [J, 6] i32, the pose in which the group rests: rotation vector, translation of each joint, in steps.
+        weights: [M, J] u8, 0 to 64: which joints move each node; all 0: the rig does not move it.
+        poses: [T, 6, J] i32 temporal DCT coefficients of the poses of the joints.
+        rotation_step: radians. translation_step: world units.
+    """
+
+    joints: np.ndarray
+    parents: np.ndarray
+    bind: np.ndarray
+    weights: np.ndarray
+    poses: np.ndarray
+    rotation_step: float
+    translation_step: float
+
+
+@dataclass(frozen=True)
 class QuantizedNodes:
     """Nodes of the deformation graph (clause 12).
 
     Attributes:
         positions: [M, 3] u32 on the grid, in Morton order.
-        coefficients: [K, 6, M] i32 temporal DCT coefficients: rotation vector, then translation.
+        coefficients: [K, 6, M] i32 temporal DCT coefficients: rotation vector, then translation; behind what the rig
+            predicts.
         rotation_step: radians. translation_step: world units.
         neighbors: nodes that carry one Gaussian.
+        rig: predicts the motion; None: nothing does.
     """
 
     positions: np.ndarray
@@ -60,6 +84,7 @@ class QuantizedNodes:
     rotation_step: float
     translation_step: float
     neighbors: int
+    rig: QuantizedRig | None = None
 
 
 @dataclass(frozen=True)

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ..errors import UsageError
 from ..frame_range import frame_range
+from ..model.rig_file import read_rig
 from .inputs import open_tracks, scene_output
 from .options import stdout
 from .tracks import Tracks, find, place
+
+if TYPE_CHECKING:
+    from ..decode import Scene
 
 
 def edit(
@@ -24,10 +28,13 @@ def edit(
             metavar="[NAME=]A:B", help="Keep frames A to B-1 of a track; several ranges follow in their order."
         ),
     ] = None,
+    pose: Annotated[
+        list[str] | None, typer.Option(metavar="[NAME=]RIG.npz", help="Other poses for a track that has a rig.")
+    ] = None,
     drop: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Leave a track out.")] = None,
     track: Tracks = None,
 ) -> None:
-    """Trim, join and reorder at group boundaries, rename, place and drop tracks. Nothing is coded anew."""
+    """Trim, join and reorder at group boundaries, rename, place, pose and drop tracks. Nothing is coded anew."""
     from ..encode.tracks import TrackPlan, write_tracks
 
     scene_output(out)
@@ -46,10 +53,12 @@ def edit(
         if not name and len(plans) > 1:
             raise UsageError(f"--frames {text}: {first.name} has {len(plans)} tracks, expected NAME=A:B")
         i = find(first.tracks, name) if name else 0
-        count = sum(stream.groups[g]["frames"] for stream, g in plans[i].groups)
-        ranges.setdefault(i, []).append(frame_range(part, count))
+        ranges.setdefault(i, []).append(frame_range(part, plans[i].frame_count))
     for i, own in ranges.items():
         plans[i] = plans[i].cut(own)
+    for text in pose or ():
+        i, path = _posed_track(first, text)
+        plans[i] = replace(plans[i], rig=read_rig(path, plans[i].frame_count))
     dropped = {find(first.tracks, name) for name in drop or ()}
     kept = [p for i, p in enumerate(plans) if i not in dropped]
     if kept and not kept[0].config["cameras"]:  # the first track had those of all
@@ -60,3 +69,17 @@ def edit(
     elif 0 in dropped and plans[0].has_sound:
         stdout.print("the sound goes with the first track, which is dropped")
     stdout.print(f"{out}: {len(kept)} tracks, {size} bytes")
+
+
+def _posed_track(scene: Scene, text: str) -> tuple[int, Path]:
+    """Index of the track, and the file of the rig, of an option --pose.
+
+    Raises:
+        UsageError: the track is not named.
+    """
+    name, is_named, path = text.partition("=")
+    if is_named and name in [t.placement.name for t in scene.tracks]:
+        return find(scene.tracks, name), Path(path)
+    if len(scene.tracks) > 1:
+        raise UsageError(f"--pose {text}: {scene.name} has {len(scene.tracks)} tracks, expected NAME=RIG.npz")
+    return 0, Path(text)

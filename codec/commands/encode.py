@@ -14,7 +14,7 @@ from ..errors import UsageError
 from ..fingerprint import inputs, program
 from ..model.gaussians import GOP
 from ..progress import Bar
-from .options import Frames, Gop, Motion, Preset, Quality, RandomAccess, SequencePath, StreamPath, stdout
+from .options import Frames, Gop, Motion, Preset, Quality, RandomAccess, RigPath, SequencePath, StreamPath, stdout
 
 if TYPE_CHECKING:
     from ..encode.encode import EncodeReport
@@ -67,6 +67,7 @@ def encode(
         Path | None,
         typer.Option("--reuse-geometry", metavar="OLD.gsv", help="Take all but colours from OLD.gsv; SEQ has others."),
     ] = None,
+    rig: RigPath = None,
     from_maps: Annotated[
         bool, typer.Option("--from-maps", help="SEQ is a folder of attribute maps, of decode --maps.")
     ] = False,
@@ -85,7 +86,7 @@ def encode(
 
     with Bar() as bar:
         settings = EncodeSettings(quality, _bits(bitrate), keep_all, random_access, layers, refine)
-        options = TrainOptions(preset, frames, gop, motion, ray)
+        options = TrainOptions(preset, frames, gop, motion, ray, rig)
         result = encode_input(seq, out, settings, options, bar, audio, tracks, reuse_geometry)
     if report:
         report.write_text(json.dumps(result.to_json(), indent=1))
@@ -207,7 +208,7 @@ def encode_input(
         both = (audio, sound) if sound else None
         return encode_tracks(source, out, settings, options, tracks, bar, made_by=made_by, audio=both)
     if kind == "splats":
-        opened = splat_source(source, settings, options.frames, options.gop, bar)
+        opened = splat_source(source, settings, options, bar)
         on_group = lambda r: bar.update("encode", r.frames, opened.frames)  # noqa: E731
     else:
         opened, on_group = capture_source(source, out, settings, options, bar), None

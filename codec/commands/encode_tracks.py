@@ -118,6 +118,11 @@ def _check(settings: EncodeSettings, options: TrainOptions) -> None:
     """Raises UsageError for what several tracks cannot have."""
     if settings.bitrate:
         raise UsageError("--bitrate shares bits out among the groups of one track; with --tracks say --quality")
+    if options.rig:
+        raise UsageError(
+            f"--rig {options.rig}: it is of one subject, and --tracks may find several; encode each by itself and join "
+            f"them with gscodec mux"
+        )
     if options.cluster:
         raise UsageError(
             f"--ray {options.cluster}: the tracks of a capture are trained on this machine; leave one away"

@@ -23,6 +23,10 @@ Preset = Annotated[str, typer.Option(help="Training budget: fast, medium or slow
 Motion = Annotated[
     str, typer.Option(help="What learns the motion: field (hash grid and MLP beside the nodes) or nodes alone.")
 ]
+RigPath = Annotated[
+    Path | None,
+    typer.Option("--rig", metavar="RIG.npz", help="A skeleton whose poses predict the motion, one for each frame."),
+]
 Quality = Annotated[
     float | None, typer.Option(help="0 (small) to 100 (fine).", show_default="as the capture needs; 50 for splats")
 ]

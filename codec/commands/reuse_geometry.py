@@ -72,6 +72,7 @@ def _check(settings: EncodeSettings, options: TrainOptions) -> None:
         "--layers": settings.layers is not None,
         "--keep-all": settings.keep_all,
         "--ray": options.cluster is not None,
+        "--rig": options.rig is not None,
     }
     if wrong := [name for name, there in given.items() if there]:
         raise UsageError(f"--reuse-geometry takes groups, layers and steps from the stream; leave {wrong[0]} away")

@@ -16,10 +16,13 @@ from ..encode.coder import CamerasAt, RefineByPictures
 from ..encode.encode import stream_config
 from ..encode.settings import EncodeSettings
 from ..errors import CaptureError, UsageError, require
+from ..fingerprint import inputs
 from ..frame_range import frame_range
 from ..model.camera import Camera
 from ..model.gaussian_sequence import DenseGroup, GaussianSequence
 from ..model.parametric_group import ParametricGroup
+from ..model.rig import Rig
+from ..model.rig_file import read_rig
 from ..progress import Bar
 from .inputs import open_frames
 
@@ -65,6 +68,7 @@ class TrainOptions:
         preset: fast, medium or slow. frames: "A:B", None: all. gop: most frames in a group.
         motion: field or nodes, see `train_settings`.
         cluster: address of the Ray cluster that trains; None: this machine.
+        rig: file of the rig that predicts the motion; None: nothing does.
     """
 
     preset: str
@@ -72,6 +76,11 @@ class TrainOptions:
     gop: int
     motion: str = "field"
     cluster: str | None = None
+    rig: Path | None = None
+
+    def fingerprint(self) -> dict:
+        """The rig among what decides how groups are."""
+        return {"rig": inputs(self.rig)} if self.rig else {}
 
 
 def up_axis(cameras: Sequence[Camera]) -> str:
@@ -88,15 +97,19 @@ def limit_torch_threads() -> None:
     torch.set_num_threads(1)
 
 
-def splat_source(path: Path, settings: EncodeSettings, frames: str | None, gop: int, bar: Bar) -> Source:
+def splat_source(path: Path, settings: EncodeSettings, options: TrainOptions, bar: Bar) -> Source:
     """Splats that others trained, or a folder that `gscodec train` has left."""
     require("scipy", "encoding")
     from ..fit import fit_groups
     from ..splats import open_sequence
 
-    sequence = open_sequence(path, gop=gop)
+    frames = options.frames
+    sequence = open_sequence(path, gop=options.gop)
     if sequence.frame_count > 1:
         bar.say(f"{path}: {sequence.mode} ({_MODES.get(sequence.mode, 'as sequence.json says')})")
+    rig = open_rig(options.rig, sequence.frame_count, frames)
+    if rig and all(isinstance(g, ParametricGroup) for g in sequence.groups):
+        raise UsageError(f"--rig {options.rig}: {path} is trained already; give the rig to gscodec train")
     sequence = _restricted(sequence, frames)
     if settings.refine is None and sequence.frame_count == 1:
         settings = replace(settings, refine=settings.rounding.still_views)
@@ -112,14 +125,24 @@ def splat_source(path: Path, settings: EncodeSettings, frames: str | None, gop: 
             start=done,
             random_access=settings.random_access,
             quality=QUALITY_DEFAULT if settings.quality is None else settings.quality,
+            rig=rig,
         ),
         stream_config(fps=sequence.fps, **level, cameras=cameras, up=up_axis(cameras) if cameras else UP_UNKNOWN),
         settings,
-        {"frames": frames, "gop": gop},
+        {"frames": frames, "gop": options.gop} | options.fingerprint(),
         sequence.frame_count,
         lambda _: trained,
         refinement,
     )
+
+
+def open_rig(path: Path | None, count: int, frames: str | None) -> Rig | None:
+    """The rig of a file with a pose for each of `count` frames, of which the range `frames` is taken; None of None.
+
+    Raises:
+        CaptureError, UsageError: see the message.
+    """
+    return None if path is None else read_rig(path, count).frames(frame_range(frames, count))
 
 
 _MODES = {
@@ -188,16 +211,25 @@ def _moved_parents(parents: np.ndarray | None, place: np.ndarray | None) -> np.n
     return np.where(parents >= 0, place[np.maximum(parents, 0)], -1).astype(np.int32)
 
 
+def open_rig_of_capture(path: Path, capture, options: TrainOptions) -> Rig | None:
+    """As `open_rig`, of a capture at `path` that was opened with the frames of `options`."""
+    if options.rig is None:
+        return None
+    whole = capture if options.frames is None else open_frames(path, None)
+    return open_rig(options.rig, whole.frame_count, options.frames)
+
+
 def capture_source(path: Path, out: Path, settings: EncodeSettings, options: TrainOptions, bar: Bar) -> Source:
     """A capture that is trained group by group, while the group before is coded and safe on disk."""
     require("torch", "training a capture")
     capture = open_frames(path, options.frames)
     say_few_cameras(capture, path, bar)
-    source = trained_source(capture, out, settings, options, bar)
+    rig = open_rig_of_capture(path, capture, options)
+    source = trained_source(capture, out, settings, options, bar, rig=rig)
     if not options.cluster:
         return source
     recipe = _recipe(options, settings)
-    return replace(source, groups=partial(_cluster_groups, path, source.settings, options, recipe, bar))
+    return replace(source, groups=partial(_cluster_groups, path, source.settings, options, recipe, rig, bar))
 
 
 def say_few_cameras(capture: Capture, path: Path, bar: Bar) -> None:
@@ -228,11 +260,13 @@ def trained_source(
     bar: Bar,
     *,
     longer: float = 1.0,
+    rig: Rig | None = None,
 ) -> Source:
     """An opened capture, or a part of one.
 
     Args:
         out: the stream, beside which checkpoints lie. longer: times the usual steps of a keyframe.
+        rig: predicts the motion; None: nothing does.
     """
     from ..train.checkpoint import Checkpoint
     from ..train.refinement import PictureRefinement
@@ -244,7 +278,7 @@ def trained_source(
     settings = replace(settings, loss=LOSS[options.preset])
     work, trained = out.with_name(out.name + ".work"), capture.indices("train")
     return Source(
-        partial(_local_groups, capture, recipe, settings.random_access, work, bar),
+        partial(_local_groups, capture, recipe, settings.random_access, work, rig, bar),
         stream_config(
             fps=capture.fps,
             sh_degree=recipe.sh_degree,
@@ -254,7 +288,7 @@ def trained_source(
             up=up_axis(capture.cameras),
         ),
         settings,
-        {"frames": options.frames, "training": asdict(recipe)},
+        {"frames": options.frames, "training": asdict(recipe)} | options.fingerprint(),
         capture.frame_count,
         lambda t: [capture.camera(i, t) for i in trained],
         PictureRefinement(capture, views=settings.refine),
@@ -262,7 +296,7 @@ def trained_source(
     )
 
 
-def _local_groups(capture, recipe, random_access: int, work: Path, bar: Bar, _: int, first_frame: int):
+def _local_groups(capture, recipe, random_access: int, work: Path, rig, bar: Bar, _: int, first_frame: int):
     from ..train.train import train_groups
 
     steps, start = [0, 1], first_frame
@@ -271,14 +305,14 @@ def _local_groups(capture, recipe, random_access: int, work: Path, bar: Bar, _: 
         steps[:] = p.done, p.total
         bar.update(p.stage, *steps)
 
-    options = {"random_access": random_access, "checkpoints": work, "on_progress": on_progress}
+    options = {"random_access": random_access, "rig": rig, "checkpoints": work, "on_progress": on_progress}
     for group in train_groups(capture, recipe, first_frame=first_frame, **options):
         bar.update(f"code {start}-{start + len(group) - 1}", *steps)
         start += len(group)
         yield group
 
 
-def _cluster_groups(path: Path, settings, options: TrainOptions, recipe, bar: Bar, _: int, first_frame: int):
+def _cluster_groups(path: Path, settings, options: TrainOptions, recipe, rig, bar: Bar, _: int, first_frame: int):
     from ..train.ray_jobs import cluster_groups
 
     total = open_frames(path, options.frames).frame_count
@@ -288,5 +322,6 @@ def _cluster_groups(path: Path, settings, options: TrainOptions, recipe, bar: Ba
         recipe,
         settings.random_access,
         first_frame=first_frame,
+        rig=rig,
         on_progress=lambda done: bar.update("train on the cluster", done, total),
     )

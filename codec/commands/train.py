@@ -16,7 +16,7 @@ from ..fingerprint import inputs, program, sentence
 from ..model.gaussians import GOP
 from ..progress import Bar
 from .inputs import open_frames
-from .options import Frames, Gop, Motion, Preset, Quality, RandomAccess, stdout
+from .options import Frames, Gop, Motion, Preset, Quality, RandomAccess, RigPath, stdout
 
 if TYPE_CHECKING:
     from .sources import TrainOptions
@@ -31,12 +31,13 @@ def train(
     gop: Gop = GOP,
     random_access: RandomAccess = 60,
     quality: Quality = None,
+    rig: RigPath = None,
 ) -> None:
     """Capture to one .ply per frame, the first half of encode."""
     from .sources import TrainOptions
 
     with Bar() as bar:
-        options = TrainOptions(preset, frames, gop, motion)
+        options = TrainOptions(preset, frames, gop, motion, rig=rig)
         count = train_to_folder(capture, folder, options, random_access=random_access, quality=quality, bar=bar)
     stdout.print(f"{folder}: {count} frames")
 
@@ -54,13 +55,14 @@ def train_to_folder(
     from ..train.checkpoint import Checkpoint
     from ..train.settings import LOSS, train_settings
     from ..train.train import train_groups
-    from .sources import limit_torch_threads
+    from .sources import limit_torch_threads, open_rig_of_capture
 
     limit_torch_threads()
     capture = open_frames(source, options.frames)
     recipe = train_settings(options.preset, quality, motion=options.motion, gop=options.gop)
     work, unfinished = folder / "work", folder / "unfinished.json"
     settings = {"frames": options.frames, "random_access": random_access, "training": asdict(recipe)}
+    settings |= options.fingerprint()
     made_by = {"program": program(), "input": inputs(source), "settings": settings}
     training = {
         "capture": str(source.resolve()),
@@ -79,6 +81,7 @@ def train_to_folder(
         recipe,
         first_frame=writer.frame_count,
         random_access=random_access,
+        rig=open_rig_of_capture(source, capture, options),
         checkpoints=work,
         on_progress=lambda p: bar.update(p.stage, p.done, p.total),
     )

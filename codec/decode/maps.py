@@ -108,7 +108,9 @@ def _facts(q: QuantizedGroup) -> dict:
         for n, t in q.trajectories.items()
     }
     facts["lifetimes"] = q.lifetimes is not None
-    facts["nodes"] = None if q.nodes is None else _plain(vars(q.nodes))
+    facts["nodes"] = None if q.nodes is None else _plain({n: v for n, v in vars(q.nodes).items() if n != "rig"})
+    if q.nodes is not None and q.nodes.rig is not None:
+        facts["nodes"]["rig"] = _plain(vars(q.nodes.rig))
     return facts
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from ..bitstream.color import TO_RGB
-from ..bitstream.quantized_group import QuantizedGroup, QuantizedTrajectories
+from ..bitstream.quantized_group import QuantizedGroup, QuantizedRig, QuantizedTrajectories
 from ..model.attributes import BY_NAME
 from ..model.gaussians import Gaussians
 from ..model.parametric_group import NodeMotion, ParametricGroup
+from ..model.rig import RigMotion
 from ..model.temporal_transform import dct_basis
 
 
@@ -32,8 +33,19 @@ def _nodes(q: QuantizedGroup, neighbors: np.ndarray, weights: np.ndarray) -> Nod
     basis = dct_basis(q.frames)[: len(q.nodes.coefficients)]
     values = np.einsum("kt,kcm->tmc", basis, q.nodes.coefficients)
     rotations, translations = values[..., :3] * q.nodes.rotation_step, values[..., 3:] * q.nodes.translation_step
-    moves = rotations.astype(np.float32), translations.astype(np.float32)
-    return NodeMotion(places, *moves, neighbors.astype(np.int32), weights)
+    moves, rig = (rotations.astype(np.float32), translations.astype(np.float32)), None
+    if q.nodes.rig is not None:
+        rig = rig_motion(q.nodes.rig, q.origin, q.grid_step)
+        moves = rig.total(places, *moves)
+    return NodeMotion(places, *moves, neighbors.astype(np.int32), weights, rig)
+
+
+def rig_motion(r: QuantizedRig, origin: np.ndarray, grid_step: float) -> RigMotion:
+    """A rig in floats, of a group with this grid."""
+    steps = np.repeat([r.rotation_step, r.translation_step], 3).astype(np.float32)
+    joints = np.float32(origin) + np.float32(grid_step) * r.joints.astype(np.float32)
+    poses = steps * np.einsum("kt,kcj->tjc", dct_basis(len(r.poses)), r.poses)
+    return RigMotion(joints, r.parents, steps * r.bind.astype(np.float32), poses.astype(np.float32), r.weights)
 
 
 def _coefficients(attribute: str, t: QuantizedTrajectories) -> np.ndarray:

@@ -10,7 +10,13 @@ import numpy as np
 
 from .. import _native
 from ..bitstream.hilbert_layout import HilbertLayout
-from ..bitstream.quantized_group import QuantizedChannels, QuantizedGroup, QuantizedNodes, QuantizedTrajectories
+from ..bitstream.quantized_group import (
+    QuantizedChannels,
+    QuantizedGroup,
+    QuantizedNodes,
+    QuantizedRig,
+    QuantizedTrajectories,
+)
 from ..errors import UsageError, require
 from .audio import AudioTrack, GroupSound
 from .writer import StreamWriter
@@ -129,7 +135,14 @@ def _trajectories(name: str, t: dict, plane) -> QuantizedTrajectories:
 
 def _nodes(n: dict) -> QuantizedNodes:
     positions, coefficients = np.array(n["positions"], np.uint32), np.array(n["coefficients"], np.int32)
-    return QuantizedNodes(positions, coefficients, n["rotation_step"], n["translation_step"], n["neighbors"])
+    steps, rig = (n["rotation_step"], n["translation_step"]), n.get("rig")
+    return QuantizedNodes(positions, coefficients, *steps, n["neighbors"], rig and _rig(rig))
+
+
+def _rig(r: dict) -> QuantizedRig:
+    arrays = {n: np.array(r[n], np.int32) for n in ("joints", "bind", "poses")}
+    arrays |= {n: np.array(r[n], np.uint8) for n in ("parents", "weights")}
+    return QuantizedRig(**arrays, rotation_step=r["rotation_step"], translation_step=r["translation_step"])
 
 
 def _read_plane(path: Path, layout: HilbertLayout) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 from .. import _native
 from ..bitstream.quantization import trajectory_step
 from ..bitstream.quantized_group import QuantizedChannels, QuantizedGroup, QuantizedNodes, QuantizedTrajectories
+from ..decode.parametric import rig_motion
 from ..model.attributes import CANONICAL, NEIGHBORS_MAX
 from ..model.node_solve import solve_translations
 from ..model.rotations import quat_conjugate, quat_multiply
@@ -21,6 +22,7 @@ from ..model.temporal_transform import dct_basis
 from . import companding, rdo
 from .coded_form import CodedForm
 from .quantization_plan import Grid, Plan
+from .quantize_rig import quantize_rig
 from .rotation_residuals import quantize_rotations, step_factors
 from .settings import RdoSettings
 
@@ -225,15 +227,24 @@ def _quantize_nodes(form: CodedForm, positions: np.ndarray, plan: Plan, settings
         c = np.tensordot(basis / np.float32(step), values.astype(np.float32), 1).transpose(0, 2, 1)
         return rdo.quantize_trajectories(c, weights * step**2, frames, price, settings)
 
-    rotations = quantized(nodes.rotations[:, first], rotation_weights, rotation_step)
+    turned = nodes.rotations[:, first]
     moved = nodes.translations[:, first] + (nodes.positions[first] - places)  # the node rests on the grid
+    rig, predicted = nodes.rig and quantize_rig(nodes.rig.take_nodes(first), grid, step), None
+    if rig is not None:
+        predicted = rig_motion(rig, grid.origin, grid.step)
+        turned, _ = predicted.residual(places, turned, moved)
+    rotations = quantized(turned, rotation_weights, rotation_step)
     decoded = rotation_step * np.tensordot(basis[: len(rotations)].T, rotations.transpose(0, 2, 1), 1)
+    if predicted is not None:
+        decoded, _ = predicted.total(places, decoded, np.zeros_like(decoded))
     moved = solve_translations((places, decoded, moved), x, form.held(form.means), (index, share))
+    if predicted is not None:
+        _, moved = predicted.residual(places, decoded, moved)
     translations = quantized(moved, shift_weights, step)
     used = max(len(rotations), len(translations))
     padded = [np.pad(p, ((0, used - len(p)), (0, 0), (0, 0))) for p in (rotations, translations)]
     neighbors = min(NEIGHBORS, NEIGHBORS_MAX, len(on_grid))
-    return QuantizedNodes(on_grid, np.concatenate(padded, 1), rotation_step, step, neighbors)
+    return QuantizedNodes(on_grid, np.concatenate(padded, 1), rotation_step, step, neighbors, rig)
 
 
 def _node_weights(index, share, x, places, weights) -> tuple[np.ndarray, np.ndarray]:

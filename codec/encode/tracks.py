@@ -1,4 +1,5 @@
-"""Tracks of .gsv files -> one file: mux, and edits that code nothing anew. Every unit stays byte-identical.
+"""Tracks of .gsv files -> one file: mux, and edits that code nothing anew. Every unit stays byte-identical, but for the
+poses of a track with a rig that is posed anew.
 
 A `TrackPlan` says which groups of which files a track consists of, and where it is placed. Only boxes are written: moov
 with the placements, an index of each track, and the fragments, whose times follow from their order.
@@ -19,6 +20,8 @@ from ..decode.scene import Track
 from ..decode.stream import Stream
 from ..errors import UsageError
 from ..model.placement import Placement
+from ..model.rig import Rig
+from .reposing import reposed
 from .writer import layer_ends
 
 SAME = ("fps", "sh_frame", "color_space", "up", "metres_per_unit")  # of tracks that are joined
@@ -32,11 +35,18 @@ class TrackPlan:
         config: gsvC, of `_native.init_segment`.
         placement: gsvT.
         groups: (file, number of the group in it) in playing order.
+        rig: other poses for all of their frames; None: as they are.
     """
 
     config: dict
     placement: Placement
     groups: Sequence[tuple[Stream, int]]
+    rig: Rig | None = None
+
+    @property
+    def frame_count(self) -> int:
+        """Frames of all groups."""
+        return sum(stream.groups[i]["frames"] for stream, i in self.groups)
 
     @property
     def has_sound(self) -> bool:
@@ -102,7 +112,7 @@ def write_tracks(out: Path, plans: Sequence[TrackPlan]) -> int:
     written with it alone.
 
     Raises:
-        UsageError: there is no track, or a predicted group has lost its reference.
+        UsageError: there is no track, a predicted group has lost its reference, or a group to be posed has no rig.
     """
     if not plans:
         raise UsageError(f"{out}: no track is left, expected at least one")
@@ -133,8 +143,11 @@ def _write_groups(f, plan: TrackPlan, config: dict, number: int) -> list[tuple[i
     """Appends the fragments of a track; returns its index, as `_native.finish` takes it."""
     start, index = 0, []
     for stream, i in plan.groups:
-        g, payload = stream.groups[i], stream.payload(i)
-        number += 1
+        g, number = stream.groups[i], number + 1
+        if plan.rig is None:
+            payload = stream.payload(i)
+        else:
+            payload = reposed(stream, i, plan.rig.frames(range(start, start + g["frames"])))
         sound = _sound(stream, g, start, config)
         data = _native.fragment(payload, number, start, g["frames"], g["sync"], config, sound)
         f.write(data)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
+from functools import partial
 
 import numpy as np
 
@@ -16,33 +17,52 @@ from ..model.attributes import CANONICAL
 from ..model.gaussian_sequence import DenseGroup
 from ..model.gaussians import Gaussians
 from ..model.parametric_group import NodeMotion, ParametricGroup, checked_parents
+from ..model.rig import Rig, RigMotion
 from ..model.rotations import quat_conjugate, quat_multiply, quat_normalize, rotate
+from ..model.skin_weights import skin_weights
 from ..model.temporal_transform import dct_basis
 from .dense_stack import DenseStack
-from .node_fit import fit_nodes
+from .node_fit import Predict, fit_nodes
 
 
 def fit_groups(
-    groups: Sequence[DenseGroup | ParametricGroup], *, start: int = 0, random_access: int = 0, quality: float = 50.0
+    groups: Sequence[DenseGroup | ParametricGroup],
+    *,
+    start: int = 0,
+    random_access: int = 0,
+    quality: float = 50.0,
+    rig: Rig | None = None,
 ) -> Iterator[ParametricGroup]:
     """Yields the groups from `start` on; those that are parametric already as they are.
 
     Args:
         random_access: frames from one independent group to the next at most; 0 or 1: every group rests by itself.
         quality: of the stream (0 to 100); it decides how many nodes pay.
+        rig: with poses of all frames of `groups`, predicts the motion of groups that are fitted.
     """
     rest, since = None, 0  # rest positions of the group before, and frames since the first of its segment
-    for i in range(_segment_start(groups, start, random_access), len(groups)):
+    first = _segment_start(groups, start, random_access)
+    frame = sum(map(len, groups[:first])) if rig else 0
+    at_rest = frame  # the frame in which the segment rests
+    for i in range(first, len(groups)):
         group = groups[i]
         if isinstance(group, ParametricGroup):
             rest, fitted = None, group
         else:
             continues = rest is not None and group.parents is not None and since + len(group) <= random_access
-            fitted = fit_group(group, quality=quality, rest=rest if continues else None)
+            at_rest = at_rest if continues else frame + len(group) // 2
+            predict = rig and partial(_predicted, rig, at_rest, range(frame, frame + len(group)))
+            fitted = fit_group(group, quality=quality, rest=rest if continues else None, predict=predict)
             since = since + len(group) if continues else len(group)
             rest = fitted.canonical.means
+        frame += len(group)
         if i >= start:
             yield fitted
+
+
+def _predicted(rig: Rig, at_rest: int, frames: range, places: np.ndarray) -> RigMotion:
+    """What a rig says of nodes at `places` [M, 3], which rest as they are in a frame."""
+    return rig.motion(skin_weights(rig, at_rest, places), at_rest, frames)
 
 
 def _segment_start(groups, start: int, random_access: int) -> int:
@@ -56,12 +76,15 @@ def _segment_start(groups, start: int, random_access: int) -> int:
     return first
 
 
-def fit_group(group: DenseGroup, *, quality: float = 50.0, rest: np.ndarray | None = None) -> ParametricGroup:
+def fit_group(
+    group: DenseGroup, *, quality: float = 50.0, rest: np.ndarray | None = None, predict: Predict | None = None
+) -> ParametricGroup:
     """One group.
 
     Args:
         rest: [P, 3] rest positions of the Gaussians of the group before, which `group.parents` names; None: the group
             rests as it is in its middle frame.
+        predict: positions of nodes at rest -> what a rig says of their motion.
     """
     frames, own = len(group), (group.lifetimes, group.parents)
     if frames == 1:
@@ -70,7 +93,7 @@ def fit_group(group: DenseGroup, *, quality: float = 50.0, rest: np.ndarray | No
     middle = stack.at(frames // 2)
     if not len(middle):
         return ParametricGroup(frames, middle, None, {}, *own)
-    nodes, means = _motion(stack, middle, group.parents if rest is not None else None, rest, quality)
+    nodes, means = _motion(stack, middle, group.parents if rest is not None else None, rest, quality, predict)
     still = ParametricGroup(frames, _with(middle, means=means), nodes)
     carried, rotations = still.carried()
     middle_rotations = rotations[stack.nearest_frame(frames // 2), np.arange(len(middle))]
@@ -80,16 +103,16 @@ def fit_group(group: DenseGroup, *, quality: float = 50.0, rest: np.ndarray | No
     return ParametricGroup(frames, canonical, nodes, trajectories, *own)
 
 
-def _motion(stack, middle: Gaussians, parents, rest, quality) -> tuple[NodeMotion | None, np.ndarray]:
+def _motion(stack, middle: Gaussians, parents, rest, quality, predict) -> tuple[NodeMotion | None, np.ndarray]:
     """Nodes of the group, and where its Gaussians rest, [N, 3]."""
     step = steps_for(quality, subject_radius(middle.means))["means"]
     if parents is None:
-        return fit_nodes(middle.means, stack.frames.means, step), middle.means
+        return fit_nodes(middle.means, stack.frames.means, step, predict=predict), middle.means
     known = np.flatnonzero(checked_parents(parents, len(middle), len(rest)) >= 0)
     if not len(known):
         return None, middle.means
     places = rest[parents[known]]
-    nodes = fit_nodes(places, stack.frames.means[:, known], step)
+    nodes = fit_nodes(places, stack.frames.means[:, known], step, predict=predict)
     means = middle.means.copy()
     if nodes is not None:
         born = np.flatnonzero(parents < 0)

@@ -7,7 +7,7 @@ graph (HiFi4G), plus residual trajectories in a temporal DCT. Evaluation is nati
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,6 +16,7 @@ from .. import _native
 from ..errors import CaptureError
 from .camera import Calibration
 from .gaussians import Gaussians, shown_at
+from .rig import RigMotion
 from .temporal_transform import dct_basis
 
 
@@ -29,6 +30,8 @@ class NodeMotion:
         translations: [T, M, 3] f32, displacement of the node from rest, world units.
         neighbors: [N, k] int32, nodes that carry each Gaussian, k >= 1.
         weights: [N, k] f32, by which their motions are blended; each row sums to 1.
+        rig: what predicts the motion, so that the stream holds what is left; None: nothing does. Rotations and
+            translations are the whole motion in either case.
     """
 
     positions: np.ndarray
@@ -36,11 +39,11 @@ class NodeMotion:
     translations: np.ndarray
     neighbors: np.ndarray
     weights: np.ndarray
+    rig: RigMotion | None = None
 
     def take(self, index: np.ndarray) -> NodeMotion:
         """The same nodes for the Gaussians at `index` ([n] int)."""
-        own = self.neighbors[index], self.weights[index]
-        return NodeMotion(self.positions, self.rotations, self.translations, *own)
+        return replace(self, neighbors=self.neighbors[index], weights=self.weights[index])
 
 
 def checked_parents(parents: np.ndarray, count: int, before: int) -> np.ndarray:

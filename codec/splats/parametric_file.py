@@ -4,13 +4,14 @@ the file equals one made in memory."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 
 from ..model.camera import Calibration
 from ..model.gaussians import Gaussians
 from ..model.parametric_group import NodeMotion, ParametricGroup
+from ..model.rig import RigMotion
 
 OPTIONAL = ("lifetimes", "parents")
 
@@ -19,9 +20,10 @@ def to_arrays(group: ParametricGroup) -> dict[str, np.ndarray]:
     """Everything in a group as named arrays."""
     arrays = {n: np.array(getattr(group, n)) for n in ("frame_count", "rate_optimized", "ended")}
     parts = {"canonical": group.canonical, "nodes": group.nodes, "calibration": group.calibration}
+    parts["rig"] = group.nodes and group.nodes.rig
     for part, value in parts.items():
         if value is not None:
-            arrays |= {f"{part}.{f.name}": getattr(value, f.name) for f in fields(value)}
+            arrays |= {f"{part}.{f.name}": getattr(value, f.name) for f in fields(value) if f.name != "rig"}
     arrays |= {f"trajectories.{n}": c for n, c in group.trajectories.items()}
     return arrays | {n: getattr(group, n) for n in OPTIONAL if getattr(group, n) is not None}
 
@@ -35,12 +37,13 @@ def from_arrays(arrays: Mapping[str, np.ndarray]) -> ParametricGroup:
 
     def part(name: str, kind):
         own = {n.partition(".")[2]: a for n, a in arrays.items() if n.startswith(f"{name}.")}
-        return kind(**{f.name: own[f.name] for f in fields(kind)}) if own else None
+        return kind(**{f.name: own[f.name] for f in fields(kind) if f.name != "rig"}) if own else None
 
+    nodes, rig = part("nodes", NodeMotion), part("rig", RigMotion)
     return ParametricGroup(
         int(arrays["frame_count"]),
         part("canonical", Gaussians),
-        part("nodes", NodeMotion),
+        replace(nodes, rig=rig) if rig else nodes,
         {n.partition(".")[2]: a for n, a in arrays.items() if n.startswith("trajectories.")},
         *(arrays.get(n) for n in OPTIONAL),
         part("calibration", Calibration),

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 
 from ..errors import UsageError, require
 from ..model.parametric_group import ParametricGroup
+from ..model.rig import Rig
 from .settings import TrainSettings
 from .train import segments, train_groups
 
@@ -25,6 +26,7 @@ def cluster_groups(
     random_access: int,
     *,
     first_frame: int = 0,
+    rig: Rig | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> Iterator[ParametricGroup]:
     """Yields what `train_groups` does.
@@ -32,6 +34,7 @@ def cluster_groups(
     Args:
         address: of the cluster, as `ray.init` takes it ("auto", "ray://host:10001"); "local" starts one here.
         open_capture: () -> Capture, anywhere in the cluster.
+        rig: predicts the motion in all frames of the capture.
         first_frame: where an earlier run stopped; the segment that it stopped in is trained again as a whole.
         on_progress: called with the number of frames done.
 
@@ -49,7 +52,7 @@ def cluster_groups(
         cpus = int(min(CPUS, max(node["Resources"].get("CPU", 1) for node in ray.nodes())))
         threads = {"env_vars": {"RAYON_NUM_THREADS": str(cpus), "OMP_NUM_THREADS": "1"}}  # of the kernels, of torch
         job = ray.remote(num_cpus=cpus, max_retries=RETRIES, runtime_env=threads)(train_segment)
-        pending = [job.remote(open_capture, settings, random_access, s) for s in left]
+        pending = [job.remote(open_capture, settings, random_access, s, rig) for s in left]
         for segment in left:
             done = segment.start
             for group in ray.get(pending.pop(0)):
@@ -75,10 +78,10 @@ def _knock(address: str) -> None:
 
 
 def train_segment(
-    open_capture: Callable, settings: TrainSettings, random_access: int, frames: range
+    open_capture: Callable, settings: TrainSettings, random_access: int, frames: range, rig: Rig | None = None
 ) -> list[ParametricGroup]:
     """One job: the groups of a segment."""
-    groups = train_groups(open_capture(), settings, first_frame=frames.start, random_access=random_access)
+    groups = train_groups(open_capture(), settings, first_frame=frames.start, random_access=random_access, rig=rig)
     done = frames.start
     found = []
     while done < frames.stop:

@@ -9,6 +9,7 @@ import torch
 
 from ..bitstream.quantization import Steps
 from ..model.attributes import ATTRIBUTES
+from ..model.rig import Rig
 from .model import NAMES, Model
 from .settings import TrainSettings
 from .tracking import Tracker
@@ -52,14 +53,16 @@ class Subject:
         return {**whole, **cameras, **canonical, **self.tracker.state()}
 
     @staticmethod
-    def restored(state: dict[str, np.ndarray], views: Views, settings: TrainSettings) -> Subject:
+    def restored(
+        state: dict[str, np.ndarray], views: Views, settings: TrainSettings, rig: Rig | None = None
+    ) -> Subject:
         """Inverse of `state`; also sets the calibration of `views`."""
         canonical = {n: torch.from_numpy(state[f"canonical.{n}"]) for n in NAMES}
         loss, radius = state["loss_radius"].tolist()
         views.exposure.values, views.extrinsics.values = state["exposure"], state["extrinsics"]
         views.extrinsics.set_subject(state["center"], radius)
         steps = _steps_from_array(state["steps"])
-        tracker = Tracker.restored(state, views, settings)
+        tracker = Tracker.restored(state, views, settings, rig)
         return Subject(tracker, loss, radius, Model(canonical), state["parents"], steps)
 
 

@@ -23,6 +23,7 @@ import numpy as np
 import torch
 
 from ..bitstream.quantization import subject_radius
+from ..model.rig import Rig
 from ..model.rotations import quat_conjugate, rotate, rotvec_to_quat
 from .change_detection import Changes
 from .deformation_graph import NodeGraph, Pose
@@ -31,6 +32,7 @@ from .frame_fit import FrameFit
 from .keyframe import Statistics
 from .model import NAMES, REMOVED_LOGIT, Model, quat_product
 from .relocalization import relocalize
+from .rig_prediction import RigPrediction
 from .settings import TrainSettings
 from .views import Views, view_losses
 
@@ -57,6 +59,7 @@ class Tracker:
         loss: image loss of the last frame with changes, without the mask term.
         masks: changed pixels of the last frame, as of `Changes.advance`.
         screen_gradient: [N], mean in the last frame.
+        rig: says how the nodes move to the next frame; None: they go on as they did.
     """
 
     def __init__(
@@ -67,10 +70,14 @@ class Tracker:
         self.radius, self.loss, self.keyframe_gradient = numbers.tolist()
         self.changes = changes
         self.moving = torch.zeros(len(own), dtype=torch.bool)
+        self.rig: RigPrediction | None = None
 
     @staticmethod
-    def start(key: Model, views: Views, settings: TrainSettings, loss: float, frames: range) -> Tracker:
-        """Tracks `key`, the keyframe of frames[0] with image loss `loss`; nodes are dense where frames[1] changes."""
+    def start(
+        key: Model, views: Views, settings: TrainSettings, loss: float, frames: range, rig: Rig | None = None
+    ) -> Tracker:
+        """Tracks `key`, the keyframe of frames[0] with image loss `loss`; nodes are dense where frames[1] changes.
+        `rig`: predicts their motion."""
         s, changes = settings.tracking, Changes.since(views, frames[0], settings.change_detection)
         stats, visible = Statistics(len(key), settings.keyframe.mse_min), []
         for result in view_losses(key.params, views, frames[0], settings):
@@ -88,7 +95,9 @@ class Tracker:
         graph = NodeGraph.of(means, sizes, radius, torch.from_numpy(moving), settings.graph)
         own = Model({**key.params, "means": torch.zeros_like(means)})
         gradient = float(torch.quantile(stats.mean_screen_gradient(), s.gradient_quantile))
-        return Tracker(graph, own, views, settings, np.array([radius, loss, gradient]), changes)
+        tracker = Tracker(graph, own, views, settings, np.array([radius, loss, gradient]), changes)
+        tracker.rig = rig and RigPrediction(rig, frames[0], graph)
+        return tracker
 
     def carried(self, own: Model, pose: Pose) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """Attributes of `own` carried to `pose`, and the rotation of each Gaussian by the nodes, [N, 4]."""
@@ -113,6 +122,8 @@ class Tracker:
             Image loss at the end, without the mask term. None: nothing has changed, or no Gaussian is left and no pixel
             needs one. Infinity: no Gaussian is left, and pixels change.
         """
+        if self.rig is not None:
+            self.pose = self.rig.step(self.pose, self.graph, frame)
         self.moving = torch.from_numpy(self._moving(frame))
         self.screen_gradient = torch.zeros(len(self.own))
         changed = any(m.any() for m in self.masks)
@@ -255,10 +266,13 @@ class Tracker:
         fitted = {f"fitted.{i}": image for i, image in enumerate(self.changes.fitted)}
         graph = {f"graph.{n}": a for n, a in self.graph.state().items()}
         numbers = np.array([self.radius, self.loss, self.keyframe_gradient])
-        return {"numbers": numbers, **graph, **own, **pose, **fitted}
+        rig = {} if self.rig is None else {"at_rest": np.array(self.rig.at_rest)}
+        return {"numbers": numbers, **rig, **graph, **own, **pose, **fitted}
 
     @staticmethod
-    def restored(state: dict[str, np.ndarray], views: Views, settings: TrainSettings) -> Tracker:
+    def restored(
+        state: dict[str, np.ndarray], views: Views, settings: TrainSettings, rig: Rig | None = None
+    ) -> Tracker:
         """Inverse of `state`."""
         own = Model({n: torch.from_numpy(state[f"own.{n}"]) for n in NAMES})
         graph = {n.removeprefix("graph."): a for n, a in state.items() if n.startswith("graph.")}
@@ -266,4 +280,5 @@ class Tracker:
         changes = Changes(views, fitted, settings.change_detection)
         tracker = Tracker(NodeGraph.restored(graph, settings.graph), own, views, settings, state["numbers"], changes)
         tracker.pose = Pose(*(torch.from_numpy(state[f"pose.{f.name}"]) for f in fields(Pose)))
+        tracker.rig = rig and RigPrediction(rig, int(state["at_rest"]), tracker.graph)
         return tracker

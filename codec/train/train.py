@@ -15,6 +15,7 @@ import torch
 
 from ..bitstream.quantization import steps_for
 from ..model.parametric_group import ParametricGroup
+from ..model.rig import Rig
 from ..render.backend import Backend
 from ..render.cpu import CpuBackend
 from ..render.sensitivity import measured_steps
@@ -54,6 +55,7 @@ def train_groups(
     *,
     first_frame: int = 0,
     random_access: int = 0,
+    rig: Rig | None = None,
     checkpoints: Path | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     backend: Backend | None = None,
@@ -69,6 +71,7 @@ def train_groups(
     Args:
         first_frame: where an earlier run stopped, the first frame of a group.
         random_access: see `segments`.
+        rig: predicts the motion in all frames of the capture.
         checkpoints: folder of the states that groups start from; None: nothing is written.
         on_progress: called after every step.
         backend: device that renders and optimises; a new CpuBackend if None.
@@ -80,12 +83,12 @@ def train_groups(
         CaptureError: a frame cannot be read, or no view overlaps another.
     """
     store = Checkpoint(checkpoints)
-    run = _Run(capture, settings, backend or CpuBackend(), on_progress)
+    run = _Run(capture, settings, backend or CpuBackend(), on_progress, rig)
     if not first_frame:
         store.clear()  # an earlier run with other settings may have left some
     state = store.load(first_frame) if first_frame else None  # absent after a cut, too
     if state is not None:
-        run.subject = Subject.restored(state, run.views, run.settings)
+        run.subject = Subject.restored(state, run.views, run.settings, rig)
     start = first_frame
     for segment in segments(capture.frame_count, settings.gop, random_access):
         while start < segment.stop:
@@ -108,8 +111,8 @@ def segments(frame_count: int, gop: int, random_access: int) -> list[range]:
 class _Run:
     """State that the groups of one run share. `subject` is None where the next frame needs a keyframe."""
 
-    def __init__(self, capture, settings: TrainSettings, backend: Backend, on_progress):
-        self.capture, self.on_progress = capture, on_progress
+    def __init__(self, capture, settings: TrainSettings, backend: Backend, on_progress, rig: Rig | None):
+        self.capture, self.on_progress, self.rig = capture, on_progress, rig
         self.views = Views(capture, settings, backend)
         self.settings = with_frame_budget(settings if capture.has_alpha else settings.of_room(), self.views, 0)
         self.progress = Progress(0)
@@ -156,6 +159,9 @@ class _Run:
         known = len(model.key) if parents is None else len(parents)
         new = np.full(len(model.key) - known, -1)
         group = model.group(None if parents is None else np.append(parents, new).astype(np.int32))
+        if subject.tracker.rig is not None:
+            predicted = subject.tracker.rig.motion(len(group.nodes.positions), done)
+            group = replace(group, nodes=replace(group.nodes, rig=predicted))
         group = replace(group, ended=ended)
         subject.start_next_group(model.key)
         if not len(subject.parents):
@@ -170,7 +176,7 @@ class _Run:
         model, radius = initial_model(self.capture, frames[0], budget.points, s, self.views.view)
         on_step = self._report(f"keyframe {frames[0]}")
         loss = train_keyframe(model, self.views, frames[0], s, steps=budget.steps, radius=radius, on_step=on_step)
-        return Subject(Tracker.start(model, self.views, s, loss, frames), loss, radius)
+        return Subject(Tracker.start(model, self.views, s, loss, frames, self.rig), loss, radius)
 
     def _track(self, frames: range, track: _TrackedFrames) -> str:
         """Tracks `frames` up to the end of the group and adds them to `track`; returns why that came early

@@ -5,7 +5,13 @@ from dataclasses import replace
 import numpy as np
 
 from gscodec import _native
-from gscodec.bitstream.quantized_group import QuantizedChannels, QuantizedGroup, QuantizedNodes, QuantizedTrajectories
+from gscodec.bitstream.quantized_group import (
+    QuantizedChannels,
+    QuantizedGroup,
+    QuantizedNodes,
+    QuantizedRig,
+    QuantizedTrajectories,
+)
 
 CHANNELS = {"log_scales": 3, "quats": 3, "logit_opacities": 1, "sh0": 3}
 
@@ -115,6 +121,28 @@ def tied_nodes():
     group = make_group(60, 5, bits=2, nodes=30, neighbors=3)
     nodes = replace(group.nodes, positions=np.repeat(group.nodes.positions[::2], 2, axis=0))
     return replace(group, nodes=nodes)
+
+
+def rigged(group, joints=6, seed=2):
+    """A group whose nodes a rig moves: a tree of joints with two roots, weights of up to three joints, or none."""
+    rng = np.random.default_rng(seed)
+    count = len(group.nodes.positions)
+    parents = np.array([0, 1, *(rng.integers(0, j) for j in range(2, joints))][:joints], np.uint8)
+    decay = (200 / (1 + np.arange(group.frames)) ** 2).reshape(-1, 1, 1)
+    poses = (decay * rng.standard_normal((group.frames, 6, joints))).round().astype(np.int32)
+    poses[:, 3:, 2:] = 0
+    share = rng.random((count, joints)) * (rng.random((count, joints)) < 0.4)
+    weights = np.floor(64 * share / np.maximum(share.sum(1, keepdims=True), 1e-9)).astype(np.uint8)
+    rig = QuantizedRig(
+        joints=rng.integers(-300, 1500, (joints, 3)).astype(np.int32),
+        parents=parents,
+        bind=(100 * rng.standard_normal((joints, 6))).round().astype(np.int32),
+        weights=weights,
+        poses=poses,
+        rotation_step=0.005,
+        translation_step=0.002,
+    )
+    return replace(group, nodes=replace(group.nodes, rig=rig))
 
 
 def take(group, index):

@@ -53,6 +53,7 @@ from groups import (  # noqa: E402
     layered,
     make_group,
     predicted,
+    rigged,
     tied_nodes,
     tiled,
 )
@@ -78,6 +79,8 @@ from units import (  # noqa: E402
     poke_time,
     predicted_file,
     remove_unit,
+    rig_unit,
+    rigged_file,
     traj,
     unit_dict,
     units_file,
@@ -95,7 +98,15 @@ SHIFTS = [[0, 0, 0, 0, 0], [1, 2, 3, 0, 4], [3, 15, 1, 2, 3]]
 COMPANDED = companded(
     coarser(layered(make_group(90, 3, spread=40, trajectories={"log_scales": 2}), [[0], [1], [2]]), SHIFTS)
 )
+RIGGED = rigged(make_group(120, 7, seed=6, nodes=14, trajectories={"means": 2}))
+WHOLE_RIG = make_group(90, 3, seed=7, nodes=5)
 LAYERED = layered(make_group(100, 3, nodes=4, trajectories={"means": 2}), [[0], [1, 2], [3, 4, 5]])
+
+WEIGHT_OF_MINUS_5 = (
+    "003ffffffa45729ac39a60504848b82d6946f5638a611e5dd76e86ec8c7e4a9e226b5b9443a7dfde35e1b86916"
+    "62c043b14ac18959c5381b46c5db2e00e3e0867444cc3c48c85f48bd12084e2c19ced2006bdc0e9bf36dc5f48a"
+    "92f3187f2ed13ae17ea947ae0935bee1f6cdb1c675c1c3f2d32d2662354820823cfde6f1c26b30f90ec7"
+)
 
 VALID = {  # name: (what it is about, bytes)
     "single_frame": ("one group of one frame", lambda: groups_file(make_group(300, 1))),
@@ -223,6 +234,15 @@ VALID = {  # name: (what it is about, bytes)
         "companding, with layers that leave out low bits and a trajectory on top, and a group predicted from it",
         lambda: predicted_file(COMPANDED, predicted(COMPANDED, FULL, births=0)),
     ),
+    "rig": ("a rig of two roots, with nodes that it does not move", lambda: groups_file(RIGGED)),
+    "rig_predicted": (
+        "a rig of one joint, of one frame, and groups with and without a rig predicted from it",
+        lambda: predicted_file(
+            rigged(make_group(40, 1, nodes=3), joints=1),
+            predicted(make_group(40, 1, nodes=3), rigged(make_group(50, 5, seed=3, nodes=6), joints=9)),
+            predicted(make_group(40, 1, nodes=3), replace(WHOLE_RIG), back=2),
+        ),
+    ),
     "sound": ("an audio track of Opus, in the first of two groups", sound_file),
     "sound_aac": ("an audio track of AAC", lambda: sound_file(b"mp4a", b"esds", finish=False)),
     "sound_unknown": ("an audio track that is neither AAC nor Opus", lambda: sound_file(b"fLaC", b"dfLa")),
@@ -333,6 +353,15 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "unit_no_nodes": (B, "node_positions", remove_unit(2)),
     "unit_no_node_trajectories": (B, "node_trajectories", remove_unit(3)),
     "unit_node_index": (B, "index of 0", change_unit(2, index=1)),
+    "unit_rig_unannounced": (B, "announces", insert(unit_dict(5))),
+    "unit_no_rig": (B, "a unit rig", lambda: rigged_file(lambda u: u.remove(find_unit(u, 5)))),
+    "unit_no_joint_poses": (B, "a unit joint_poses", lambda: rigged_file(lambda u: u.remove(find_unit(u, 6)))),
+    "unit_rig_index": (B, "index of 0", rig_unit(5, index=1)),
+    "unit_joint_poses_twice": (
+        B,
+        "one unit of each",
+        lambda: rigged_file(lambda u: u.append(dict(find_unit(u, 6)))),
+    ),
     "unit_layer_correction_attribute": (B, "layer_correction", insert(unit_dict(4, index=3, payload=f32(1)))),
     "unit_layer_correction_nan": (B, "finite", insert(unit_dict(4, index=4, payload=f32(NAN)))),
     "unit_layer_correction_long": (B, "layer_correction", insert(unit_dict(4, index=4, payload=f32(1) + b"\0"))),
@@ -381,7 +410,7 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "header_companding_low": (B, "low", header(flags=2, companding=[(0.0, 0.1), (0.0, 0.1), (0.0, 0.1), (INF, 0.1)])),
     "header_companding_cut": (B, "8 more", header(flags=2, bounds=())),
     "predicted_companding": (B, "flags", change_predicted(lambda h: h[:2] + bytes([h[2] | 2]) + h[3:])),
-    "header_flags": (B, "flags", header(flags=32)),
+    "header_flags": (B, "flags", header(flags=64)),
     "header_flag_of_draft_7": (B, "flags", header(flags=4)),
     "header_shift": (B, "shift", header(flags=8, shifts=[0, 16, 0, 0, 0])),
     "header_shift_positions": (B, "shift", header(flags=8, shifts=[HEADER["grid_bits"], 0, 0, 0, 0])),
@@ -419,6 +448,10 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "header_node_coefficients": (B, "coefficients", header(coefficients=5)),
     "header_rotation_step": (B, "rotation_step", header(rotation_step=0.0)),
     "header_translation_step": (B, "translation_step", header(translation_step=NAN)),
+    "header_rig_no_nodes": (B, "nodes in a group with a rig", header(flags=32, node_count=0)),
+    "header_rig_no_joints": (B, "at least one joint", header(flags=32, rig=(0, 0.1, 0.1))),
+    "header_rig_rotation_step": (B, "rotation_step of joints", header(flags=32, rig=(2, 0.0, 0.1))),
+    "header_rig_translation_step": (B, "translation_step of joints", header(flags=32, rig=(2, 0.1, INF))),
     "header_truncated": (B, "2 more", change_unit(0, payload=pack_header()[:-1])),
     "header_left_over": (B, "group_header", change_unit(0, payload=pack_header() + b"\0")),
     # Limits
@@ -448,6 +481,14 @@ INVALID = {  # name: (error, part of the message of both decoders, bytes)
     "payload_escape": (B, "sh0", change_stream("sh0", lambda p: b"\xef" + bytes(63))),
     "payload_value": (B, "sh0", change_stream("sh0", lambda p: b"\xee\x70" + bytes(62))),
     "payload_symbol": (B, "sh0", change_stream("sh0", lambda p: b"\xff\xff" + bytes(62))),
+    "payload_rig_parent": (B, "values within", rig_unit(5, payload=b"\xff" * 40)),
+    "payload_rig_weight": (B, "values within", rig_unit(5, payload=bytes.fromhex(WEIGHT_OF_MINUS_5))),
+    "payload_rig_left_over": (
+        B,
+        "rig",
+        lambda: rigged_file(lambda u: find_unit(u, 5).update(payload=find_unit(u, 5)["payload"] + b"\1" * 8)),
+    ),
+    "payload_joint_poses_short": (B, "joint_poses", rig_unit(6, payload=b"\x55" * 9)),
     "payload_lifetime": (B, "lifetimes", change_stream("lifetimes", lambda p: bytes.fromhex("342f5d0a5e4842"))),
 }
 

@@ -9,7 +9,7 @@ import zlib
 from pathlib import Path
 
 from files import CAMERA, groups_file, make_file, poke, split_boxes, u32
-from groups import encode, layered, make_group, predicted
+from groups import encode, layered, make_group, predicted, rigged
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import reference_decoder as reference
@@ -137,7 +137,7 @@ def varint(value):
 
 def add_unknown_units(units):
     units.append(unit_dict(200, index=17, payload=b"from later"))
-    units.append(unit_dict(5, index=2))
+    units.append(unit_dict(7, index=2))
     units.append(unit_dict(255, layer=3))
     units.append(unit_dict(255, layer=3))
     units.append(unit_dict(10, layer=3, payload=bytes(100)))
@@ -202,6 +202,19 @@ HEADER = {
 }
 
 
+def rig_unit(unit_type, **fields):
+    """A group with a rig, with a unit changed."""
+    change = lambda units: find_unit(units, unit_type).update(fields)  # noqa: E731
+    return lambda: rigged_file(change)
+
+
+def rigged_file(edit):
+    """A group with a rig, with its units edited."""
+    units = split_units(encode(rigged(base_group())))
+    edit(units)
+    return make_file([(join_units(units), 4)])
+
+
 def pack_header(**changes):
     h = HEADER | changes
     data = struct.pack(">HB", h["frames"], h["flags"])
@@ -219,6 +232,7 @@ def pack_header(**changes):
         data += struct.pack(
             ">BHff", *(h[k] for k in ("neighbors", "coefficients", "rotation_step", "translation_step"))
         )
+    data += struct.pack(">Bff", *h["rig"]) if "rig" in h else b""
     cells = 4 ** max(h["tile_side_log2"], 4)
     bounds = b"".join(struct.pack(">H", v) for v in h["bounds"])
     return data + bounds * sum(-(-count // cells) for count in h["layer_counts"] if count < 2**24)

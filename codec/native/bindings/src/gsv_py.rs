@@ -8,6 +8,8 @@ mod parametric;
 mod placement;
 mod quantized_from;
 mod report;
+mod reposing;
+mod rig;
 mod rigid_blend;
 mod values;
 
@@ -42,6 +44,8 @@ pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(rigid_blend::blend_rigid, m)?)?;
     m.add_function(wrap_pyfunction!(rigid_blend::node_gradients, m)?)?;
     m.add_function(wrap_pyfunction!(rigid_blend::quat_product, m)?)?;
+    m.add_function(wrap_pyfunction!(rig::rig_motion, m)?)?;
+    m.add_function(wrap_pyfunction!(reposing::repose, m)?)?;
     m.add_function(wrap_pyfunction!(attributes, m)?)?;
     m.add_class::<parametric::ParametricEvaluator>()?;
     m.add_class::<decoded::DecodedGroup>()

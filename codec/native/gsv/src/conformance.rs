@@ -121,7 +121,8 @@ fn needs(header: &Header, key: UnitKey) -> [Option<UnitKey>; 2] {
             let born = born.filter(|_| usize::from(index) >= header.survivor_tiles(k));
             [first, born].map(|t| t.map(|t| (UnitType::Tile, layer, t as u16)))
         }
-        UnitType::NodeTrajectories => [Some((UnitType::NodePositions, 0, 0)), None],
+        UnitType::NodeTrajectories | UnitType::Rig => [Some((UnitType::NodePositions, 0, 0)), None],
+        UnitType::JointPoses => [(UnitType::NodePositions, 0, 0), (UnitType::Rig, 0, 0)].map(Some),
         _ => [None; 2],
     };
     needed.map(|need| need.filter(|need| *need != key))
@@ -138,9 +139,11 @@ fn announced(h: &Header, layers: usize) -> Vec<(UnitKey, bool)> {
         out.push(((UnitType::NodePositions, 0, 0), true));
         out.push(((UnitType::NodeTrajectories, 0, 0), true));
     }
+    let poses = [UnitType::Rig, UnitType::JointPoses].map(|kind| ((kind, 0, 0), true));
     for k in 0..h.tiles.len().min(layers) {
         let corrected = [Attribute::LogScales, Attribute::LogitOpacities];
         out.extend(corrected.map(|a| ((UnitType::LayerCorrection, k as u8, a as u16), false)));
     }
+    out.extend(poses.iter().filter(|_| h.rig.joints > 0));
     out
 }

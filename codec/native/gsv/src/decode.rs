@@ -13,7 +13,7 @@ use crate::dequantize;
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader};
 use crate::group::Group;
-use crate::header::{Header, NodeHeader};
+use crate::header::{Header, NodeHeader, RigHeader};
 use crate::levels::Level;
 use crate::lifetimes;
 use crate::morton;
@@ -21,6 +21,7 @@ use crate::neighbors::{self, Near};
 use crate::parallel;
 use crate::positions::{self, SplitModel};
 use crate::range_coder::Decoder;
+use crate::rig::{self, Rig};
 use crate::tile::{self, Models, Stream, StreamModel};
 use crate::trajectories::{self, Kind, Stop, Trajectories, TrajectoryModel};
 use crate::unit::{self, ALL_LAYERS, Unit, UnitType};
@@ -165,12 +166,15 @@ fn decode(header: Header, units: &[Unit], how: &Decoding) -> Result<(Group, Vec<
     let corrections = (0..count)
         .map(|k| decoder.correction(k as u8))
         .collect::<Result<Vec<_>>>()?;
-    let ((node_positions, node_trajectories), layers) = (nodes?, layers?);
+    let (nodes, layers) = (nodes?, layers?);
     let mut group = assemble(layers, corrections, decoder.reference, &header);
-    (group.node_positions, group.node_trajectories) = (node_positions, node_trajectories);
+    (group.node_positions, group.node_trajectories, group.rig) = nodes;
     group.header = header;
     if group.node_positions.is_empty() {
         group.header.nodes = NodeHeader::default();
+    }
+    if group.rig.is_none() {
+        group.header.rig = RigHeader::default();
     }
     if group.node_trajectories.len() != group.node_positions.len() {
         group.node_trajectories = Trajectories::still(6, group.node_positions.len());
@@ -217,6 +221,9 @@ enum Part {
     Trajectories(usize, Trajectories),
     Lifetimes(Vec<[u16; 2]>),
 }
+
+/// Positions of nodes, their trajectories, and the rig.
+type Nodes = (Vec<[u32; 3]>, Trajectories, Option<Rig>);
 
 /// A tile, and what its models have learned.
 type Learned = (Tile, Vec<(Stream, StreamModel)>);
@@ -397,27 +404,52 @@ impl GroupDecoder<'_> {
         Ok(survivors)
     }
 
-    /// Nodes and their trajectories, which do not depend on the Gaussians.
-    fn nodes(&self) -> Result<(Vec<[u32; 3]>, Trajectories)> {
+    /// Nodes, their trajectories and the rig, which do not depend on the Gaussians.
+    fn nodes(&self) -> Result<Nodes> {
         let h = &self.header.nodes;
-        let source = |kind| {
-            let unit = self.sound.get((kind, 0, 0))?;
-            let (bytes, offset, label) = (unit.payload, unit.offset, unit.label());
-            Some(Source { bytes, offset, label })
-        };
-        let Some(own) = source(UnitType::NodePositions) else {
+        let Some(own) = self.source(UnitType::NodePositions) else {
             return Ok(Default::default());
         };
         let positions = self.points(&own, &mut StreamModel::Positions(SplitModel::default()), h.count, 0)?;
-        let Some(motion) = source(UnitType::NodeTrajectories) else {
-            return Ok((positions, Trajectories::default()));
+        let near = neighbors::nearest(&positions);
+        let (motion, rig) = (self.node_trajectories(&near)?, self.rig(&near)?);
+        Ok((positions, motion, rig))
+    }
+
+    /// A unit that a group has once.
+    fn source(&self, kind: UnitType) -> Option<Source<'_>> {
+        let unit = self.sound.get((kind, 0, 0))?;
+        let (bytes, offset, label) = (unit.payload, unit.offset, unit.label());
+        Some(Source { bytes, offset, label })
+    }
+
+    /// `near`: the neighbours of each node.
+    fn node_trajectories(&self, near: &[Near]) -> Result<Trajectories> {
+        let Some(motion) = self.source(UnitType::NodeTrajectories) else {
+            return Ok(Trajectories::default());
         };
-        let (near, k) = (neighbors::nearest(&positions), usize::from(h.coefficients));
+        let k = usize::from(self.header.nodes.coefficients);
         let mut c = Decoder::new(motion.bytes);
         let mut model = TrajectoryModel::new(Kind::Node);
-        let t = trajectories::code(&mut c, &mut model, k, &near, &Trajectories::new(6), u64::MAX); // counted from the header
+        let t = trajectories::code(&mut c, &mut model, k, near, &Trajectories::new(6), u64::MAX); // counted from the header
         motion.finish(c, t.is_ok())?;
-        Ok((positions, t.unwrap_or_default()))
+        Ok(t.unwrap_or_default())
+    }
+
+    /// The rig with the poses of its joints; None if one of the two is missing. `near`: the neighbours of each node.
+    fn rig(&self, near: &[Near]) -> Result<Option<Rig>> {
+        let (Some(own), Some(poses)) = (self.source(UnitType::Rig), self.source(UnitType::JointPoses)) else {
+            return Ok(None);
+        };
+        let mut c = Decoder::new(own.bytes);
+        let rig = rig::code(&mut c, usize::from(self.header.rig.joints), near, &Rig::default());
+        own.finish(c, rig.is_some())?;
+        let mut rig = rig.unwrap_or_default();
+        let (mut c, blank) = (Decoder::new(poses.bytes), Trajectories::new(rig::CHANNELS));
+        let t = rig::code_poses(&mut c, &rig.parents, self.header.frames, &blank);
+        poses.finish(c, t.is_ok())?;
+        rig.poses = t.unwrap_or_default();
+        Ok(Some(rig))
     }
 
     /// Decodes a stream other than positions and deaths.

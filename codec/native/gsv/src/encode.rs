@@ -14,6 +14,7 @@ use crate::morton;
 use crate::neighbors;
 use crate::positions::{self, SplitModel};
 use crate::range_coder::Encoder;
+use crate::rig::{self, Rig};
 use crate::tile::{self, Models, Stream, StreamModel};
 use crate::trajectories::{self, Kind, Trajectories, TrajectoryModel};
 use crate::unit::{self, Entry, UnitKey, UnitType};
@@ -188,11 +189,25 @@ impl GroupEncoder<'_> {
         let (k, mut model) = (usize::from(h.nodes.coefficients), TrajectoryModel::new(Kind::Node));
         let own: &Trajectories = &g.node_trajectories;
         let _ = trajectories::code(&mut e, &mut model, k, &near, own, u64::MAX);
-        vec![
+        let mut units = vec![
             ((UnitType::NodePositions, 0, 0), places),
             ((UnitType::NodeTrajectories, 0, 0), e.finish()),
-        ]
+        ];
+        if let Some(rig) = &g.rig {
+            let mut e = Encoder::default();
+            let _ = rig::code(&mut e, rig.joints.len(), &near, rig); // it is valid, and an encoder never stops
+            units.push(((UnitType::Rig, 0, 0), e.finish()));
+            units.push(((UnitType::JointPoses, 0, 0), joint_poses(rig, h.frames)));
+        }
+        units
     }
+}
+
+/// The unit of the poses of the joints.
+pub fn joint_poses(rig: &Rig, frames: u16) -> Vec<u8> {
+    let mut e = Encoder::default();
+    let _ = rig::code_poses(&mut e, &rig.parents, frames, &rig.poses);
+    e.finish()
 }
 
 /// `points` without their lowest `shift` bits.

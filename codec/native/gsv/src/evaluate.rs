@@ -10,7 +10,9 @@ use crate::group::Group;
 use crate::header::Header;
 use crate::neighbors;
 use crate::parallel::join;
-use crate::parametric::{AttributeMotion, Frame, FrameMut, Parametric, rgb};
+use crate::parametric::{AttributeMotion, Frame, FrameMut, Parametric, RigMotion, rgb};
+use crate::rig::Rig;
+use crate::skinning::Skinning;
 use crate::trajectories::Trajectories;
 use rayon::prelude::*;
 
@@ -21,6 +23,7 @@ pub struct Evaluator {
     motions: Vec<AttributeMotion<i32>>,
     blend: Blend,
     nodes: Vec<[f32; 3]>, // from the origin of the grid
+    skinning: Option<Skinning>,
 }
 
 impl Evaluator {
@@ -47,12 +50,14 @@ impl Evaluator {
             .zip(trajectories)
             .map(|(h, t)| AttributeMotion::new(h.attribute, h.step, true, t))
             .collect();
+        let skinning = group.rig.as_ref().map(|rig| skinning(rig, &group.header));
         Evaluator {
             group,
             canonical,
             motions,
             blend,
             nodes,
+            skinning,
         }
     }
 
@@ -111,8 +116,18 @@ impl Evaluator {
             nodes: &self.nodes,
             node_motion: &self.group.node_trajectories,
             node_steps: [h.nodes.rotation_step, h.nodes.translation_step],
+            rig: self.rig(),
             motions: &self.motions,
         }
+    }
+
+    fn rig(&self) -> Option<RigMotion<'_>> {
+        let (h, rig) = (&self.group.header.rig, self.group.rig.as_ref()?);
+        Some(RigMotion {
+            skinning: self.skinning.as_ref()?,
+            poses: &rig.poses,
+            steps: [h.rotation_step, h.translation_step],
+        })
     }
 
     /// Evaluates frame `t` (clamped to the group) into `frame`, whose buffers are reused.
@@ -158,6 +173,16 @@ fn rotations_of(group: &Group, reference: Option<&Group>) -> Vec<Quat> {
         ));
     }
     out
+}
+
+/// The rig of a group in floats, from the origin of the grid.
+fn skinning(rig: &Rig, h: &Header) -> Skinning {
+    let place = |p: &[i32; 3]| p.map(|v| h.grid_step * v as f32);
+    let steps = [h.rig.rotation_step, h.rig.translation_step];
+    let bind = |b: &[i32; 6]| std::array::from_fn(|c| steps[c / 3] * b[c] as f32);
+    let bind: Vec<[f32; 6]> = rig.bind.iter().map(bind).collect();
+    let joints = rig.joints.iter().map(place).collect();
+    Skinning::new(joints, rig.parents.clone(), &bind, &rig.weights)
 }
 
 fn colours(mut values: Vec<f32>) -> Vec<f32> {

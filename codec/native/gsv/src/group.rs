@@ -9,6 +9,7 @@ use crate::fields::Writer;
 use crate::header::{Header, LayerHeader};
 use crate::levels::LEVELS;
 use crate::morton;
+use crate::rig::{self, Rig};
 use crate::trajectories::Trajectories;
 use crate::values::MAX_VALUE;
 
@@ -33,6 +34,8 @@ pub struct Group {
     pub lifetimes: Option<Vec<[u16; 2]>>,
     pub node_positions: Vec<[u32; 3]>,
     pub node_trajectories: Trajectories,
+    /// What predicts the motion of the nodes.
+    pub rig: Option<Rig>,
     /// In the order of `header.trajectories`.
     pub trajectories: Vec<Trajectories>,
     /// Of each layer: what is added to log_scales and logit_opacities while it is the last decoded layer.
@@ -237,6 +240,12 @@ impl Group {
                 h.nodes.coefficients,
             )?;
         }
+        must(self.rig.is_some() == (h.rig.joints > 0), || {
+            "expected a rig as the header says".into()
+        })?;
+        if let Some(rig) = &self.rig {
+            validate_rig(rig, h)?;
+        }
         for (i, [t0, t1]) in self.lifetimes.iter().flatten().enumerate() {
             must(t0 < t1 && *t1 <= h.frames, || {
                 format!(
@@ -254,6 +263,23 @@ impl Group {
         let at = self.header.attributes().iter().position(|b| *b == a)?;
         self.channels.get(at).map(Vec::as_slice)
     }
+}
+
+fn validate_rig(r: &Rig, h: &Header) -> Result<()> {
+    let (j, m) = (usize::from(h.rig.joints), h.nodes.count as usize);
+    let counts = [r.joints.len(), r.parents.len(), r.bind.len()];
+    must(counts == [j; 3] && r.weights.len() == m * j, || {
+        format!("rig: expected {j} joints, and {j} weights for each of {m} nodes")
+    })?;
+    must(r.parents.iter().zip(0..).all(|(p, j)| usize::from(*p) <= j), || {
+        "rig: expected the parent of a joint before it".into()
+    })?;
+    must(r.weights.iter().all(|w| i32::from(*w) <= rig::WEIGHT_MAX), || {
+        format!("rig: expected weights of 0 to {}", rig::WEIGHT_MAX)
+    })?;
+    range("rig", r.joints.as_flattened())?;
+    range("rig", r.bind.as_flattened())?;
+    trajectory("joints", &r.poses, j, rig::CHANNELS, h.frames)
 }
 
 fn points(name: &str, points: &[[u32; 3]], bits: u8) -> Result<()> {

@@ -46,6 +46,14 @@ pub struct NodeHeader {
     pub translation_step: f32,
 }
 
+/// Header of the rig, which predicts the motion of the nodes.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct RigHeader {
+    pub joints: u8,
+    pub rotation_step: f32,
+    pub translation_step: f32,
+}
+
 /// What the index tells of one tile (spec 4).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct TileHeader {
@@ -98,6 +106,8 @@ pub struct Header {
     pub trajectories: Vec<TrajectoryHeader>,
     /// `count` 0: none.
     pub nodes: NodeHeader,
+    /// `joints` 0: none.
+    pub rig: RigHeader,
 }
 
 impl Header {
@@ -176,6 +186,7 @@ impl Header {
         let symbols = births * (3 + channels)
             + count * self.trajectories.len() as u64
             + nodes * (3 + 6 * u64::from(self.nodes.coefficients))
+            + u64::from(self.rig.joints) * (9 + 6 * u64::from(self.frames) + nodes)
             + deaths;
         level.cap(unit, "symbols", symbols, level.symbols)?;
         Ok(symbols)

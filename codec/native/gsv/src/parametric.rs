@@ -7,7 +7,9 @@ use crate::attributes::Attribute;
 use crate::blend::Blend;
 use crate::dequantize::{IDENTITY, Quat, multiply};
 use crate::parallel::join;
+use crate::rig::CHANNELS;
 use crate::rigid_blend::{RigidBlend, from_rotation_vector, pose};
+use crate::skinning::{Skinning, rotate};
 use crate::trajectories::Trajectories;
 use rayon::prelude::*;
 
@@ -125,6 +127,31 @@ impl<V: Coefficient> AttributeMotion<V> {
     }
 }
 
+/// A rig, and the poses of its joints.
+pub struct RigMotion<'a> {
+    pub skinning: &'a Skinning,
+    /// [J] of rotation vector and translation.
+    pub poses: &'a Trajectories,
+    /// Radians and world units.
+    pub steps: [f32; 2],
+}
+
+/// The channels of a rotation vector and a translation in units of their steps.
+fn scaled([a, b, c, x, y, z]: [f32; 6], [rotation, translation]: [f32; 2]) -> [f32; 6] {
+    let [a, b, c] = [a, b, c].map(|v| v * rotation);
+    let [x, y, z] = [x, y, z].map(|v| v * translation);
+    [a, b, c, x, y, z]
+}
+
+impl RigMotion<'_> {
+    /// Where `nodes` are carried, and by which rotations.
+    fn carry(&self, basis: &[f32], nodes: &[[f32; 3]]) -> (Vec<[f32; 3]>, Vec<Quat>) {
+        let at = |j| scaled(transform(self.poses.get(j), CHANNELS, basis), self.steps);
+        let poses: Vec<[f32; CHANNELS]> = (0..self.poses.len()).map(at).collect();
+        self.skinning.carry(&poses, nodes)
+    }
+}
+
 /// Everything that a frame is evaluated from.
 pub struct Parametric<'a, V> {
     pub frames: u16,
@@ -136,10 +163,11 @@ pub struct Parametric<'a, V> {
     pub blend: &'a Blend,
     /// [M] at rest, from the origin.
     pub nodes: &'a [[f32; 3]],
-    /// [M] of 6 channels: rotation vector, translation.
+    /// [M] of 6 channels: rotation vector, translation; behind what the rig predicts.
     pub node_motion: &'a Trajectories<V>,
     /// Radians and world units.
     pub node_steps: [f32; 2],
+    pub rig: Option<RigMotion<'a>>,
     pub motions: &'a [AttributeMotion<V>],
 }
 
@@ -215,11 +243,18 @@ impl<V: Coefficient> Parametric<'_, V> {
                 });
             return;
         }
-        let [rotation_step, translation_step] = self.node_steps;
+        let predicted = self.rig.as_ref().map(|rig| rig.carry(basis, self.nodes));
         let pose = |(j, n): (usize, &[f32; 3])| {
-            let [rx, ry, rz, tx, ty, tz] = transform(self.node_motion.get(j), 6, basis);
-            let q = from_rotation_vector([rx, ry, rz].map(|v| v * rotation_step));
-            pose(q, *n, [tx, ty, tz].map(|v| v * translation_step))
+            let [rx, ry, rz, tx, ty, tz] = scaled(transform(self.node_motion.get(j), 6, basis), self.node_steps);
+            let (q, shift) = (from_rotation_vector([rx, ry, rz]), [tx, ty, tz]);
+            let known = predicted.as_ref().and_then(|(x, r)| x.get(j).zip(r.get(j)));
+            known.map_or_else(
+                || pose(q, *n, shift),
+                |(x, r)| {
+                    let shift = rotate(*r, shift);
+                    pose(multiply(*r, q), *n, std::array::from_fn(|a| x[a] - n[a] + shift[a]))
+                },
+            )
         };
         let poses = RigidBlend::new(self.nodes.iter().enumerate().map(pose).collect());
         poses.carry(self.blend, rest, out, |i, x, q| (add(origin, x), turned(i, q)));

@@ -97,6 +97,12 @@ impl RigidBlend {
         sum
     }
 
+    /// Where one point is carried, and its rotation. `index`, `weight`: a row of a blend.
+    #[inline(never)]
+    pub fn carry_one(&self, x: [f32; 3], index: &[u32], weight: &[f32]) -> ([f32; 3], Quat) {
+        self.blended(x, index, weight)
+    }
+
     #[inline(always)]
     fn blended(&self, x: [f32; 3], index: &[u32], weight: &[f32]) -> ([f32; 3], Quat) {
         let [r0, r1, r2, shift, q] = self.sum(index, weight);

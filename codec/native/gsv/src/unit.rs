@@ -18,12 +18,22 @@ pub enum UnitType {
     NodePositions = 2,
     NodeTrajectories = 3,
     LayerCorrection = 4,
+    Rig = 5,
+    JointPoses = 6,
 }
 
 use UnitType::*;
 
 impl UnitType {
-    const ALL: [UnitType; 5] = [GroupHeader, Tile, NodePositions, NodeTrajectories, LayerCorrection];
+    const ALL: [UnitType; 7] = [
+        GroupHeader,
+        Tile,
+        NodePositions,
+        NodeTrajectories,
+        LayerCorrection,
+        Rig,
+        JointPoses,
+    ];
 
     pub fn from_number(n: u8) -> Option<UnitType> {
         Self::ALL.into_iter().find(|u| *u as u8 == n)
@@ -36,6 +46,8 @@ impl UnitType {
             NodePositions => "node_positions",
             NodeTrajectories => "node_trajectories",
             LayerCorrection => "layer_correction",
+            Rig => "rig",
+            JointPoses => "joint_poses",
         }
     }
 }
@@ -156,7 +168,7 @@ pub fn scan(payload: &[u8], layers: usize, packed: bool, wanted: impl Fn(u8, u16
         let kind = UnitType::from_number(entry.number);
         match (kind, entry.index) {
             (Some(GroupHeader), _) => return fail("no second group_header"),
-            (Some(NodePositions | NodeTrajectories), 1..) => return fail("an index of 0"),
+            (Some(NodePositions | NodeTrajectories | Rig | JointPoses), 1..) => return fail("an index of 0"),
             (Some(LayerCorrection), 0 | 1 | 3 | 5..) => return fail("a layer_correction of attribute 2 or 4"),
             _ => {}
         }

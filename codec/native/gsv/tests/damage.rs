@@ -77,6 +77,7 @@ fn small_shape() -> common::Shape {
         bits: 8,
         sh_degree: 0,
         nodes: 4,
+        joints: 0,
         magnitude: 5,
         lifetimes: true,
         moving: 0b11110,
@@ -151,7 +152,7 @@ fn later_versions() {
         (3, "reserved flags"),
         (9, "reserved flags"),
         (4, "reserved flags"),
-        (32, "reserved flags"),
+        (64, "reserved flags"),
     ] {
         let mut header = header.clone();
         header[2] = flags;
@@ -166,7 +167,9 @@ fn later_versions() {
         ..Entry::new((Tile, 0, 0), b"").unwrap()
     };
     for (entry, part) in [
-        (later(5, 0, 9), ""),
+        (later(7, 0, 9), ""),
+        (later(5, 0, 1), "index of 0"),
+        (later(6, 0, 0), "one unit of each"),
         (later(255, 3, 0), ""),
         (later(0, 0, 0), "no second"),
         (later(1, 0, 9), "announces"),

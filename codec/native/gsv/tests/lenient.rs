@@ -121,7 +121,9 @@ fn a_damaged_tile_of_a_predicted_group() {
 
 #[test]
 fn without_their_nodes_gaussians_stay_where_they_are() {
-    let payload = encode_group(&small(), None).unwrap();
+    let mut g = small();
+    (g.rig, g.header.rig) = Default::default();
+    let payload = encode_group(&g, None).unwrap();
     let rest = |key: UnitKey| {
         let (mut group, damage) = decode_damaged(&damaged(&payload, key), &how()).unwrap();
         (group.trajectories, group.header.trajectories) = (Vec::new(), Vec::new());
@@ -129,7 +131,6 @@ fn without_their_nodes_gaussians_stay_where_they_are() {
         Evaluator::new(group).frame(3, &mut frame);
         (frame.means, damage)
     };
-    let g = small();
     let origin: Vec<[f32; 3]> = g
         .positions
         .iter()
@@ -149,6 +150,23 @@ fn without_their_nodes_gaussians_stay_where_they_are() {
     assert_eq!(means, origin);
     let both = [(UnitType::NodePositions, 0, 0), (UnitType::NodeTrajectories, 0, 0)];
     assert_eq!(named(&damage), both);
+}
+
+#[test]
+fn without_its_rig_or_its_poses_nothing_is_predicted() {
+    let payload = encode_group(&small(), None).unwrap();
+    let whole = decode_damaged(&payload, &how()).unwrap().0;
+    for kind in [UnitType::Rig, UnitType::JointPoses] {
+        let (group, damage) = decode_damaged(&damaged(&payload, (kind, 0, 0)), &how()).unwrap();
+        assert_eq!(damage[0].kind, Some(kind));
+        assert_eq!(group.rig, None);
+        assert_eq!(group.node_trajectories, whole.node_trajectories);
+        group.validate(None).unwrap();
+        Evaluator::new(group).frame(3, &mut Frame::default());
+    }
+    let (group, damage) = decode_damaged(&damaged(&payload, (UnitType::NodePositions, 0, 0)), &how()).unwrap();
+    assert_eq!(damage.len(), 4);
+    assert_eq!(group.rig, None);
 }
 
 #[test]

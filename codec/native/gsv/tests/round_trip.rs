@@ -38,6 +38,7 @@ fn same(a: &Group, b: &Group) {
     assert_eq!(a.trajectories, b.trajectories);
     assert_eq!(a.node_trajectories.len(), b.node_trajectories.len());
     (0..a.node_trajectories.len()).for_each(|i| assert_eq!(a.node_trajectories.get(i), b.node_trajectories.get(i)));
+    assert_eq!(a.rig, b.rig);
 }
 
 proptest! {
@@ -228,6 +229,7 @@ fn all_points_in_one_place() {
     let mut g = group(&Shape {
         counts: vec![5000],
         nodes: 0,
+        joints: 0,
         moving: 0,
         lifetimes: false,
         ..tiny()
@@ -269,6 +271,7 @@ fn tiny() -> Shape {
         bits: 6,
         sh_degree: 0,
         nodes: 0,
+        joints: 0,
         magnitude: 3,
         lifetimes: false,
         moving: 0,
@@ -301,6 +304,13 @@ fn impossible_groups_are_refused() {
     refused(|g| g.channels[1][0] = (1 << 24) + 1, "quats");
     refused(|g| g.header.trajectories[0].coefficients = 6, "coefficients");
     refused(|g| g.header.nodes.neighbors = 9, "neighbors");
+    refused(|g| g.header.rig.joints = 0, "a rig as the header");
+    refused(|g| g.header.rig.rotation_step = 0.0, "rotation_step");
+    refused(|g| g.rig.as_mut().unwrap().weights.truncate(1), "weights for each");
+    refused(|g| g.rig.as_mut().unwrap().weights[0] = 65, "weights of 0 to 64");
+    refused(|g| g.rig.as_mut().unwrap().parents[0] = 1, "parent");
+    refused(|g| g.rig.as_mut().unwrap().bind[0][5] = (1 << 24) + 1, "rig");
+    refused(|g| g.rig.as_mut().unwrap().poses = Default::default(), "joints");
     refused(|g| g.lifetimes = Some(vec![[3, 3]; 12]), "lifetime of Gaussian 0");
     refused(|g| g.lifetimes = None, "lifetimes as the header");
     refused(|g| g.header.frames = 300, "frames, level 4");

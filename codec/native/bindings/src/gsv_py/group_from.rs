@@ -1,10 +1,12 @@
 //! `gscodec.bitstream.quantized_group.QuantizedGroup` (planar arrays) -> `gsv::group::Group` (interleaved).
 
+use super::rig::rig_from;
 use super::values::{array, invalid, item, optional, points, value};
 use gsv::attributes::{Attribute, sh_coefficients};
 use gsv::companding::{Companding, PIECES};
 use gsv::group::{BIRTH, Group};
 use gsv::header::{Header, LayerHeader, NodeHeader, Scale, TILE_SIDES, TrajectoryHeader};
+use gsv::rig::CHANNELS;
 use gsv::trajectories::Trajectories;
 use numpy::{PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
 use pyo3::prelude::*;
@@ -237,7 +239,11 @@ fn motion_from(t: &Bound<PyDict>, header: &mut Header, group: &mut Group) -> PyR
 
 /// `coefficients` [K, C, N] -> K and sparse trajectories.
 fn coefficients(d: &Bound<PyAny>, name: &str, channels: usize, count: usize) -> PyResult<(u16, Trajectories)> {
-    let a = array(d, "coefficients", "int32")?;
+    dense(&array(d, "coefficients", "int32")?, name, channels, count)
+}
+
+/// [K, C, N] i32 -> K and sparse trajectories.
+pub fn dense(a: &Bound<PyAny>, name: &str, channels: usize, count: usize) -> PyResult<(u16, Trajectories)> {
     let Ok(a) = a.extract::<PyReadonlyArray3<i32>>() else {
         return invalid(format!("trajectories of {name}: expected shape [K, C, N]"));
     };
@@ -271,5 +277,11 @@ fn nodes_from(d: &Bound<PyAny>, header: &mut Header, group: &mut Group) -> PyRes
         rotation_step: value(d, "rotation_step")?,
         translation_step: value(d, "translation_step")?,
     };
+    if let Some(r) = optional(d, "rig")? {
+        let (own, mut rig) = rig_from(&r, group.node_positions.len())?;
+        let (_, poses) = dense(&array(&r, "poses", "int32")?, "joints", CHANNELS, rig.joints.len())?;
+        (header.rig, rig.poses) = (own, poses);
+        group.rig = Some(rig);
+    }
     Ok(())
 }

@@ -139,6 +139,7 @@ impl ParametricEvaluator {
             nodes: &self.nodes,
             node_motion: &self.node_motion,
             node_steps: [1.0; 2],
+            rig: None,
             motions: &self.motions,
         }
     }

@@ -1,5 +1,6 @@
 //! `gsv::group::Group` -> `gscodec.bitstream.quantized_group.QuantizedGroup`. The mirror of group_from.rs.
 
+use super::rig::rig_into;
 use gsv::companding::{Companding, PIECES};
 use gsv::evaluate::Evaluator;
 use gsv::group::{BIRTH, Group};
@@ -89,6 +90,11 @@ pub fn quantized<'py>(py: Python<'py>, e: &Evaluator) -> PyResult<Bound<'py, PyA
         one.set_item("rotation_step", h.nodes.rotation_step)?;
         one.set_item("translation_step", h.nodes.translation_step)?;
         one.set_item("neighbors", h.nodes.neighbors)?;
+        if let Some(rig) = &g.rig {
+            let fields = rig_into(py, rig, &h.rig)?;
+            fields.set_item("poses", dense(py, &rig.poses, h.frames))?;
+            one.set_item("rig", dataclass(py, "QuantizedRig", &fields)?)?;
+        }
         d.set_item("nodes", dataclass(py, "QuantizedNodes", &one)?)?;
     }
     dataclass(py, "QuantizedGroup", &d)

@@ -12,6 +12,7 @@ const FLAG_PREDICTED: u8 = 1;
 const FLAG_COMPANDING: u8 = 2;
 const FLAG_LAYER_SHIFTS: u8 = 8;
 const FLAG_LIFETIMES: u8 = 16;
+const FLAG_RIG: u8 = 32;
 
 impl Header {
     /// Parses the payload of unit 0. `reference`: the header of the group that a predicted one refers to.
@@ -49,6 +50,7 @@ impl Header {
                 tiles: std::mem::take(&mut self.tiles),
                 trajectories: std::mem::take(&mut self.trajectories),
                 nodes: self.nodes,
+                rig: self.rig,
                 ..r.clone()
             };
         } else {
@@ -67,6 +69,7 @@ impl Header {
         }
         self.trajectories(f)?;
         self.nodes(f)?;
+        self.rig(f)?;
         self.tiles(f, reference)
     }
 
@@ -77,6 +80,9 @@ impl Header {
         if self.lifetimes {
             flags |= FLAG_LIFETIMES;
         }
+        if self.rig.joints > 0 {
+            flags |= FLAG_RIG;
+        }
         if self.reference == 0 && !self.shifts.is_empty() {
             flags |= FLAG_LAYER_SHIFTS;
         }
@@ -85,13 +91,16 @@ impl Header {
         }
         f.u8(&mut flags)?;
         let known = match flags & FLAG_PREDICTED {
-            0 => FLAG_LIFETIMES | FLAG_LAYER_SHIFTS | FLAG_COMPANDING,
-            _ => FLAG_LIFETIMES | FLAG_PREDICTED,
+            0 => FLAG_LIFETIMES | FLAG_RIG | FLAG_LAYER_SHIFTS | FLAG_COMPANDING,
+            _ => FLAG_LIFETIMES | FLAG_RIG | FLAG_PREDICTED,
         };
         f.must(flags & !known == 0, || {
             format!("reserved flags to be 0, found {flags:#04x}")
         })?;
         self.lifetimes = flags & FLAG_LIFETIMES != 0;
+        if flags & FLAG_RIG != 0 {
+            self.rig.joints = self.rig.joints.max(1); // their number follows
+        }
         if flags & FLAG_LAYER_SHIFTS != 0 {
             self.shifts.resize(self.layers.len().max(1), Default::default());
         }
@@ -277,6 +286,21 @@ impl Header {
         coefficients(f, n.coefficients, self.frames)?;
         f.step(&mut n.rotation_step, "rotation_step")?;
         f.step(&mut n.translation_step, "translation_step")
+    }
+
+    /// The rig, if the opening announces it.
+    fn rig<F: Fields>(&mut self, f: &mut F) -> Result<()> {
+        let r = &mut self.rig;
+        if r.joints == 0 {
+            return Ok(());
+        }
+        f.must(self.nodes.count > 0, || {
+            "nodes in a group with a rig, found none".into()
+        })?;
+        f.u8(&mut r.joints)?;
+        f.must(r.joints > 0, || "at least one joint, found 0".into())?;
+        f.step(&mut r.rotation_step, "rotation_step of joints")?;
+        f.step(&mut r.translation_step, "translation_step of joints")
     }
 }
 

@@ -5,9 +5,10 @@ use gsv::attributes::Attribute;
 use gsv::companding::Companding;
 use gsv::decode::Decoding;
 use gsv::group::{BIRTH, Group};
-use gsv::header::{Header, LayerHeader, NodeHeader, Scale, TrajectoryHeader};
+use gsv::header::{Header, LayerHeader, NodeHeader, RigHeader, Scale, TrajectoryHeader};
 use gsv::levels::LEVELS;
 use gsv::morton;
+use gsv::rig::{CHANNELS, Rig, WEIGHT_MAX};
 use gsv::trajectories::Trajectories;
 use proptest::prelude::*;
 
@@ -20,6 +21,8 @@ pub struct Shape {
     pub bits: u8,
     pub sh_degree: u8,
     pub nodes: usize,
+    /// Joints of the rig, where there are nodes; 0: none.
+    pub joints: usize,
     /// Bits of magnitude of channels and coefficients.
     pub magnitude: u32,
     pub lifetimes: bool,
@@ -39,19 +42,20 @@ pub fn shape() -> impl Strategy<Value = Shape> {
         0..=3u8,
     );
     let rest = (
-        prop_oneof![Just(0usize), 1..20usize],
+        (prop_oneof![Just(0usize), 1..20usize], 0..6usize),
         0..=24u32,
         any::<bool>(),
         any::<u8>(),
         any::<u64>(),
     );
     (sizes, rest).prop_map(
-        |((counts, frames, bits, sh_degree), (nodes, magnitude, lifetimes, moving, seed))| Shape {
+        |((counts, frames, bits, sh_degree), ((nodes, joints), magnitude, lifetimes, moving, seed))| Shape {
             counts,
             frames,
             bits,
             sh_degree,
             nodes,
+            joints,
             magnitude,
             lifetimes,
             moving,
@@ -201,6 +205,14 @@ fn motion(g: &mut Group, header: &mut Header, s: &Shape, r: &mut Random) {
         };
         g.node_positions = points(r, s.nodes, s.bits);
         g.node_trajectories = trajectories(r, s.nodes, 6, coefficients, s.magnitude);
+        if s.joints > 0 {
+            header.rig = RigHeader {
+                joints: s.joints as u8,
+                rotation_step: 0.02,
+                translation_step: 0.004,
+            };
+            g.rig = Some(rig(s, r));
+        }
     }
     if s.lifetimes {
         let mut life = || {
@@ -208,6 +220,20 @@ fn motion(g: &mut Group, header: &mut Header, s: &Shape, r: &mut Random) {
             [t0, t0 + 1 + r.below(u64::from(s.frames - t0)) as u16]
         };
         g.lifetimes = Some((0..count).map(|_| life()).collect());
+    }
+}
+
+fn rig(s: &Shape, r: &mut Random) -> Rig {
+    let values = |r: &mut Random| std::array::from_fn(|_| r.value(s.magnitude));
+    let weight = |r: &mut Random| (r.below(2) * r.below(WEIGHT_MAX as u64 + 1)) as u8;
+    Rig {
+        joints: (0..s.joints)
+            .map(|_| std::array::from_fn(|_| r.value(s.magnitude)))
+            .collect(),
+        parents: (0..s.joints as u64).map(|j| r.below(j + 1) as u8).collect(),
+        bind: (0..s.joints).map(|_| values(r)).collect(),
+        weights: (0..s.nodes * s.joints).map(|_| weight(r)).collect(),
+        poses: trajectories(r, s.joints, CHANNELS, s.frames, s.magnitude),
     }
 }
 
@@ -250,6 +276,7 @@ pub fn predicted(reference: &Group, s: &Shape) -> Group {
         layers: g.layers.clone(),
         trajectories: Vec::new(),
         nodes: NodeHeader::default(),
+        rig: RigHeader::default(),
         lifetimes: s.lifetimes,
         ..before.clone()
     };
@@ -275,6 +302,7 @@ pub fn layered() -> Shape {
         bits: 6,
         sh_degree: 1,
         nodes: 3,
+        joints: 2,
         magnitude: 6,
         lifetimes: true,
         moving: 0xFF,
@@ -300,6 +328,7 @@ pub fn small() -> Group {
         bits: 6,
         sh_degree: 1,
         nodes: 3,
+        joints: 2,
         magnitude: 6,
         lifetimes: true,
         moving: 0xFF,
