@@ -7,7 +7,8 @@ the correlation is high and another depth map agrees.
 
 Two views that look from directions far apart see a surface at such different slants that windows parallel to one image
 never match. A view without near neighbours is compared with the nearest ones there are over planes of several
-directions (Gallup et al. 2007): level ones (floor, table) and upright ones.
+directions (Gallup et al. 2007): level ones (floor, table) and upright ones. A depth is kept if no other one matches as
+well. Where most of a picture has no texture it is left out, since the surfaces that are found would leave the rest bare.
 
 A shell of far points is added around the scene, for parts without texture and therefore without depth (sky, dark):
 stage has 26.7 dB with it, 25.7 without, 23.8 with random points.
@@ -52,7 +53,7 @@ def sweep(
     near, depths = [], []
     for i, camera in enumerate(cameras):
         s, neighbours, normals = settings, _neighbours(cameras, i, settings), [camera.viewmat[2, :3]]
-        if len(neighbours) < s.scored_neighbours:
+        if len(neighbours) < s.scored_neighbours and _textured(greys[i], s):
             s = s.of_lone_view()
             neighbours = _neighbours(cameras, i, s)
             normals += world_normals(cameras, s.upright_planes)
@@ -95,6 +96,11 @@ def _neighbours(cameras, i: int, settings: PlaneSweepSettings) -> list[int]:
     away = [np.linalg.norm(c.center - cameras[i].center) for c in cameras]
     order = [j for j in np.argsort(away) if j != i and axis[j] @ axis[i] > settings.axis_cosine_min]
     return order[: settings.neighbours]
+
+
+def _textured(grey: np.ndarray, settings: PlaneSweepSettings) -> bool:
+    """Whether most of a picture has texture, so that the points of a sweep cover what it shows."""
+    return float(np.mean(_windows(grey, settings.window)[1] >= settings.contrast_min)) > 0.5
 
 
 def world_normals(cameras, upright: int) -> list[np.ndarray]:
@@ -170,6 +176,7 @@ def _depth(
     camera, grey = cameras[i].cropped(left, top, right - left, bottom - top), greys[i][part]
     mean, deviation = _windows(grey, settings.window)
     best, depth = np.full(grey.shape, -1, np.float32), np.zeros(grey.shape, np.float32)
+    second = np.full(grey.shape, -1, np.float32)  # best score at another depth
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     y, x = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
     rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.K).T
@@ -194,7 +201,10 @@ def _depth(
             score[~inside] = -1
         score = np.sort(scores, 0)[-settings.scored_neighbours :].mean(0)
         better = score > best
+        other = np.abs(depth * inverse_depth - 1) > settings.other_depth
+        second = np.maximum(second, np.where(other, np.minimum(score, best), -1))
         best[better], depth[better] = score[better], 1 / inverse_depth[better]
+    best[best - second < settings.unique_min] = -1
     depth[(best < settings.correlation_min) | (deviation < settings.contrast_min) | ~where[part]] = 0
     whole[part] = depth
     return whole

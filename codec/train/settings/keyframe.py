@@ -49,6 +49,9 @@ class PlaneSweepSettings:
     axis_cosine_min: float = 0.5  # between optical axes of neighbours: 60 degrees
     lone_correlation_min: float = 0.75  # where one view, from far aside, is all there is to compare with
     lone_window: int = 11  # pixels, there: two views agree by chance more often than three
+    unique_min: float = -1.0  # correlation above that at any other depth; -1: it may be as high there
+    lone_unique_min: float = 0.05  # the same for a view without near neighbours: patterns repeat
+    other_depth: float = 0.1  # relative difference from which a depth is another one
     upright_planes: int = 6  # directions of upright planes, for a view without near neighbours
     slant_cosine_min: float = 0.15  # between a ray and the normal of a plane
     window: int = 7  # pixels, side of the correlated windows
@@ -60,6 +63,7 @@ class PlaneSweepSettings:
     def of_lone_view(self) -> PlaneSweepSettings:
         """The settings for a view that has fewer near neighbours than are scored: one from any side decides."""
         lone = {"window": self.lone_window, "correlation_min": self.lone_correlation_min}
+        lone["unique_min"] = self.lone_unique_min
         return replace(self, axis_cosine_min=-1.0, scored_neighbours=1, **lone)
 
 
