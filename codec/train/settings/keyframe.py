@@ -49,6 +49,7 @@ class PlaneSweepSettings:
     axis_cosine_min: float = 0.5  # between optical axes of neighbours: 60 degrees
     lone_correlation_min: float = 0.75  # where one view, from far aside, is all there is to compare with
     lone_window: int = 11  # pixels, there: two views agree by chance more often than three
+    sides_min: float = 8.0  # windows along the shorter side of such a picture
     unique_min: float = -1.0  # correlation above that at any other depth; -1: it may be as high there
     lone_unique_min: float = 0.05  # the same for a view without near neighbours: patterns repeat
     other_depth: float = 0.1  # relative difference from which a depth is another one
