@@ -16,6 +16,7 @@ from gscodec.decode import open_stream
 RECORDED = json.loads((DATA / "recorded.json").read_text())
 # A run on another machine differs from those recorded as one with another seed does: it is one more draw, which lies
 # with 99 % within STUDENT * deviation * sqrt(1 + 1 / seeds) of the mean (Student's t, 9 degrees of freedom).
+# Bytes lie farther apart than decibels, since each run chooses its own quality, within a tolerance.
 SEEDS, STUDENT = 10, 3.25
 LEAST = {"kb_per_frame": 0.02, "ssim": 0.001, "vmaf": 0.5, "flicker": 0.02, "haze": 0.02}  # of an interval; dB: 0.05
 
@@ -69,6 +70,6 @@ def test_bundled_capture_from_end_to_end(tmp_path):
         excess = worse * (measured[key] - figure["mean"])
         assert excess <= interval, f"{key}: {measured[key]}, recorded {figure['mean']} +- {interval:.3f}"
         if key in ("kb_per_frame", "psnr_fg"):
-            assert interval <= (0.1 * figure["mean"] if key == "kb_per_frame" else 0.4), (
+            assert interval <= (0.12 * figure["mean"] if key == "kb_per_frame" else 0.4), (
                 f"{key}: the seeds are far apart"
             )
