@@ -75,7 +75,7 @@ format: venv
 	$(BIN)/ruff format .
 	$(CARGO) fmt --all
 
-# The web player's decoder: codec/native -> player/native.wasm.gz, which is committed.
+# The web player's decoder: codec/native -> player/native.wasm.gz, which is committed. Needs npm, for wasm-opt.
 player:
 	$(PYTHON) player/build.py
 
