@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from synthetic import blob, turning
+from synthetic import blob, moved, turning
 from training import TINY, arc, capture_of, psnr_of, splat_wall
 
 from gscodec.bitstream.quantization import steps_for
@@ -21,6 +21,7 @@ from gscodec.train.deformation_graph import NodeGraph, Pose
 from gscodec.train.finetune import GroupModel
 from gscodec.train.model import from_gaussians
 from gscodec.train.motion_field import MotionField
+from gscodec.train.motion_search import search
 from gscodec.train.relocalization import relocalize
 from gscodec.train.settings import AdamSettings, MotionFieldSettings
 from gscodec.train.tracking import Tracker
@@ -54,6 +55,27 @@ def test_tracking_finds_the_turn(capture):
     carried = group.frame(2, CpuBackend()).means.detach().numpy()
     carried = np.abs(truth.frame(2).means - carried).mean()
     assert carried < 0.3 * still, "the nodes have found it, not the Gaussians each for itself"
+
+
+def test_a_motion_out_of_reach_of_the_gradient_is_searched_for():
+    turn, shift = np.array([0.0, 0.8, 0.1]), np.array([0.9, -0.3, 0.2])
+    first = blob(300)
+    to = lambda g: capture_of(GaussianSequence(25.0, [DenseGroup([first, g], None)]))  # noqa: E731
+
+    rough = dataclasses.replace(first, sh0=first.sh0 + 0.5 * np.random.default_rng(0).standard_normal((300, 3)))
+
+    def tracker_of(capture):  # of a keyframe that has errors, as any has
+        tracker = Tracker.start(from_gaussians(rough), Views(capture, TINY, CpuBackend()), TINY, 0.01, range(2))
+        tracker.moving[:] = True
+        return tracker
+
+    tracker = tracker_of(to(moved(first, turn, shift)))
+    found = search(tracker, 1).next()
+    R = quat_to_matrix(rotvec_to_quat(turn))
+    missed = np.abs(found.nodes.numpy() - (tracker.pose.nodes.numpy() @ R.T + shift)).mean()
+    assert missed < 0.1, "radii of the blob, most of whose nodes move by more than 1"
+    near = to(moved(first, 0.03 * turn, 0.03 * shift))
+    assert search(tracker_of(near), 1) is None, "a search takes seconds"
 
 
 def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():

@@ -6,8 +6,9 @@ colours the motion follows the shading instead of the surface (lumberjack after 
 26.1). The first half of the steps sees small images, in which large motion is near and a step is cheap.
 
 Gaussians behind pixels that do not change (change_detection.py) stay as they are, to the bit, and so do their nodes.
-New Gaussians (densification.py) have nodes of their own, unless they lie beside others; those that move too fast for
-the gradient are searched for (relocalization.py). Gaussians that have faded, or lie outside of the masks, are removed.
+New Gaussians (densification.py) have nodes of their own, unless they lie beside others. What moves too fast for the
+gradient is searched for: new Gaussians (relocalization.py), and the subject and its parts (motion_search.py). Gaussians
+that have faded, or lie outside of the masks, are removed.
 
 A hash grid and an MLP move the nodes beside their own variables (motion_field.py), so that far motion is reached in
 fewer steps.
@@ -31,6 +32,7 @@ from .densification import error_masks, spawn
 from .frame_fit import FrameFit
 from .keyframe import Statistics
 from .model import NAMES, REMOVED_LOGIT, Model, quat_product
+from .motion_search import search
 from .relocalization import relocalize
 from .rig_prediction import RigPrediction
 from .settings import TrainSettings
@@ -131,7 +133,9 @@ class Tracker:
             return np.inf if changed else None
         if self.moving.any():
             self._relocalize(frame)
-            self._fit(frame, on_step)
+            found = search(self, frame)
+            self.pose = found or self.pose
+            self._fit(frame, on_step, found is not None)
         else:
             still = {n: 0 * getattr(self.pose, n) for n in ("angular_velocity", "velocity")}
             self.pose = replace(self.pose, **still)
@@ -140,29 +144,33 @@ class Tracker:
         self._remove(torch.from_numpy(outside) | (self.moving & faded))
         return self.loss if changed and self.alive.any() else None
 
-    def _fit(self, frame: int, on_step: OnStep) -> None:
-        """Rounds of `motion_steps`, until the loss is near that of the frame before or falls no more."""
+    def _fit(self, frame: int, on_step: OnStep, searched: bool) -> None:
+        """Rounds of `motion_steps`, until the loss is near that of the frame before or falls no more. Stiff ones come
+        first if the velocity is that of a search (`searched`) or not known at all."""
         fit = FrameFit(self, np.random.default_rng([self.settings.seed, frame, 1]))
         s = self.settings.tracking
         bound, loss = s.loss_ratio * self.loss + s.loss_floor, np.inf
-        if not self.pose.velocity.any():
-            self._round(fit, frame, 1.0, on_step)
+        stiff = [s.searched_scale] if searched else []
+        stiff += [s.small_scale] if searched or not self.pose.velocity.any() else []
+        for scale in stiff:
+            self._round(fit, frame, on_step, scale, stiff=True)
         for i in range(s.rounds_max):
-            before, loss = loss, self._round(fit, frame, 0.5 if i == 0 else 0.0, on_step)
+            before, loss = loss, self._round(fit, frame, on_step, s.small_scale if i == 0 else 1.0)
             if loss < bound or loss > s.progress_ratio * before:
                 break
         self.own, self.pose = fit.result()
         self.loss = loss
         self.screen_gradient = fit.statistics.mean_screen_gradient()
 
-    def _round(self, fit: FrameFit, frame: int, small: float, on_step: OnStep) -> float:
-        """`motion_steps` views, the first share of them, `small`, at small size; returns the image loss at the end."""
+    def _round(self, fit: FrameFit, frame: int, on_step: OnStep, scale: float, *, stiff: bool = False) -> float:
+        """`motion_steps` views at `scale` times their size in the first half, or, if `stiff`, in all steps; returns the
+        image loss at the end."""
         s, steps = self.settings.tracking, self.settings.motion_steps
         losses = []
         for step in range(steps):
-            full = step >= small * steps
-            target = self.views.draw(frame, 1.0 if full else s.small_scale)
-            losses.append(fit.step(target, s.rate_decay ** (step / steps), full=full, first=small == 1))
+            now = scale if stiff or step < steps / 2 else 1.0
+            decay = s.rate_decay ** (step / steps)
+            losses.append(fit.step(self.views.draw(frame, now), decay, full=now == 1, first=stiff))
             if on_step:
                 on_step(step, losses[-1])
         return float(np.mean(losses[-s.loss_window :]))

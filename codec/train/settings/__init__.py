@@ -30,6 +30,7 @@ from .tracking import (
     DensificationSettings,
     GroupSettings,
     MotionFieldSettings,
+    MotionSearchSettings,
     RelocalizationSettings,
     RoomSettings,
     TrackingSettings,
@@ -50,6 +51,7 @@ __all__ = [
     "KeyframeSettings",
     "LearningRates",
     "MotionFieldSettings",
+    "MotionSearchSettings",
     "PlaneSweepSettings",
     "RecolorSettings",
     "RefinementSettings",
@@ -112,6 +114,7 @@ class TrainSettings:
     graph: DeformationGraphSettings = field(default_factory=DeformationGraphSettings)
     motion_field: MotionFieldSettings = field(default_factory=MotionFieldSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    motion_search: MotionSearchSettings = field(default_factory=MotionSearchSettings)
     densification: DensificationSettings = field(default_factory=DensificationSettings)
     relocalization: RelocalizationSettings = field(default_factory=RelocalizationSettings)
     finetune: FinetuneSettings = field(default_factory=FinetuneSettings)

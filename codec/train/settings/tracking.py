@@ -82,8 +82,9 @@ class TrackingSettings:
     progress_ratio: float = 0.9  # a round that leaves more of the loss than this is the last
     loss_window: int = 20  # steps whose mean is the loss of a round: about every view once
     small_scale: float = 0.5  # of the images in the first half of the first round: large motion, cheap steps
-    # Without a known velocity, a first round: stiff nodes and slow attributes, or else far-moved Gaussians take the
-    # colours of what they lie over.
+    searched_scale: float = 0.25  # of the images in the first of two stiff rounds behind a search
+    # Without a known velocity, or with that of a search, first rounds: stiff nodes and slow attributes, or else
+    # far-moved Gaussians take the colours of what they lie over.
     first_round_rigidity: float = 25.0  # times `rigidity`
     first_round_rates: float = 0.1  # times `rates`
     mask_factor: float = 3.0  # times mask_lambda: the silhouette does not depend on light
@@ -92,6 +93,21 @@ class TrackingSettings:
     separate_distance: float = 4.0  # spacings of new Gaussians; so far from all others they get their own nodes
     separate_min: int = 8  # new Gaussians that are worth nodes of their own
     visible_weight: float = 0.05  # blending weight from which a camera sees a Gaussian
+
+
+@dataclass(frozen=True)
+class MotionSearchSettings:
+    """Search for a subject that has moved out of reach of the gradient (`motion_search.py`)."""
+
+    side: float = 64.0  # pixels, of the longer side of the pictures that are compared
+    views: int = 8  # as far apart as possible
+    ratio: float = 2.0  # loss at constant velocity over that of the frame before, from which there is a search
+    turn: float = 0.6  # radians, of the starts
+    steps: int = 25  # from each start
+    rate: float = 0.05  # radians, radii
+    rate_decay: float = 0.1  # rate at the last step, times that at the first
+    parts: int = 8  # rigid bodies of the second search
+    gain: float = 0.9  # a motion is taken if its loss is this share of the best one so far
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,145 @@
+"""Motion search: where a subject has gone that has moved out of reach of the gradient.
+
+In: a tracker before it fits a frame. Out: its pose with another step to that frame, where one fits much better than
+constant velocity does. First the whole subject is one rigid body, then it has some parts, which are bodies of their
+own. Small pictures of some views are compared. From several turns (the starts) a few steps of the gradient bring all
+parts to the nearest fit; of these motions each part takes the one with which the pictures fit best. What moves besides
+is left to the fit of the frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from ..farthest_point_sampling import farthest_points
+from ..model.rotations import quat_multiply, quat_to_rotvec, rotate, rotvec_to_quat
+from ..render.backend import RenderLoss
+from ..render.optimizer import Adam
+from .deformation_graph import Pose
+from .model import quat_product
+from .views import start_photometric_loss
+
+if TYPE_CHECKING:
+    from .tracking import Tracker
+
+
+def search(tracker: Tracker, frame: int) -> Pose | None:
+    """The pose of `tracker`, in the frame before `frame`, with the step that fits `frame` best; None: constant velocity
+    fits well enough, or nothing fits better."""
+    s, pose = tracker.settings.motion_search, None
+    for parts in (1, s.parts):
+        bodies = _Bodies(tracker, pose or tracker.pose, frame, parts)
+        still = np.zeros((parts, 6), np.float32)
+        start = bodies.loss(still)
+        if pose is None and start < s.ratio * bodies.loss_before():
+            return None
+        found = [bodies.fitted(still + np.append(turn, np.zeros(3, np.float32))) for turn in _starts(s.turn)]
+        best = bodies.chosen(still, start, found)
+        if best is not still:
+            pose = bodies.pose(best)
+    return pose
+
+
+def _starts(turn: float) -> np.ndarray:
+    """Rotation vectors [7, 3]: none, and `turn` radians either way about each axis."""
+    return np.concatenate([np.zeros((1, 3)), turn * np.eye(3), -turn * np.eye(3)]).astype(np.float32)
+
+
+class _Bodies:
+    """The moving Gaussians of a tracker a frame after `pose` at its velocity, as `parts` rigid bodies, and small views
+    of `frame`. A motion [parts, 6] has for each a rotation vector about its center and a translation in radii."""
+
+    def __init__(self, tracker: Tracker, pose: Pose, frame: int, parts: int):
+        self.tracker, self.settings, self._pose, self._frame = tracker, tracker.settings.motion_search, pose, frame
+        views = tracker.views
+        places = np.stack([views.camera(i, frame).center for i in views.train_cameras])
+        chosen = sorted(farthest_points(places, min(self.settings.views, len(places))))
+        self._cameras = [views.train_cameras[i] for i in chosen]
+        self._scale = min(1.0, self.settings.side / views.largest_side)
+        self._moving = tracker.moving & tracker.alive
+        self._params = tracker.carried(tracker.own, pose.next())[0]
+        means = self._params["means"][self._moving]
+        self._seeds = means[torch.from_numpy(farthest_points(means.numpy(), parts)).long()]
+        self._part = self._nearest(self._params["means"])
+        count = torch.bincount(self._part[self._moving], minlength=parts).clamp(min=1)[:, None]
+        self._centers = torch.zeros(parts, 3).index_add(0, self._part[self._moving], means) / count
+
+    def _nearest(self, points: torch.Tensor) -> torch.Tensor:
+        """Part of each of `points` [P, 3]."""
+        return torch.cdist(points, self._seeds).argmin(1)
+
+    def _loss(self, params: dict, frame: int) -> RenderLoss:
+        t = self.tracker
+        targets = [t.views.target(i, frame, self._scale) for i in self._cameras]
+        return start_photometric_loss(params, targets, t.settings, np.random.default_rng(0), t.views.backend)()
+
+    def loss_before(self) -> float:
+        """Loss of the frame before, as it was fitted."""
+        return self._loss(self.tracker.model.params, self._frame - 1).loss
+
+    def loss(self, motion: np.ndarray) -> float:
+        """Loss behind a motion."""
+        return self._loss(self._moved(motion), self._frame).loss
+
+    def _turned(self, motion: np.ndarray, points: torch.Tensor, part: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Points [P, 3] of some parts behind a motion, and their rotations [P, 4]."""
+        values = torch.from_numpy(motion)
+        turn, shift = rotvec_to_quat(values[:, :3])[part], self.tracker.radius * values[part, 3:]
+        center = self._centers[part]
+        return rotate(turn, points - center) + center + shift, turn
+
+    def _moved(self, motion: np.ndarray) -> dict[str, torch.Tensor]:
+        p = self._params
+        means, turn = self._turned(motion, p["means"], self._part)
+        moved = {"means": means, "quats": quat_product(turn.contiguous(), p["quats"])}
+        return {**p, **{n: torch.where(self._moving[:, None], x, p[n]) for n, x in moved.items()}}
+
+    def fitted(self, motion: np.ndarray) -> np.ndarray:
+        """The motion that some steps of the gradient reach from `motion`."""
+        t, s = self.tracker, self.settings
+        values, adam = {"motion": motion.copy()}, Adam(t.views.backend, t.settings.tracking.node_adam)
+        for step in range(s.steps):
+            params = self._moved(values["motion"])
+            grads = self._loss(params, self._frame).grads
+            by_means, by_quats = (grads[n] * self._moving[:, None] for n in ("means", "quats"))
+            arm = params["means"] - self._centers[self._part]
+            arm = arm - t.radius * torch.from_numpy(values["motion"])[self._part, 3:]
+            torque = torch.linalg.cross(arm, by_means)
+            torque += 0.5 * quat_product(by_quats, params["quats"], inverse_b=True)[:, 1:]
+            by = torch.zeros(len(motion), 6).index_add(0, self._part, torch.cat([torque, t.radius * by_means], 1))
+            adam.step(values, {"motion": by.numpy()}, {"motion": s.rate * s.rate_decay ** (step / s.steps)})
+        return values["motion"]
+
+    def chosen(self, still: np.ndarray, start: float, found: list[np.ndarray]) -> np.ndarray:
+        """For each part one of the motions `found`, or `still`, whose loss is `start`."""
+        s = self.settings
+        losses = [self.loss(m) for m in found]
+        best, least = min(zip(found, losses, strict=True), key=lambda x: x[1])
+        if least > s.gain * start:
+            best, least = still, start
+        if len(still) == 1:
+            return best
+        changed = False
+        for part in range(len(still)):
+            for other in [*found, still]:
+                tried = best.copy()
+                tried[part] = other[part]
+                if (loss := self.loss(tried)) < least:
+                    best, least, changed = tried, loss, True
+        return self.fitted(best) if changed and least < s.gain * start else best
+
+    def pose(self, motion: np.ndarray) -> Pose:
+        """The pose of the tracker with a step that ends behind `motion`."""
+        there = self._pose.next()
+        nodes, turn = self._turned(motion, there.nodes, self._nearest(there.nodes))
+        whole = quat_multiply(turn, rotvec_to_quat(self._pose.angular_velocity))
+        carriers = self.tracker.graph.carriers(self.tracker.moving)[:, None]
+        return replace(
+            self._pose,
+            angular_velocity=torch.where(carriers, quat_to_rotvec(whole), self._pose.angular_velocity),
+            velocity=torch.where(carriers, nodes - self._pose.nodes, self._pose.velocity),
+        )
