@@ -52,7 +52,8 @@ tools: venv
 	@command -v npm >/dev/null || { $(APT) npm >/dev/null; }
 	@{ command -v qemu-aarch64 && command -v aarch64-linux-gnu-gcc; } >/dev/null \
 		|| { $(APT) qemu-user gcc-aarch64-linux-gnu libc6-dev-arm64-cross >/dev/null; }
-	npm install --silent --no-audit --no-fund --prefix $(TOOLS) @playcanvas/splat-transform@3
+	npm install --silent --no-audit --no-fund --prefix $(TOOLS) @playcanvas/splat-transform@3 \
+		playcanvas@$(shell sed -n 's/.*"playcanvas": "\(.*\)".*/\1/p' player/examples/package.json)
 	$(BIN)/python -m pip install --quiet --editable '.[ray]'
 
 # The tests of the crates that have NEON or decode, on an emulated processor.

@@ -22,12 +22,15 @@ from gscodec.encode.settings import EncodeSettings
 from gscodec.render.image import render_image
 
 ROOT = Path(__file__).parent.parent
-PAGE = """<!doctype html><canvas></canvas><script type="importmap">{"imports": {
+PAGE = """<!doctype html><link rel="icon" href="data:,"><canvas></canvas><script type="importmap">{"imports": {
     "gscodec": "/node_modules/gscodec/embed/stream.js",
     "gscodec/three": "/node_modules/gscodec/embed/three.js",
     "three": "/node_modules/gscodec/spark.js",
-    "@sparkjsdev/spark": "/node_modules/gscodec/spark.js"
+    "@sparkjsdev/spark": "/node_modules/gscodec/spark.js",
+    "gscodec/playcanvas": "/node_modules/gscodec/embed/playcanvas.js",
+    "playcanvas": "/playcanvas.mjs"
 }}</script>"""
+INSTALLED = ("build/tools", "player/examples")  # where PlayCanvas may be: `make tools`, or npm install for the examples
 
 
 @pytest.fixture(scope="module")
@@ -184,7 +187,7 @@ SCENE = """Promise.all([import("three"), import("gscodec/three")]).then(async ([
 
 
 def scene_comes_to(browser, want) -> bool:
-    """Spark sorts at its own pace."""
+    """Splats are sorted at their own pace."""
     for _ in range(200):
         got = pixels(browser, "new Promise((done) => setTimeout(() => done(window.scene.draw()), 30))")
         if browser.eval("window.scene.shown") == 8 and psnr(got, want) >= 33:
@@ -208,4 +211,50 @@ def test_a_three_js_scene_shows_it(gl_browser, address, app):
         assert want.std() > 10
         assert scene_comes_to(gl_browser, want), upright
         gl_browser.eval("window.scene.object.dispose()")
+    assert gl_browser.errors == []
+
+
+PLAYCANVAS = """Promise.all([import("playcanvas"), import("gscodec/playcanvas")]).then(async ([pc, { GsvScript }]) => {
+    const canvas = document.querySelector("canvas");
+    const app = new pc.Application(canvas, { graphicsDeviceOptions: { antialias: false } });
+    app.setCanvasFillMode(pc.FILLMODE_NONE, 200, 150);
+    app.setCanvasResolution(pc.RESOLUTION_FIXED, 200, 150);
+    app.start();
+    const entity = (name, type, data) => {
+        const e = new pc.Entity(name);
+        e.addComponent(type, data);
+        app.root.addChild(e);
+        return e;
+    };
+    const clearColor = new pc.Color(0.2, 0.3, 0.5);
+    const camera = entity("camera", "camera", { clearColor, fov: 45, nearClip: 0.01, farClip: 100 });
+    camera.setPosition(0.5, 1, 3);
+    camera.lookAt(0, 0, 0);
+    const movie = entity("movie", "script", {});
+    const script = movie.script.create(GsvScript, { properties: { src: "z.gsv", autoplay: false } });
+    window.scene = { shown: null, draw: () => new Promise((done) => app.once("frameend", () => done(canvas))) };
+    movie.script.gsv.on("frame", (frame) => (window.scene.shown = frame));
+    await script.ready;
+    script.playback.position = 8;
+    return Array.from(camera.camera.viewMatrix.data);
+})"""
+
+
+def test_a_playcanvas_scene_shows_it(gl_browser, address, app):
+    engine = [ROOT / d / "node_modules/playcanvas/build/playcanvas.mjs" for d in INSTALLED]
+    engine = [e for e in engine if e.exists()]
+    if not engine:
+        pytest.skip("PlayCanvas is not installed: npm install in player/examples")
+    shutil.copy(engine[0], app / "playcanvas.mjs")
+    config = stream_config(fps=FPS, sh_degree=1, gaussians=400, frames=LENGTH, background=(0.2, 0.3, 0.5))
+    encode_sequence(sequence(sh_count=3), app / "z.gsv", config, EncodeSettings(quality=80))
+    stream = open_stream(app / "z.gsv")
+    gl_browser.goto(address)
+    view = np.array(gl_browser.eval(PLAYCANVAS)).reshape(4, 4).T
+    view = np.diag([1.0, -1, -1, 1]) @ view
+    focal = 75 / np.tan(np.radians(22.5))
+    camera = camera_of([200, 150, focal, focal, 100, 75, *view[:3].ravel(), 0.01])
+    want = render_image(stream.frame(8), camera, tuple(stream.config["background"]))
+    assert want.std() > 10
+    assert scene_comes_to(gl_browser, want)
     assert gl_browser.errors == []
