@@ -8,7 +8,7 @@ Streams lie in FOLDER; a missing one is encoded first, which is not measured:
   statue_all   the same with all of its 101,275 Gaussians
   long         the same as statue with 300 frames, for the memory
 
-Results of a stream:
+bench/results/player.json has an entry for each stream:
   first_picture_ms       from the start of the navigation; page and stream come from this machine, nothing is cached
   first_picture_slow_ms  the same over 2 Mbit/s with 40 ms to the first byte of each answer, throttled by Chromium
   first_picture_bytes    received by then over that link
@@ -34,7 +34,7 @@ from pathlib import Path
 from gscodec.player.server import Server
 
 from .browser import Browser, Browsers
-from .machine import RESULTS, ROOT, write_result
+from .machine import RESULTS, ROOT, update_entries
 from .run import animated, gscodec
 
 SIZE = "512x512"
@@ -248,13 +248,11 @@ def main() -> None:
     if unknown := set(a.streams) - {"demo", *STATUES}:
         sys.exit(f"error: no such stream: {', '.join(unknown)}, expected demo, {', '.join(STATUES)}")
     found = streams(a.folder, a.streams or ["demo", *STATUES])
-    results = {}
     with Browsers() as browsers:
-        version = browsers.start().page.context.browser.version
-        for name, path in found.items():
-            results[name] = measure(browsers, name, path)
-            print(name, json.dumps(results[name]), flush=True)
-    write_result(RESULTS / "player.json", {"size": SIZE, "browser": f"Chromium {version}", "streams": results})
+        browser = {"browser": f"Chromium {browsers.start().page.context.browser.version}", "size": SIZE}
+        entries = ({"stream": name, **browser, **measure(browsers, name, path)} for name, path in found.items())
+        for entry in update_entries(RESULTS / "player.json", entries, lambda e: e["stream"]):
+            print(json.dumps(entry), flush=True)
 
 
 if __name__ == "__main__":

@@ -21,8 +21,6 @@ FILES = {  # what -> file, command
     "statue, 20 frames": ("statue.json", "python -m bench.run statue"),
     "statue, 40 frames": ("statue40.json", "python -m bench.run statue40"),
     "yellow_clip3.splatv": ("splatv.json", "python -m bench.run splatv"),
-    "page, its speed": ("player.json", "python -m bench.player FOLDER"),
-    "page, first picture": ("first_picture.json", "python -m bench.player FOLDER"),
     "rasterizer": ("raster.json", "gscodec bench raster"),
     "tiles": ("tiles.json", "python -m bench.tiles"),
 }
@@ -49,6 +47,7 @@ def _rows() -> Iterator[tuple[str, ...]]:
     ):
         yield what, file, f"`{command}`", _commits(_entries(file)), "-"
     for file, what, module in (
+        ("player.json", "page", "player FOLDER"),
         ("points.json", "sparse points", "sparse_points"),
         ("depth.json", "depth images", "depth"),
         ("tracks.json", "a capture in tracks", "capture_tracks"),
