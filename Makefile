@@ -41,7 +41,7 @@ demo: venv
 
 test: venv lint browser $(CI_TESTS)
 	$(CARGO) test --release --quiet --workspace --features bindings/wasm
-	$(CI_ENV) $(BIN)/python -m pytest
+	$(CI_ENV) $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 # What `make test` does besides where CI is set; there a test that is skipped fails.
 ci: venv tools neon fuzz

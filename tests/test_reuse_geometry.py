@@ -158,6 +158,8 @@ def test_what_does_not_fit_is_said(old, plys, tmp_path):
 
     out = tmp_path / "new.gsv"
     says("leave --quality away", plys, out, "--quality", 50)
+    says("leave --preset away", plys, out, "--preset", "fast")
+    says("leave --gop away", plys, out, "--gop", 7)
     says("expected as many", plys, out, "--frames", "0:5")
     says("the output is the stream whose geometry is reused", plys, old)
     fewer = tmp_path / "fewer"

@@ -20,6 +20,7 @@ from ..errors import CaptureError, UsageError, require
 from ..fingerprint import inputs, program
 from ..frame_range import frame_range
 from ..model.camera import Calibration, Camera
+from ..model.gaussians import GOP
 from ..model.parametric_group import ParametricGroup
 from ..progress import Bar
 from .inputs import open_frames, open_tracks
@@ -66,6 +67,7 @@ def encode_reusing(
 
 def _check(settings: EncodeSettings, options: TrainOptions) -> None:
     """Raises UsageError for options that would change the geometry."""
+    usual = TrainOptions("medium", None, GOP)
     given = {
         "--quality": settings.quality is not None,
         "--bitrate": settings.bitrate is not None,
@@ -73,9 +75,12 @@ def _check(settings: EncodeSettings, options: TrainOptions) -> None:
         "--keep-all": settings.keep_all,
         "--ray": options.cluster is not None,
         "--rig": options.rig is not None,
+        **{f"--{n}": getattr(options, n) != getattr(usual, n) for n in ("preset", "gop", "motion")},
     }
     if wrong := [name for name, there in given.items() if there]:
-        raise UsageError(f"--reuse-geometry takes groups, layers and steps from the stream; leave {wrong[0]} away")
+        raise UsageError(
+            f"--reuse-geometry takes groups, motion, layers and steps from the stream; leave {wrong[0]} away"
+        )
 
 
 def _only_track(path: Path) -> Stream:
