@@ -100,7 +100,7 @@ SPZ_BAD = [
 ]
 
 
-@pytest.mark.parametrize(("content", "message"), SPZ_BAD)
+@pytest.mark.parametrize(("content", "message"), SPZ_BAD, ids=[message for _, message in SPZ_BAD])
 def test_bad_spz(tmp_path, content, message):
     (tmp_path / "a.spz").write_bytes(content)
     with pytest.raises(CaptureError, match=r"a\.spz: .*" + message):
