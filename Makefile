@@ -7,7 +7,7 @@ CARGO := cd codec/native && cargo
 DEMO := demo
 DIST := dist
 
-# What CI has besides: Ray, splat-transform, an emulator of the processors that have NEON.
+# What CI has besides: Ray, splat-transform, PlayCanvas, an emulator of the processors that have NEON.
 TOOLS := $(CURDIR)/build/tools
 CI_TESTS := $(if $(CI),ci)
 CI_ENV := $(if $(CI),PATH="$(TOOLS)/node_modules/.bin:$$PATH")
