@@ -61,7 +61,6 @@ def test_a_motion_out_of_reach_of_the_gradient_is_searched_for():
     turn, shift = np.array([0.0, 0.8, 0.1]), np.array([0.9, -0.3, 0.2])
     first = blob(300)
     to = lambda g: capture_of(GaussianSequence(25.0, [DenseGroup([first, g], None)]))  # noqa: E731
-
     rough = dataclasses.replace(first, sh0=first.sh0 + 0.5 * np.random.default_rng(0).standard_normal((300, 3)))
 
     def tracker_of(capture):  # of a keyframe that has errors, as any has
@@ -74,6 +73,8 @@ def test_a_motion_out_of_reach_of_the_gradient_is_searched_for():
     R = quat_to_matrix(rotvec_to_quat(turn))
     missed = np.abs(found.nodes.numpy() - (tracker.pose.nodes.numpy() @ R.T + shift)).mean()
     assert missed < 0.1, "radii of the blob, most of whose nodes move by more than 1"
+    tracker.moving[:] = False
+    assert search(tracker, 1) is None, "there is nothing to search for"
     near = to(moved(first, 0.03 * turn, 0.03 * shift))
     assert search(tracker_of(near), 1) is None, "a search takes seconds"
 

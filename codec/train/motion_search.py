@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 def search(tracker: Tracker, frame: int) -> Pose | None:
     """The pose of `tracker`, in the frame before `frame`, with the step that fits `frame` best; None: constant velocity
     fits well enough, or nothing fits better."""
+    if not tracker.moving.any():  # all that moved has been found to be gone
+        return None
     s, pose = tracker.settings.motion_search, None
     for parts in (1, s.parts):
         bodies = _Bodies(tracker, pose or tracker.pose, frame, parts)
@@ -60,7 +62,7 @@ class _Bodies:
         chosen = sorted(farthest_points(places, min(self.settings.views, len(places))))
         self._cameras = [views.train_cameras[i] for i in chosen]
         self._scale = min(1.0, self.settings.side / views.largest_side)
-        self._moving = tracker.moving & tracker.alive
+        self._moving = tracker.moving
         self._params = tracker.carried(tracker.own, pose.next())[0]
         means = self._params["means"][self._moving]
         self._seeds = means[torch.from_numpy(farthest_points(means.numpy(), parts)).long()]
