@@ -21,7 +21,10 @@ PLAYER = Path(__file__).resolve().parent
 NATIVE = PLAYER.parent / "codec" / "native"
 TARGET = "wasm32-unknown-unknown"
 WASM, HASH = PLAYER / "native.wasm.gz", PLAYER / "native.sha256"
-BINARYEN = "132.0.0"  # whose wasm-opt makes the module an eighth smaller
+BINARYEN = "132.0.0"  # whose wasm-opt makes the module a tenth smaller
+# Instructions up to which a function that is called once goes into its caller: what is called for each Gaussian stays by
+# itself, since a browser optimises a function from its next call on.
+INLINED_MAX = 40
 FEATURES = "simd bulk-memory sign-ext mutable-globals nontrapping-float-to-int reference-types multivalue".split()
 SPARK, SPARK_HASH = PLAYER / "spark.js", PLAYER / "spark.sha256"
 
@@ -74,7 +77,8 @@ def _optimized(module: Path) -> bytes:
         package = f"binaryen@{BINARYEN}"
         install = f"npm install --silent --ignore-scripts --no-fund --no-audit --prefix . {package}".split()
         out, program = Path(folder) / "out.wasm", Path(folder) / "node_modules" / ".bin" / "wasm-opt"
-        optimize = [program, "-O2", *(f"--enable-{f}" for f in FEATURES), module, "-o", out]
+        optimize = [program, "-O2", "--one-caller-inline-max-function-size", str(INLINED_MAX)]
+        optimize += [*(f"--enable-{f}" for f in FEATURES), module, "-o", out]
         if subprocess.run(install, cwd=folder).returncode or subprocess.run(optimize).returncode:
             sys.exit(f"error: wasm-opt of {package} was not fetched or failed")
         return out.read_bytes()

@@ -36,29 +36,30 @@ impl ChannelModel {
 
 /// Codes `values`, which holds the C channels of Gaussian i at `C * i..`. False if a forbidden value was read.
 pub fn code<C: Bins>(c: &mut C, model: &mut ChannelModel, near: &[Near], values: &mut [i32]) -> bool {
-    let ChannelModel { symbols, class, second } = model;
-    let (channels, second) = (class.len(), *second);
-    for (i, near) in near.iter().enumerate() {
+    let channels = model.class.len();
+    near.iter().enumerate().all(|(i, near)| {
         let (done, rest) = values.split_at_mut(i * channels);
-        let Some(own) = rest.get_mut(..channels) else {
-            return false;
-        };
-        for (ch, &class) in class.iter().enumerate() {
-            let mut around = [0; NEAR];
-            let mut present = 0;
-            for v in near.iter().map_while(|j| done.get(*j as usize * channels + ch)) {
-                around[present] = *v;
-                present += 1;
-            }
-            let back = |n: usize| ch.checked_sub(n).map_or(0, |k| own[k]);
-            let prev = [back(1), back(second)];
-            match value(c, symbols, class, own[ch], &around[..present], prev) {
-                Some(v) => own[ch] = v,
-                None => return false,
-            }
+        let own = rest.get_mut(..channels);
+        own.is_some_and(|own| gaussian(c, model, near, done, own)) && c.alive()
+    })
+}
+
+/// Codes `own`, the channels of one Gaussian; `done`: those of all before it. False if a forbidden value was read.
+#[cfg_attr(target_arch = "wasm32", inline(never))] // a browser optimises a function from its next call on
+fn gaussian<C: Bins>(c: &mut C, model: &mut ChannelModel, near: &Near, done: &[i32], own: &mut [i32]) -> bool {
+    let ChannelModel { symbols, class, second } = model;
+    for (ch, &class_of) in class.iter().enumerate() {
+        let mut around = [0; NEAR];
+        let mut present = 0;
+        for v in near.iter().map_while(|j| done.get(*j as usize * own.len() + ch)) {
+            around[present] = *v;
+            present += 1;
         }
-        if !c.alive() {
-            return false;
+        let back = |n: usize| ch.checked_sub(n).map_or(0, |k| own[k]);
+        let prev = [back(1), back(*second)];
+        match value(c, symbols, class_of, own[ch], &around[..present], prev) {
+            Some(v) => own[ch] = v,
+            None => return false,
         }
     }
     true

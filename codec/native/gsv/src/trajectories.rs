@@ -199,6 +199,7 @@ impl TrajectoryModel {
             .bin(c, want, first + 2 * last + other, first + last, LENGTHS)
     }
 
+    #[cfg_attr(target_arch = "wasm32", inline(never))] // see channels.rs
     fn length<C: Bins>(&mut self, c: &mut C, near: &Near, out: &Trajectories, want: usize, k_max: usize) -> usize {
         let l = near.map(|j| out.get(j as usize).len() / out.channels.max(1));
         let a = 4 * l[0].min(3) + l[1].min(3);
@@ -214,6 +215,7 @@ impl TrajectoryModel {
         length
     }
 
+    #[cfg_attr(target_arch = "wasm32", inline(never))] // see channels.rs
     fn coefficients<C: Bins>(&mut self, c: &mut C, near: &Near, out: &mut Trajectories, want: &[i32], length: usize) {
         let (channels, base) = (out.channels, out.values.len());
         for place in 0..length * channels {

@@ -95,6 +95,7 @@ impl Split {
     }
 
     /// Codes the number of points per child: splits along x, then y, then z.
+    #[cfg_attr(target_arch = "wasm32", inline(never))] // see ../channels.rs
     pub fn children<C: Bins>(mut self, coder: &mut SplitCoder<C>) -> [u32; 8] {
         let mut counts = [0; 8];
         let [lx, ly, lz] = self.lower;
@@ -131,6 +132,7 @@ impl Split {
 
     /// Codes the child of a single point. Equal to `children`, which most nodes do not need, but without branches that
     /// cannot be predicted.
+    #[cfg_attr(target_arch = "wasm32", inline(never))] // see ../channels.rs
     pub fn child<C: Bins>(self, coder: &mut SplitCoder<C>) -> usize {
         let [lx, ly, lz] = self.lower;
         let c = context(halves(ly, 4, 0), halves(lz, 4, 0), sum(lx, 4, 4), self.upper[0]);
