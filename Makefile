@@ -76,7 +76,8 @@ format: venv
 	$(BIN)/ruff format .
 	$(CARGO) fmt --all
 
-# The web player's decoder: codec/native -> player/native.wasm.gz, which is committed. Needs npm, for wasm-opt.
+# The web player's decoder: codec/native -> player/native.wasm.gz, and its script: player/*.js -> player/page.js, which are
+# committed. Needs npm, for wasm-opt and esbuild.
 player:
 	$(PYTHON) player/build.py
 

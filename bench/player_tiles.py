@@ -38,9 +38,8 @@ RESULT = RESULTS / "player_tiles.json"
 
 # opens the stream; partly: whether only the tiles in view are fetched
 OPEN = """async ([partly, stream]) => {
-    const { Engine } = await import("/engine.js");
-    if (!partly) Engine.partly = Infinity;
     const player = document.querySelector("gsv-player");
+    if (!partly) player.engine.constructor.partly = Infinity;
     player.setAttribute("src", stream);
     await new Promise((done) => player.addEventListener("picture", done, { once: true }));
     const { source } = player.engine;

@@ -1,4 +1,5 @@
-"""`make player`: codec/native -> player/native.wasm.gz, and the hash of what it was built from (native.sha256).
+"""`make player`: codec/native -> player/native.wasm.gz, player.js and what it imports -> page.js, which index.html loads;
+and the hash of what each was built from (native.sha256, page.sha256).
 `make spark`: three.js and Spark, of the versions and hashes in spark/package-lock.json -> spark.js, and its hashes.
 
 All are committed, so that a checkout and the wheel play offline and without toolchains; a test fails when a hash is
@@ -26,6 +27,8 @@ BINARYEN = "132.0.0"  # whose wasm-opt makes the module a tenth smaller
 # itself, since a browser optimises a function from its next call on.
 INLINED_MAX = 40
 FEATURES = "simd bulk-memory sign-ext mutable-globals nontrapping-float-to-int reference-types multivalue".split()
+PAGE, PAGE_HASH = PLAYER / "page.js", PLAYER / "page.sha256"
+LATER = ["gpu.js", "parts.js", "sound.js", "spark.js"]  # which the page loads when it needs them
 SPARK, SPARK_HASH = PLAYER / "spark.js", PLAYER / "spark.sha256"
 
 
@@ -84,6 +87,34 @@ def _optimized(module: Path) -> bytes:
         return out.read_bytes()
 
 
+def page_hashes() -> str:
+    """SHA-256 over the sources of page.js, and of page.js."""
+    digest = hashlib.sha256()
+    for f in sorted(PLAYER.glob("*.js")):
+        if f.name not in (PAGE.name, "worker.js", *LATER):
+            digest.update(f.name.encode() + b"\n" + f.read_bytes())
+    return f"{digest.hexdigest()} {hashlib.sha256(PAGE.read_bytes()).hexdigest()}"
+
+
+def build_page() -> None:
+    """Builds page.js, in which the modules are one file without comments, half as large on the way to a browser.
+
+    Raises:
+        SystemExit: npm is missing or fails.
+    """
+    if not shutil.which("npm"):
+        sys.exit("error: npm was not found; page.js is bundled with it (Debian: apt-get install npm)")
+    with tempfile.TemporaryDirectory() as folder:
+        for f in ("package.json", "package-lock.json"):
+            shutil.copy(PLAYER / "spark" / f, folder)
+        subprocess.run("npm ci --ignore-scripts --no-fund --no-audit --silent".split(), cwd=folder, check=True)
+        command = [Path(folder) / "node_modules" / ".bin" / "esbuild", "player.js", "--bundle", "--minify"]
+        command += ["--format=esm", "--target=es2022", f"--outfile={PAGE}", "--log-level=error"]
+        subprocess.run([*command, *(f"--external:./{name}" for name in LATER)], cwd=PLAYER, check=True)
+    PAGE_HASH.write_text(page_hashes() + "\n")
+    print(f"{PAGE.name}: {PAGE.stat().st_size / 1000:.0f} kB")
+
+
 def _has_target() -> bool:
     """Whether the target is installed, after asking rustup for it."""
     sysroot = subprocess.run(["rustc", "--print", "sysroot"], capture_output=True, text=True, check=True).stdout.strip()
@@ -137,6 +168,8 @@ def check_committed() -> None:
         sys.exit(
             "error: player/native.wasm.gz was built from other sources; run `make player` and commit player/native.*"
         )
+    if not PAGE_HASH.exists() or PAGE_HASH.read_text().strip() != page_hashes():
+        sys.exit("error: player/page.js was made from other modules; run `make player` and commit player/page.*")
     if not SPARK_HASH.exists() or SPARK_HASH.read_text().strip() != spark_hashes():
         sys.exit("error: player/spark.js is not that of player/spark; run `make spark` and commit player/spark.*")
 
@@ -148,3 +181,4 @@ if __name__ == "__main__":
         if "--committed" in sys.argv[1:]:  # CI: the committed files must be current, and the tests run on rebuilt ones
             check_committed()
         build()
+        build_page()

@@ -22,24 +22,16 @@ from pathlib import Path
 from gscodec.errors import UsageError
 
 PAGE = Path(__file__).parent
+# page.js is player.js with its modules, see build.py
 FILES = {
     "index.html": "text/html; charset=utf-8",
-    "player.js": "text/javascript; charset=utf-8",
-    "engine.js": "text/javascript; charset=utf-8",
-    "renderer.js": "text/javascript; charset=utf-8",
+    "page.js": "text/javascript; charset=utf-8",
     "gpu.js": "text/javascript; charset=utf-8",
     "spark.js": "text/javascript; charset=utf-8",
-    "source.js": "text/javascript; charset=utf-8",
-    "abr.js": "text/javascript; charset=utf-8",
-    "layers.js": "text/javascript; charset=utf-8",
     "sound.js": "text/javascript; charset=utf-8",
     "parts.js": "text/javascript; charset=utf-8",
-    "tracks.js": "text/javascript; charset=utf-8",
-    "tiles.js": "text/javascript; charset=utf-8",
     "worker.js": "text/javascript; charset=utf-8",
     "native.js": "text/javascript; charset=utf-8",
-    "camera.js": "text/javascript; charset=utf-8",
-    "controls.js": "text/javascript; charset=utf-8",
     "player.css": "text/css; charset=utf-8",
     "native.wasm.gz": "application/gzip",
 }

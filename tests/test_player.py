@@ -230,7 +230,7 @@ def test_layers_follow_the_device(browser, server):
     """Fewer when it is too slow for some looks in a row, more again after a while."""
     browser.goto(server.url + "?src=none.gsv")
     script = """(async () => {
-        const { LayerChoice } = await import("/layers.js");
+        const { constructor: LayerChoice } = document.querySelector("gsv-player").engine.choice;
         const choice = new LayerChoice();
         const rates = [1, 2, 3];
         const after = (load, times, now) => {

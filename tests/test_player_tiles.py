@@ -99,7 +99,7 @@ ALL_THERE = f"""(({{ engine }}) => (engine.scene?.tracks ?? [{{ engine }}]).ever
 def open_partly(browser, server, url: str) -> None:
     """Opens a stream of which the page fetches only what is in view, whatever its size."""
     browser.goto(f"{server.url}?autoplay=off&loop=off&layers=all&size=160x120")
-    browser.eval("import('/engine.js').then(({ Engine }) => (Engine.partly = 0))")
+    browser.eval(f"{PLAYER}.engine.constructor.partly = 0")
     browser.eval(f"{PLAYER}.setAttribute('camera', 'first'), {PLAYER}.setAttribute('src', {json.dumps(url)})")
     browser.wait(f"{PLAYER}.camera && {PLAYER}.stats.gaussians > 0")
 

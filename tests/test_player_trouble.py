@@ -43,7 +43,7 @@ def test_the_element_on_another_page(browser, gsv, other, tmp_path):
     make = lambda *a, **k: Static(*a, directory=str(PAGE), **k)  # noqa: E731
     host = serving(http.server.ThreadingHTTPServer(("127.0.0.1", 0), make))
     file, _ = other(gsv.read_bytes())
-    page = f"""<!doctype html><script type=module src="http://127.0.0.1:{host.server_address[1]}/player.js"></script>
+    page = f"""<!doctype html><script type=module src="http://127.0.0.1:{host.server_address[1]}/page.js"></script>
         <gsv-player src="{file}" size="64x64" style="width: 300px; height: 200px"></gsv-player>"""
     url, _ = other(page.encode(), kind="text/html")
     browser.goto(url)
