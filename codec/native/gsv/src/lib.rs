@@ -22,6 +22,7 @@ pub mod evaluate;
 pub mod fields;
 pub mod group;
 pub mod header;
+mod lanes;
 pub mod levels;
 pub mod lifetimes;
 mod model;

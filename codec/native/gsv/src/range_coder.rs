@@ -4,6 +4,8 @@
 //! encoder's methods write their argument and return it, the decoder's ignore their argument and return what they read.
 //! Carries are resolved with a pending byte and a run length, as in LZMA; the first byte, always 0, is left out.
 
+use crate::lanes::count;
+
 /// One direction of the entropy coder.
 pub trait Bins {
     /// True for the reading side: values passed in are placeholders.
@@ -226,8 +228,9 @@ impl Bins for Decoder<'_> {
     fn symbol(&mut self, _: usize, ends: &Ends) -> usize {
         let unit = self.range >> 16;
         let at = (self.code / unit.max(1)).min(65535) as u16;
-        let before: u16 = ends[..SYMBOLS - 1].iter().map(|end| u16::from(*end <= at)).sum();
-        let symbol = usize::from(before);
+        let (eights, _) = ends.as_chunks();
+        let passed: u16 = eights.iter().map(|ends| count(*ends, at)).sum();
+        let symbol = usize::from(passed.saturating_sub(1)); // the last end is 0, for 65536
         let (start, length) = interval(symbol, ends);
         self.take(unit * start, unit * length);
         symbol

@@ -1,9 +1,10 @@
 //! Adaptive symbol models (spec 6.6): one of 32 symbols in three contexts <-> the range coder, in integers only.
 //!
 //! Each context has a distribution that adapts to its symbols; the mean of three, with weights that adapt too, is coded. One
-//! symbol replaces about eight bins; the 16-bit lanes vectorize on every processor.
+//! symbol replaces about eight bins; the 16-bit lanes vectorize on every processor (lanes.rs).
 
 use crate::blocks::Blocks;
+use crate::lanes::{learned, mean};
 use crate::range_coder::{Bins, Ends, SYMBOLS};
 use std::sync::LazyLock;
 
@@ -43,18 +44,10 @@ impl Distribution {
     /// Moves towards `symbol` by `rate` / 65536.
     #[inline]
     fn learn(&mut self, symbol: usize, rate: u16) {
-        for (i, end) in (0i16..).zip(&mut self.0) {
-            let target = if i >= symbol as i16 { u16::MAX } else { 0 };
-            let off = *end ^ target; // from the target
-            *end = (off - high(off, rate)) ^ target;
+        for (first, ends) in (0..).step_by(8).zip(self.0.as_chunks_mut().0) {
+            *ends = learned(*ends, symbol as i16 - first, rate);
         }
     }
-}
-
-/// The upper half of a product.
-#[inline]
-fn high(a: u16, b: u16) -> u16 {
-    ((u32::from(a) * u32::from(b)) >> 16) as u16
 }
 
 /// The distributions of one kind of context, and how many symbols each has seen.
@@ -130,9 +123,10 @@ impl SymbolModel {
             d.distributions.get(id),
         );
         let mut ends = [0; SYMBOLS];
-        for (i, end) in ends.iter_mut().enumerate() {
-            let mean = high(a.0[i], wa as u16) + high(b.0[i], wb as u16) + high(d.0[i], wd as u16);
-            *end = mean - (mean >> 9) + LEAST * (i as u16 + 1);
+        let shares = [wa, wb, wd].map(|w| w as u16);
+        let eights = a.0.as_chunks().0.iter().zip(b.0.as_chunks().0).zip(d.0.as_chunks().0);
+        for (k, (end, ((a, b), d))) in (0..).zip(ends.as_chunks_mut().0.iter_mut().zip(eights)) {
+            *end = mean([*a, *b, *d], shares, LEAST, 8 * k + 1);
         }
         ends[SYMBOLS - 1] = 0; // 65536
         let symbol = c.symbol(symbol, &ends);
