@@ -51,7 +51,7 @@ impl NodeTable {
                 .fold((u32::MAX, 0), |(l, h), p| (l.min(p[a]), h.max(p[a])))
         };
         let box_ = [0, 1, 2].map(bounds).map(|(l, h)| (f64::from(l), f64::from(h)));
-        self.sums(d, |a, v| (v - box_[a].0).abs().max((v - box_[a].1).abs()));
+        self.sums(d, |a, v| larger((v - box_[a].0).abs(), (v - box_[a].1).abs()));
         let mut farthest = [f64::INFINITY; NEAREST_MAX];
         for d in d.iter() {
             if *d < farthest[count - 1] {
@@ -59,7 +59,7 @@ impl NodeTable {
             }
         }
         let reach = farthest[count - 1];
-        self.sums(d, |a, v| (box_[a].0 - v).max(v - box_[a].1).max(0.0));
+        self.sums(d, |a, v| larger(larger(box_[a].0 - v, v - box_[a].1), 0.0));
         few.axes.iter_mut().for_each(Vec::clear);
         few.index.clear();
         for (i, _) in d.iter().enumerate().filter(|(_, d)| **d <= reach) {
@@ -104,6 +104,12 @@ impl NodeSearch {
             }
         }
     }
+}
+
+/// The larger of two numbers, neither NaN: `f64::max` is a call in wasm.
+#[inline]
+fn larger(a: f64, b: f64) -> f64 {
+    if a > b { a } else { b }
 }
 
 /// Inserts into a sorted list; the last item is dropped.
