@@ -1,9 +1,9 @@
 """Benchmarks of the whole pipeline through the command line: a JSON in bench/results per case.
 
-usage: python -m bench.run [statue] [statue40] [lumberjack] [demo]
+usage: python -m bench.run [statue] [statue40] [splatv] [lumberjack] [demo]
 
-All cases but `demo` need the data folder that the environment variable GSCODEC_DATA names, with lumberjack/ and
-splats/statue.ply; without it they are left out, and a line says so. `demo` also draws bench/charts/demo.png.
+All cases but `demo` need the data folder that the environment variable GSCODEC_DATA names, with lumberjack/,
+splats/statue.ply and splats/yellow_clip3.splatv; without it they are left out, and a line says so. `demo` also draws bench/charts/demo.png.
 """
 
 from __future__ import annotations
@@ -67,6 +67,11 @@ def statue40(data: Path, folder: Path) -> dict:
     return measure("statue40", animated(data, folder, 40), folder, "--quality", "52")
 
 
+def splatv(data: Path, folder: Path) -> dict:
+    """A trained Spacetime scene as its authors publish it, 20 of its 50 frames, at the default quality."""
+    return measure("splatv", existing(data / "splats" / "yellow_clip3.splatv"), folder, "--frames", "0:20")
+
+
 def animated(data: Path, folder: Path, frames: int) -> Path:
     """The moving statue as a folder of .ply files."""
     plys = folder / f"statue{frames}"
@@ -99,7 +104,7 @@ def beside(stream: Path, source: Path, frames: tuple[int, ...]) -> np.ndarray:
     return np.hstack(pictures)
 
 
-CASES = {"demo": demo, "statue": statue, "statue40": statue40, "lumberjack": lumberjack}
+CASES = {"demo": demo, "statue": statue, "statue40": statue40, "splatv": splatv, "lumberjack": lumberjack}
 
 
 def main() -> None:
