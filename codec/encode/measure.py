@@ -19,7 +19,7 @@ GOLDEN = (5**0.5 - 1) / 2  # steps of this share of a range visit it evenly, in 
 
 def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanSettings) -> Importance:
     """Importance of the N Gaussians, from the first, the middle and the last frame. Where Gaussians come and go, every
-    frame is seen by a camera of the capture and by another one: what lives in one frame alone shows in few views.
+    frame is seen, of a capture by one of its cameras and by another one: what lives in one frame alone shows in few views.
 
     Args:
         cameras: from which the subject was captured, if it was.
@@ -33,9 +33,10 @@ def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanS
     around = np.concatenate([f.means for f in few])
     views = settings.more_views if frames == 1 or len(g) <= settings.few else settings.views
     if group.lifetimes is not None:
-        times = _spread(frames, max(views, 2 * frames) // 2)
+        each = 2 if cameras else 1
+        times = _spread(frames, max(views, each * frames) // each)
         some = [cameras[i] for i in _spread(len(cameras), len(times))] if cameras else []
-        return measure(lambda i: _shown(group, times[i % len(times)]), around, some, 2 * len(times))
+        return measure(lambda i: _shown(group, times[i % len(times)]), around, some, each * len(times))
     return measure(lambda i: few[i % len(few)], around, cameras, views)
 
 
