@@ -67,7 +67,8 @@ TIMES = """async ([runs, drawn]) => {
 # decodes group 0 in one instance: all of it, and the share of each of two workers, in turn; least ms of each
 SHARES = """async (runs) => {
     const { Native, load } = await import("/native.js");
-    const share = (index, k, n) => Uint8Array.from(index.tiles.flatMap((tiles, layer) => tiles.map((_, t) => Number((layer + t) % n === k))));
+    const own = (k, n) => (tiles, layer) => tiles.map((_, t) => Number((layer + t) % n === k));
+    const share = (index, k, n) => Uint8Array.from(index.tiles.flatMap(own(k, n))); // as tiles.js
     const native = await Native.create(await load(new URL("/native.wasm.gz", location.href)));
     const file = new Uint8Array(await (await fetch("/stream.gsv")).arrayBuffer());
     native.push(file);

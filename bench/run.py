@@ -3,7 +3,8 @@
 usage: python -m bench.run [statue] [statue40] [splatv] [lumberjack] [demo]
 
 All cases but `demo` need the data folder that the environment variable GSCODEC_DATA names, with lumberjack/,
-splats/statue.ply and splats/yellow_clip3.splatv; without it they are left out, and a line says so. `demo` also draws bench/charts/demo.png.
+splats/statue.ply and splats/yellow_clip3.splatv; without it they are left out, and a line says so. `demo` also draws
+bench/charts/demo.png.
 """
 
 from __future__ import annotations

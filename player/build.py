@@ -1,5 +1,5 @@
-"""`make player`: codec/native -> player/native.wasm.gz, player.js and what it imports -> page.js, which index.html loads;
-and the hash of what each was built from (native.sha256, page.sha256).
+"""`make player`: codec/native -> player/native.wasm.gz; player.js and what it imports -> page.js, which index.html
+loads; and the hash of what each was built from (native.sha256, page.sha256).
 `make spark`: three.js and Spark, of the versions and hashes in spark/package-lock.json -> spark.js, and its hashes.
 
 All are committed, so that a checkout and the wheel play offline and without toolchains; a test fails when a hash is
@@ -23,8 +23,8 @@ NATIVE = PLAYER.parent / "codec" / "native"
 TARGET = "wasm32-unknown-unknown"
 WASM, HASH = PLAYER / "native.wasm.gz", PLAYER / "native.sha256"
 BINARYEN = "132.0.0"  # whose wasm-opt makes the module a tenth smaller
-# Instructions up to which a function that is called once goes into its caller: what is called for each Gaussian stays by
-# itself, since a browser optimises a function from its next call on.
+# Instructions up to which a function that is called in one place goes into its caller: what is called for each Gaussian
+# stays by itself, since a browser optimises a function from its next call on.
 INLINED_MAX = 40
 FEATURES = "simd bulk-memory sign-ext mutable-globals nontrapping-float-to-int reference-types multivalue".split()
 PAGE, PAGE_HASH = PLAYER / "page.js", PLAYER / "page.sha256"

@@ -19,7 +19,7 @@ GOLDEN = (5**0.5 - 1) / 2  # steps of this share of a range visit it evenly, in 
 
 def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanSettings) -> Importance:
     """Importance of the N Gaussians, from the first, the middle and the last frame. Where Gaussians come and go, every
-    frame is seen, of a capture by one of its cameras and by another one: what lives in one frame alone shows in few views.
+    frame is seen, in a capture by one of its cameras and by another one: what lives in one frame shows in few views.
 
     Args:
         cameras: from which the subject was captured, if it was.
