@@ -4,6 +4,7 @@ usage: python -m bench.player FOLDER [statue] [demo] ...
 
 Streams lie in FOLDER; a missing one is encoded first, which is not measured:
   demo         the bundled capture
+  demo_slow    the same with the preset slow: the Gaussians that a capture of 1000 x 1000 pixels gets
   statue       the moving statue of the data folder (GSCODEC_DATA), 40 frames, without Gaussians that no view shows
   statue_all   the same with all of its 101,275 Gaussians
   long         the same as statue with 300 frames, for the memory
@@ -42,6 +43,7 @@ LOADS = 5
 # ms, and bytes a second
 SLOW = {"offline": False, "latency": 40, "downloadThroughput": 2e6 / 8, "uploadThroughput": 2e6 / 8}
 PLAYER = "document.querySelector('gsv-player')"
+DEMOS = {"demo": (), "demo_slow": ("--preset", "slow")}
 STATUES = {"statue": (40, ()), "statue_all": (40, ("--keep-all",)), "long": (300, ())}
 
 # keeps the time of the first picture in the page
@@ -132,8 +134,8 @@ def streams(folder: Path, names: list[str]) -> dict[str, Path]:
     found = {}
     for name in names:
         path = folder / f"{name}.gsv"
-        if not path.exists() and name == "demo":
-            gscodec("encode", ROOT / "examples" / "lumberjack", path)
+        if not path.exists() and name in DEMOS:
+            gscodec("encode", ROOT / "examples" / "lumberjack", path, *DEMOS[name])
         elif not path.exists() and data:
             frames, options = STATUES[name]
             gscodec("encode", animated(data, folder, frames), path, *options)
@@ -241,13 +243,14 @@ def measure(browsers: Browsers, name: str, path: Path) -> dict:
 
 def main() -> None:
     """Measures the streams named on the command line, all by default."""
+    all_ = [*DEMOS, *STATUES]
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="where the streams are made and kept")
-    parser.add_argument("streams", nargs="*", metavar="STREAM", help=f"of demo, {', '.join(STATUES)}; all by default")
+    parser.add_argument("streams", nargs="*", metavar="STREAM", help=f"of {', '.join(all_)}; all by default")
     a = parser.parse_args()
-    if unknown := set(a.streams) - {"demo", *STATUES}:
-        sys.exit(f"error: no such stream: {', '.join(unknown)}, expected demo, {', '.join(STATUES)}")
-    found = streams(a.folder, a.streams or ["demo", *STATUES])
+    if unknown := set(a.streams) - set(all_):
+        sys.exit(f"error: no such stream: {', '.join(unknown)}, expected {', '.join(all_)}")
+    found = streams(a.folder, a.streams or all_)
     with Browsers() as browsers:
         browser = {"browser": f"Chromium {browsers.start().page.context.browser.version}", "size": SIZE}
         entries = ({"stream": name, **browser, **measure(browsers, name, path)} for name, path in found.items())
