@@ -23,6 +23,9 @@ NATIVE = PLAYER.parent / "codec" / "native"
 TARGET = "wasm32-unknown-unknown"
 WASM, HASH = PLAYER / "native.wasm.gz", PLAYER / "native.sha256"
 BINARYEN = "132.0.0"  # whose wasm-opt makes the module a tenth smaller
+ZOPFLI = "1.0.15"  # a twentieth smaller than zlib
+PACK = """const fs = require("fs");
+require("@gfx/zopfli").gzip(fs.readFileSync(0), {}, (e, data) => { if (e) throw e; fs.writeFileSync(1, data); });"""
 # Instructions up to which a function that is called in one place goes into its caller: what is called for each Gaussian
 # stays by itself, since a browser optimises a function from its next call on.
 INLINED_MAX = 40
@@ -63,13 +66,13 @@ def build() -> None:
         sys.exit(f"error: the wasm build failed; it needs the Rust target {TARGET} (rustup target add {TARGET})")
     folder = Path(os.environ.get("CARGO_TARGET_DIR", NATIVE / "target"))
     built = folder / TARGET / "wasm" / "gscodec_native.wasm"
-    WASM.write_bytes(gzip.compress(_optimized(built), 9, mtime=0))
+    WASM.write_bytes(_optimized(built))
     HASH.write_text(source_hash() + "\n")
     print(f"{WASM.name}: {WASM.stat().st_size / 1000:.0f} kB")
 
 
 def _optimized(module: Path) -> bytes:
-    """The module as wasm-opt makes it, which npm fetches.
+    """The module as wasm-opt makes it, packed by zopfli; npm fetches both.
 
     Raises:
         SystemExit: npm is missing or fails.
@@ -77,14 +80,19 @@ def _optimized(module: Path) -> bytes:
     if not shutil.which("npm"):
         sys.exit("error: npm was not found; wasm-opt comes with it (Debian: apt-get install npm)")
     with tempfile.TemporaryDirectory() as folder:
-        package = f"binaryen@{BINARYEN}"
-        install = f"npm install --silent --ignore-scripts --no-fund --no-audit --prefix . {package}".split()
+        packages = f"binaryen@{BINARYEN} @gfx/zopfli@{ZOPFLI}"
+        install = f"npm install --silent --ignore-scripts --no-fund --no-audit --prefix . {packages}".split()
         out, program = Path(folder) / "out.wasm", Path(folder) / "node_modules" / ".bin" / "wasm-opt"
         optimize = [program, "-O2", "--one-caller-inline-max-function-size", str(INLINED_MAX)]
         optimize += [*(f"--enable-{f}" for f in FEATURES), module, "-o", out]
         if subprocess.run(install, cwd=folder).returncode or subprocess.run(optimize).returncode:
-            sys.exit(f"error: wasm-opt of {package} was not fetched or failed")
-        return out.read_bytes()
+            sys.exit(f"error: wasm-opt of {packages} was not fetched or failed")
+        packed = Path(folder) / "out.wasm.gz"
+        with out.open("rb") as plain, packed.open("wb") as to:
+            subprocess.run(["node", "-e", PACK], cwd=folder, stdin=plain, stdout=to, check=True)
+        if gzip.decompress(packed.read_bytes()) != out.read_bytes():
+            sys.exit(f"error: what zopfli of {packages} has packed is not the module")
+        return packed.read_bytes()
 
 
 def page_hashes() -> str:
