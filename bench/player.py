@@ -4,7 +4,7 @@ usage: python -m bench.player FOLDER [statue] [demo] ...
 
 Streams lie in FOLDER; a missing one is encoded first, which is not measured:
   demo         the bundled capture
-  demo_slow    the same with the preset slow: the Gaussians that a capture of 1000 x 1000 pixels gets
+  demo_slow    the same with the preset slow: 14,271 Gaussians, about as many as lumberjack has at 512 x 512 (medium)
   statue       the moving statue of the data folder (GSCODEC_DATA), 40 frames, without Gaussians that no view shows
   statue_all   the same with all of its 101,275 Gaussians
   long         the same as statue with 300 frames, for the memory

@@ -1,6 +1,6 @@
 """Decoding in the page by one worker and by all cores' workers, in headless Chromium.
 
-usage: python -m bench.player_decode FOLDER [statue_all] [statue] [demo]       writes bench/results/player_decode.json
+usage: python -m bench.player_decode FOLDER [statue_all] [demo] ...       writes bench/results/player_decode.json
 
 Streams are those of bench.player, made where they are missing. The page decodes the first group again and again, alone
 and shared in turn, from bytes that it has. A time is from the request to when every worker has its tiles ready to be
@@ -24,7 +24,7 @@ from gscodec.player.server import Server
 
 from .browser import Browsers
 from .machine import RESULTS, update_entries
-from .player import PLAYER, SIZE, STATUES, streams
+from .player import DEMOS, PLAYER, SIZE, STATUES, streams
 
 RUNS, DRAWN = 15, 20
 RESULT = RESULTS / "player_decode.json"
@@ -67,19 +67,15 @@ TIMES = """async ([runs, drawn]) => {
 # decodes group 0 in one instance: all of it, and the share of each of two workers, in turn; least ms of each
 SHARES = """async (runs) => {
     const { Native, load } = await import("/native.js");
-    const own = (k, n) => (tiles, layer) => tiles.map((_, t) => Number((layer + t) % n === k));
-    const share = (index, k, n) => Uint8Array.from(index.tiles.flatMap(own(k, n))); // as tiles.js
+    const { engine } = document.querySelector("gsv-player");
+    const { content } = engine.groups.get(0);
     const native = await Native.create(await load(new URL("/native.wasm.gz", location.href)));
-    const file = new Uint8Array(await (await fetch("/stream.gsv")).arrayBuffer());
-    native.push(file);
-    const { config, groups } = native.describe();
-    const payload = file.slice(groups[0].offset, groups[0].offset + groups[0].size);
-    const index = native.index(payload);
-    const times = [null, share(index, 0, 2), share(index, 1, 2)].map((wanted) => ({ wanted, ms: Infinity }));
+    const orders = [[0, 1], [0, 2], [1, 2]].map(([k, n]) => content.orders(null, null, k, n)[0]);
+    const times = orders.map((order) => ({ ...order, ms: Infinity }));
     for (let run = 0; run < runs; run++) {
         for (const own of times) {
             const start = performance.now();
-            native.decode(0, payload, config.level, { wanted: own.wanted, keepLeading: false });
+            native.decode(0, own.payload, engine.source.level(0), { wanted: own.wanted, keepLeading: false });
             own.ms = Math.min(own.ms, performance.now() - start);
         }
     }
@@ -95,9 +91,8 @@ def measure(browsers: Browsers, path: Path) -> dict:
     browser = browsers.start("--disable-gpu")
     browser.goto(f"{server.url}?size={SIZE}&autoplay=off")
     browser.wait(f"{PLAYER}.camera && {PLAYER}.stats.gaussians > 0")
-    found = browser.page.evaluate(TIMES, [RUNS, DRAWN])
-    browser.goto(server.url + "?src=none.gsv")
     whole, *shares = browser.page.evaluate(SHARES, RUNS)
+    found = browser.page.evaluate(TIMES, [RUNS, DRAWN])
     server.shutdown()
     all_, frames = str(found["all"]), stream.groups[0]["frames"]
     entry = {"frames": frames, "gaussians": stream.group(0).count, "tiles": sum(map(len, stream.group(0).tiles()))}
@@ -120,7 +115,7 @@ def main() -> None:
     """Measures the streams named on the command line."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="where the streams are made and kept")
-    names = ["demo", *STATUES]
+    names = [*DEMOS, *STATUES]
     parser.add_argument("streams", nargs="*", metavar="STREAM", choices=names, default=["statue_all"])
     a = parser.parse_args()
     for entry in update_entries(RESULT, entries(a.folder, a.streams), key=lambda e: e["stream"]):

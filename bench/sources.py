@@ -48,6 +48,8 @@ def _rows() -> Iterator[tuple[str, ...]]:
         yield what, file, f"`{command}`", _commits(_entries(file)), "-"
     for file, what, module in (
         ("player.json", "page", "player FOLDER"),
+        ("player_decode.json", "page, decoding shared by workers", "player_decode FOLDER"),
+        ("player_tiles.json", "page, tiles in view", "player_tiles FOLDER"),
         ("points.json", "sparse points", "sparse_points"),
         ("depth.json", "depth images", "depth"),
         ("tracks.json", "a capture in tracks", "capture_tracks"),

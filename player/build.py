@@ -77,8 +77,7 @@ def _optimized(module: Path) -> bytes:
     Raises:
         SystemExit: npm is missing or fails.
     """
-    if not shutil.which("npm"):
-        sys.exit("error: npm was not found; wasm-opt comes with it (Debian: apt-get install npm)")
+    _need_npm("wasm-opt comes with it")
     with tempfile.TemporaryDirectory() as folder:
         packages = f"binaryen@{BINARYEN} @gfx/zopfli@{ZOPFLI}"
         install = f"npm install --silent --ignore-scripts --no-fund --no-audit --prefix . {packages}".split()
@@ -95,32 +94,60 @@ def _optimized(module: Path) -> bytes:
         return packed.read_bytes()
 
 
+def page_modules() -> list[Path]:
+    """The sources of page.js."""
+    return [f for f in sorted(PLAYER.glob("*.js")) if f.name not in (PAGE.name, "worker.js", *LATER)]
+
+
 def page_hashes() -> str:
     """SHA-256 over the sources of page.js, and of page.js."""
+    return _hashes(page_modules(), PAGE)
+
+
+def spark_hashes() -> str:
+    """SHA-256 over the sources of spark.js, and of spark.js."""
+    return _hashes(sorted((PLAYER / "spark").iterdir()), SPARK)
+
+
+def _hashes(sources: list[Path], made: Path) -> str:
     digest = hashlib.sha256()
-    for f in sorted(PLAYER.glob("*.js")):
-        if f.name not in (PAGE.name, "worker.js", *LATER):
-            digest.update(f.name.encode() + b"\n" + f.read_bytes())
-    return f"{digest.hexdigest()} {hashlib.sha256(PAGE.read_bytes()).hexdigest()}"
+    for f in sources:
+        digest.update(f.name.encode() + b"\n" + f.read_bytes())
+    return f"{digest.hexdigest()} {hashlib.sha256(made.read_bytes()).hexdigest()}"
 
 
 def build_page() -> None:
     """Builds page.js, in which the modules are one file without comments, half as large on the way to a browser.
 
     Raises:
-        SystemExit: npm is missing or fails.
+        SystemExit: npm is missing.
+        CalledProcessError: it fails.
     """
-    if not shutil.which("npm"):
-        sys.exit("error: npm was not found; page.js is bundled with it (Debian: apt-get install npm)")
     with tempfile.TemporaryDirectory() as folder:
-        for f in ("package.json", "package-lock.json"):
-            shutil.copy(PLAYER / "spark" / f, folder)
-        subprocess.run("npm ci --ignore-scripts --no-fund --no-audit --silent".split(), cwd=folder, check=True)
-        command = [Path(folder) / "node_modules" / ".bin" / "esbuild", "player.js", "--bundle", "--minify"]
-        command += ["--format=esm", "--target=es2022", f"--outfile={PAGE}", "--log-level=error"]
-        subprocess.run([*command, *(f"--external:./{name}" for name in LATER)], cwd=PLAYER, check=True)
+        modules = _installed(Path(folder))
+        _esbuild(modules, PLAYER / "player.js", PAGE, *(f"--external:./{name}" for name in LATER))
     PAGE_HASH.write_text(page_hashes() + "\n")
-    print(f"{PAGE.name}: {PAGE.stat().st_size / 1000:.0f} kB")
+
+
+def _need_npm(why: str) -> None:
+    """Raises SystemExit if npm is missing."""
+    if not shutil.which("npm"):
+        sys.exit(f"error: npm was not found; {why} (Debian: apt-get install npm)")
+
+
+def _installed(folder: Path) -> Path:
+    """Copies spark/ to `folder` and installs what its lock file names: three.js, Spark and esbuild. Returns where."""
+    _need_npm("page.js and spark.js are bundled with it")
+    shutil.copytree(PLAYER / "spark", folder, dirs_exist_ok=True)
+    subprocess.run("npm ci --ignore-scripts --no-fund --no-audit --silent".split(), cwd=folder, check=True)
+    return folder / "node_modules"
+
+
+def _esbuild(modules: Path, entry: Path, out: Path, *options: str) -> None:
+    """Bundles `entry` and what it imports into `out`."""
+    command = [modules / ".bin" / "esbuild", entry.name, "--bundle", "--minify", "--format=esm", "--target=es2022"]
+    subprocess.run([*command, f"--outfile={out}", "--log-level=error", *options], cwd=entry.parent, check=True)
+    print(f"{out.name}: {out.stat().st_size / 1000:.0f} kB")
 
 
 def _has_target() -> bool:
@@ -140,34 +167,20 @@ def _remaps() -> list[str]:
     return [f"--remap-path-prefix={f}={'crates' if f != NATIVE else 'native'}" for f in folders]
 
 
-def spark_hashes() -> str:
-    """SHA-256 over the sources of spark.js, and of spark.js."""
-    digest = hashlib.sha256()
-    for f in sorted((PLAYER / "spark").iterdir()):
-        digest.update(f.name.encode() + b"\n" + f.read_bytes())
-    return f"{digest.hexdigest()} {hashlib.sha256(SPARK.read_bytes()).hexdigest()}"
-
-
 def build_spark() -> None:
     """Builds spark.js, with the licences of its parts at the top.
 
     Raises:
-        SystemExit: npm is missing or fails.
+        SystemExit: npm is missing.
+        CalledProcessError: it fails.
     """
-    if not shutil.which("npm"):
-        sys.exit("error: npm was not found; spark.js is bundled with it (Debian: apt-get install npm)")
     with tempfile.TemporaryDirectory() as folder:
-        shutil.copytree(PLAYER / "spark", folder, dirs_exist_ok=True)
-        modules = Path(folder) / "node_modules"
-        subprocess.run(["npm", "ci", "--ignore-scripts", "--no-fund", "--no-audit"], cwd=folder, check=True)
+        modules = _installed(Path(folder))
         names = ("three", "@sparkjsdev/spark")
         licences = [f"{name}\n\n{(modules / name / 'LICENSE').read_text()}" for name in names]
         banner = "/*! Bundled by `make spark` from:\n\n" + "\n".join(licences) + "*/"
-        command = [modules / ".bin" / "esbuild", "entry.js", "--bundle", "--minify", "--format=esm", "--target=es2022"]
-        command += [f"--banner:js={banner}", "--legal-comments=none", f"--outfile={SPARK}", "--log-level=error"]
-        subprocess.run(command, cwd=folder, check=True)
+        _esbuild(modules, Path(folder) / "entry.js", SPARK, f"--banner:js={banner}", "--legal-comments=none")
     SPARK_HASH.write_text(spark_hashes() + "\n")
-    print(f"{SPARK.name}: {SPARK.stat().st_size / 1000:.0f} kB")
 
 
 def check_committed() -> None:
