@@ -12,6 +12,7 @@ from multiprocessing import get_context
 import cv2  # noqa: F401
 import scipy.spatial  # noqa: F401
 import torch._dynamo  # noqa: F401  (what an optimizer imports; here it is imported once, not in every process)
+from training import AS_SET
 
 from bench.procedural import Scene, write_transforms
 from bench.stress_scenes import walking
@@ -25,7 +26,14 @@ from gscodec.render import sensitivity
 from gscodec.splats import sequence_writer
 from gscodec.train import checkpoint, settings
 
-TINY = {"keyframe_steps": 40, "motion_steps": 8, "finetune_steps": 4, "gaussians_max": 200, "initial_points": 150}
+TINY = {
+    "keyframe_steps": 40,
+    "motion_steps": 8,
+    "finetune_steps": 4,
+    "gaussians_max": 200,
+    "initial_points": 150,
+    "budget": AS_SET,
+}
 
 
 def write_capture(folder, frames=7):

@@ -5,6 +5,7 @@ import signal
 
 import pytest
 from interrupting import write_capture
+from training import AS_SET
 
 from gscodec.capture import open_capture
 from gscodec.encode.encode import StreamOutput, encode_groups, stream_config
@@ -15,7 +16,9 @@ from gscodec.train.settings import TrainSettings
 from gscodec.train.train import train_groups
 
 pytest.importorskip("ray", reason="Ray is not installed (pip install 'gscodec[ray]')")
-TINY = TrainSettings(gop=2, keyframe_steps=40, motion_steps=8, finetune_steps=4, gaussians_max=200, initial_points=150)
+TINY = TrainSettings(
+    gop=2, keyframe_steps=40, motion_steps=8, finetune_steps=4, gaussians_max=200, initial_points=150, budget=AS_SET
+)
 ACCESS = 2
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from training import AS_SET
 
 from bench.procedural import Scene, placed, write_transforms
 from bench.stress_scenes import walking
@@ -15,7 +16,7 @@ from gscodec.train.train import train_groups
 
 HANDHELD, ORBIT = (3.0, 0.06), 2.0
 TINY = TrainSettings(
-    gop=2, keyframe_steps=200, motion_steps=30, finetune_steps=10, gaussians_max=800, initial_points=400
+    gop=2, keyframe_steps=200, motion_steps=30, finetune_steps=10, gaussians_max=800, initial_points=400, budget=AS_SET
 )
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from quantized_groups import assert_same, layered_group, moving_group, predicted_group
 from scipy.spatial import cKDTree
+from training import AS_SET
 
 from bench.articulated import JOINTS, PARENTS, figure, pose, skin, walk, wave, write_rig
 from bench.rig import capture_of
@@ -316,7 +317,14 @@ def test_whole_turns_make_no_jump(tmp_path):
 
 
 TINY = TrainSettings(
-    gop=3, keyframe_steps=150, motion_steps=40, finetune_steps=10, gaussians_max=700, initial_points=500, sh_degree=0
+    gop=3,
+    keyframe_steps=150,
+    motion_steps=40,
+    finetune_steps=10,
+    gaussians_max=700,
+    initial_points=500,
+    sh_degree=0,
+    budget=AS_SET,
 )
 
 

@@ -4,12 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from training import AS_SET
 
 from bench import stress
 from bench.stress_scenes import CASES, SCENES, cut, walking
 from gscodec.render import sensitivity
 
-TINY = {"keyframe_steps": 100, "motion_steps": 20, "finetune_steps": 8, "gaussians_max": 300, "initial_points": 200}
+TINY = {
+    "keyframe_steps": 100,
+    "motion_steps": 20,
+    "finetune_steps": 8,
+    "gaussians_max": 300,
+    "initial_points": 200,
+    "budget": AS_SET,
+}
 SMALL = {"train": 5, "test": 1, "size": 48, "frames": 3}
 
 

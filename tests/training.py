@@ -11,11 +11,19 @@ from gscodec.metrics.image import psnr
 from gscodec.model.camera import Camera, look_at
 from gscodec.model.gaussian_sequence import GaussianSequence
 from gscodec.render.image import render_image, render_rgba
-from gscodec.train.settings import TrainSettings
+from gscodec.train.settings import BudgetSettings, TrainSettings
 
 SIZE = 64
+AS_SET = BudgetSettings(steps_most=1.0)  # as many steps as are set, however small the pictures
 TINY = TrainSettings(
-    gop=3, keyframe_steps=150, motion_steps=60, finetune_steps=10, gaussians_max=600, initial_points=300, sh_degree=1
+    gop=3,
+    keyframe_steps=150,
+    motion_steps=60,
+    finetune_steps=10,
+    gaussians_max=600,
+    initial_points=300,
+    sh_degree=1,
+    budget=AS_SET,
 )
 
 

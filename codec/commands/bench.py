@@ -12,7 +12,7 @@ import typer
 
 from ..errors import UsageError, require
 from .checkout import require_bench
-from .options import Json, Preset, Quality, stdout
+from .options import PRESET, Json, Preset, Quality, stdout
 
 Data = Annotated[Path | None, typer.Option(envvar="GSCODEC_DATA", help="Folder with captures and splats.")]
 Captures = Annotated[Path | None, typer.Option(envvar="GSCODEC_DATA", help="Folder with the captures.")]
@@ -98,7 +98,7 @@ def rd(
 def train(
     capture: Annotated[str | None, typer.Option(help="Comma-separated cases, see bench/train.py.")] = None,
     recipe: Annotated[str | None, typer.Option(help="Comma-separated: gscodec, alone (every frame), v3.")] = None,
-    preset: Preset = "medium",
+    preset: Preset = PRESET,
     frames: Annotated[str | None, typer.Option(metavar="A:B:STEP", help="Only these frames.")] = None,
     quality: Quality = None,
     data: Captures = None,

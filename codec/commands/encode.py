@@ -14,7 +14,19 @@ from ..errors import UsageError
 from ..fingerprint import inputs, program
 from ..model.gaussians import GOP
 from ..progress import Bar
-from .options import Frames, Gop, Motion, Preset, Quality, RandomAccess, RigPath, SequencePath, StreamPath, stdout
+from .options import (
+    PRESET,
+    Frames,
+    Gop,
+    Motion,
+    Preset,
+    Quality,
+    RandomAccess,
+    RigPath,
+    SequencePath,
+    StreamPath,
+    stdout,
+)
 
 if TYPE_CHECKING:
     from ..encode.encode import EncodeReport
@@ -36,7 +48,7 @@ def encode(
     bitrate: Annotated[
         str | None, typer.Option(metavar="RATE", help="Bits per second instead of a quality: 8M, 500k.")
     ] = None,
-    preset: Preset = "medium",
+    preset: Preset = PRESET,
     motion: Motion = "field",
     frames: Frames = None,
     gop: Gop = GOP,

@@ -19,6 +19,7 @@ Gop = Annotated[int, typer.Option(help="Frames in a group at most.")]
 RandomAccess = Annotated[
     int, typer.Option(metavar="N", help="Frames from one independent group to the next at most; 0: no prediction.")
 ]
+PRESET = "medium"  # the usual one
 Preset = Annotated[str, typer.Option(help="Training budget: fast, medium or slow.")]
 Motion = Annotated[
     str, typer.Option(help="What learns the motion: field (hash grid and MLP beside the nodes) or nodes alone.")

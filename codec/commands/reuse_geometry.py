@@ -24,6 +24,7 @@ from ..model.gaussians import GOP
 from ..model.parametric_group import ParametricGroup
 from ..progress import Bar
 from .inputs import open_frames, open_tracks
+from .options import PRESET
 from .sources import TrainOptions, limit_torch_threads
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ def encode_reusing(
 
 def _check(settings: EncodeSettings, options: TrainOptions) -> None:
     """Raises UsageError for options that would change the geometry."""
-    usual = TrainOptions("medium", None, GOP)
+    usual = TrainOptions(PRESET, None, GOP)
     given = {
         "--quality": settings.quality is not None,
         "--bitrate": settings.bitrate is not None,

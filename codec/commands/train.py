@@ -16,7 +16,7 @@ from ..fingerprint import inputs, program, sentence
 from ..model.gaussians import GOP
 from ..progress import Bar
 from .inputs import open_frames
-from .options import Frames, Gop, Motion, Preset, Quality, RandomAccess, RigPath, stdout
+from .options import PRESET, Frames, Gop, Motion, Preset, Quality, RandomAccess, RigPath, stdout
 
 if TYPE_CHECKING:
     from .sources import TrainOptions
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def train(
     capture: Annotated[Path, typer.Argument(metavar="CAPTURE", help="A capture (folder or transforms.json).")],
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the .ply files go.")],
-    preset: Preset = "medium",
+    preset: Preset = PRESET,
     motion: Motion = "field",
     frames: Frames = None,
     gop: Gop = GOP,

@@ -2,7 +2,8 @@
 
 A preset is a price, the same for all scenes: of a dB in bits (below which screen gradient a Gaussian is not split, and
 above which contribution it stays) and in seconds (steps for a small picture). How many Gaussians there are follows from
-what is still wrong in the pictures; a larger picture has more of them to place, and its keyframe gets more steps.
+what is still wrong in the pictures; a larger picture has more of them to place, and its keyframe gets more steps. Very
+small pictures get more steps, too, in every frame, so that as many pixels are seen: a step costs hardly less there.
 """
 
 from __future__ import annotations
@@ -32,22 +33,28 @@ def keyframe_budget(views: Views, frame: int, settings: TrainSettings) -> Budget
     """The budget of the keyframe `frame`."""
     b, covered = settings.budget, _covered(views, frame)
     points = settings.initial_points or int(np.clip(b.points_share * covered, b.points_min, b.points_max))
-    return Budget(points, round(min(_larger(covered, b), b.steps_most) * settings.keyframe_steps))
+    return Budget(points, round(_larger(covered, b) * _smaller(covered, b) * settings.keyframe_steps))
 
 
 def with_frame_budget(settings: TrainSettings, views: Views, frame: int) -> TrainSettings:
     """Settings with the steps of a tracked frame: a large picture has fewer, since each costs more, and all frames of a
     group together refine its Gaussians."""
-    share = 1 / min(_larger(_covered(views, frame), settings.budget), settings.budget.steps_most)
-    fewer = lambda steps: max(1, round(share * steps))  # noqa: E731
-    densification = replace(settings.densification, steps=fewer(settings.densification.steps))
-    frame = {"motion_steps": fewer(settings.motion_steps), "finetune_steps": fewer(settings.finetune_steps)}
+    covered = _covered(views, frame)
+    share = _smaller(covered, settings.budget) / _larger(covered, settings.budget)
+    of_size = lambda steps: max(1, round(share * steps))  # noqa: E731
+    densification = replace(settings.densification, steps=of_size(settings.densification.steps))
+    frame = {"motion_steps": of_size(settings.motion_steps), "finetune_steps": of_size(settings.finetune_steps)}
     return replace(settings, densification=densification, **frame)
 
 
 def _larger(covered: float, settings: BudgetSettings) -> float:
-    """By how much the pictures of a scene are larger than those that a preset's steps are meant for, at least 1."""
-    return max((covered / settings.pixels) ** settings.steps_exponent, 1.0)
+    """Factor of the steps for pictures that are larger than those that a preset's steps are meant for, 1 for others."""
+    return float(np.clip((covered / settings.pixels) ** settings.steps_exponent, 1.0, settings.steps_most))
+
+
+def _smaller(covered: float, settings: BudgetSettings) -> float:
+    """The same for pictures so small that a step costs hardly less; 1 where they show nothing."""
+    return float(np.clip(settings.small_pixels / covered, 1.0, settings.steps_most)) if covered else 1.0
 
 
 def _covered(views: Views, frame: int) -> float:

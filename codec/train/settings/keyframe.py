@@ -88,7 +88,8 @@ class BudgetSettings:
     points_min: int = 4000
     points_max: int = 40_000
     pixels: float = 50_000.0  # that show the scene, for which a preset's steps are meant
-    steps_exponent: float = 0.5  # of the pixels, in the steps
+    small_pixels: float = 12_500.0  # half the side of those: below it a step costs hardly less
+    steps_exponent: float = 0.5  # of the pixels, in the steps of larger pictures
     steps_most: float = 2.5  # times a preset's steps
 
 
