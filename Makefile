@@ -12,7 +12,7 @@ TOOLS := $(CURDIR)/build/tools
 CI_TESTS := $(if $(CI),ci)
 CI_ENV := $(if $(CI),PATH="$(TOOLS)/node_modules/.bin:$$PATH")
 NEON := aarch64-unknown-linux-gnu
-EMULATED := CARGO_PROFILE_RELEASE_LTO=off CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc \
+EMULATED := CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc \
 	CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER="qemu-aarch64 -L /usr/aarch64-linux-gnu"
 APT := apt-get update -qq >/dev/null && DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends
 
@@ -40,7 +40,7 @@ demo: venv
 	@echo "  $(BIN)/gscodec decode $(DEMO)/lumberjack.gsv plys/                   .ply frames for any splat viewer"
 
 test: venv lint browser $(CI_TESTS)
-	$(CARGO) test --release --quiet --workspace --features bindings/wasm
+	$(CARGO) test --profile quick --quiet --workspace --features bindings/wasm
 	$(CI_ENV) $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 # What `make test` does besides where CI is set; there a test that is skipped fails.
@@ -59,7 +59,7 @@ tools: venv
 # The tests of the crates that have NEON or decode, on an emulated processor.
 neon:
 	rustup target add $(NEON)
-	$(CARGO:cargo=)$(EMULATED) cargo test --release --quiet --target $(NEON) -p raster -p gsv
+	$(CARGO:cargo=)$(EMULATED) cargo test --profile quick --quiet --target $(NEON) -p raster -p gsv
 
 # A short run of each fuzz target.
 fuzz: venv
@@ -69,7 +69,7 @@ lint: venv
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(CARGO) fmt --all --check
-	$(CARGO) clippy --release --quiet --workspace --all-targets --features bindings/wasm -- -D warnings
+	$(CARGO) clippy --profile quick --quiet --workspace --all-targets --features bindings/wasm -- -D warnings
 
 format: venv
 	$(BIN)/ruff check --fix .
