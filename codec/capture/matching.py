@@ -19,6 +19,7 @@ from .images import View
 NEIGHBOURS = 2  # cameras that each one is compared with
 RATIO = 0.7  # of the best descriptor distance to the second best: a match is distinct (Lowe 2004)
 INLIER = 0.01  # of the image's width: farther from its epipolar line, a match is wrong whatever the calibration is
+INLIER_PIXELS = 3.0  # at least, four times the error from which poses are learned: else small pictures hide it
 FEATURES = 1500  # of one image at most
 
 
@@ -89,7 +90,7 @@ def _matches(cameras: list[Camera], found: list, a: int, b: int) -> Matches:
     p = points_a[[m.queryIdx for m in pairs]].reshape(-1, 2)
     q = points_b[[m.trainIdx for m in pairs]].reshape(-1, 2)
     distances = _distances(cameras[a], cameras[b], p, q)
-    kept = distances < INLIER * cameras[a].width
+    kept = distances < max(INLIER * cameras[a].width, INLIER_PIXELS)
     return Matches(a, b, p[kept], q[kept], distances[kept])
 
 
