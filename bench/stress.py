@@ -157,7 +157,7 @@ def _converged(capture: Capture, frame: int, settings):
     from gscodec.metrics.evaluate import evaluate_capture
 
     part, best = train.part(capture, range(frame, frame + 1)), None
-    settings = replace(settings, budget=replace(settings.budget, small_pixels=0.0))  # FACTORS is what small ones get
+    settings = replace(settings, budget=replace(settings.budget, small_pixels=0.0))  # FACTORS alone says how many
     for factor in FACTORS:
         longer = replace(settings, keyframe_steps=factor * settings.keyframe_steps)
         (alone,), _ = train.every_frame_alone(capture, [frame], longer)

@@ -3,9 +3,8 @@
 import os
 import signal
 
+import interrupting
 import pytest
-from interrupting import write_capture
-from training import AS_SET
 
 from gscodec.capture import open_capture
 from gscodec.encode.encode import StreamOutput, encode_groups, stream_config
@@ -16,16 +15,14 @@ from gscodec.train.settings import TrainSettings
 from gscodec.train.train import train_groups
 
 pytest.importorskip("ray", reason="Ray is not installed (pip install 'gscodec[ray]')")
-TINY = TrainSettings(
-    gop=2, keyframe_steps=40, motion_steps=8, finetune_steps=4, gaussians_max=200, initial_points=150, budget=AS_SET
-)
+TINY = TrainSettings(gop=2, **interrupting.TINY)
 ACCESS = 2
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("walking")
-    write_capture(folder, frames=5)
+    interrupting.write_capture(folder, frames=5)
     return folder
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import training
 from quantized_groups import assert_same, layered_group, moving_group, predicted_group
 from scipy.spatial import cKDTree
-from training import AS_SET
 
 from bench.articulated import JOINTS, PARENTS, figure, pose, skin, walk, wave, write_rig
 from bench.rig import capture_of
@@ -31,7 +31,6 @@ from gscodec.model.rotations import quat_to_matrix, quat_to_rotvec, rotvec_to_qu
 from gscodec.model.skin_weights import integer_weights, skin_weights
 from gscodec.splats import write_sequence
 from gscodec.splats.parametric_file import from_arrays, to_arrays
-from gscodec.train.settings import TrainSettings
 from gscodec.train.train import train_groups
 
 LEVEL, FRAMES, GOP = 1, 12, 6
@@ -316,16 +315,7 @@ def test_whole_turns_make_no_jump(tmp_path):
     np.testing.assert_allclose(read_rig(tmp_path / "turns.npz").poses, poses, atol=1e-4)
 
 
-TINY = TrainSettings(
-    gop=3,
-    keyframe_steps=150,
-    motion_steps=40,
-    finetune_steps=10,
-    gaussians_max=700,
-    initial_points=500,
-    sh_degree=0,
-    budget=AS_SET,
-)
+TINY = replace(training.TINY, motion_steps=40, gaussians_max=700, initial_points=500, sh_degree=0)
 
 
 @pytest.fixture(scope="module")
