@@ -1,9 +1,9 @@
 """Stress test: each case of stress_scenes.py, trained as a sequence and with frames alone, both coded and decoded.
 
 bench/results/stress.json has one entry per case. PSNR is that of the subject on the test cameras, over the frames that
-show it; all of it is of decoded streams, the two of which are coded at the same quality. The frames alone have the
-Gaussians of the preset, and as many steps as it takes until twice as many gain less than `CONVERGED_DB`. `lost` is
-their PSNR minus that of the sequence. `verdict` is "fails" on
+show it; all of it is of decoded streams, coded as `gscodec encode` does where no quality is named. The frames alone
+have the Gaussians of the preset, and as many steps as it takes until twice as many gain less than `CONVERGED_DB`.
+`lost` is their PSNR minus that of the sequence. `verdict` is "fails" on
   - a crash, a value that is not finite, or more Gaussians than the budget allows,
   - a mean PSNR below the floor of the case, or a frame more than `FRAME_DB` below the floor,
   - `lost` above `ALLOWED_DB` in the mean, or above `ALLOWED_FRAME_DB` in a frame,
@@ -24,13 +24,14 @@ from gscodec.capture import Capture
 from gscodec.encode.settings import EncodeSettings
 from gscodec.errors import UsageError
 from gscodec.model.gaussians import Gaussians
+from gscodec.train.settings import LOSS, train_settings
 
 from . import train
 from .machine import update_entries
 from .stress_scenes import CASES, Stress
 
 PRESET = "fast"
-QUALITY = 50.0
+ENCODING = EncodeSettings(loss=LOSS[PRESET])
 BUDGET = {"gaussians_max": 3750, "initial_points": 2000}  # for pictures of 128 x 128
 BUDGETS = {  # case -> changes of the budget
     "300 frames": {
@@ -95,15 +96,13 @@ def verdict(found: dict, case: Stress) -> str:
 
 def compare(capture: Capture, **budget) -> dict:
     """Results of one capture; `budget`: changes of the training settings."""
-    from gscodec.train.settings import train_settings
-
-    settings = train_settings(PRESET, QUALITY, **budget)
+    settings = train_settings(PRESET, **budget)
     for camera in range(len(capture.cameras)):  # traced and cached here, so that training is timed without it
         for t in range(capture.frame_count):
             capture.view(camera, t)
     groups, seconds = train.sequence(capture, settings)
     models = train.shown(groups)
-    size, decoded, *_ = train.coded(capture, groups, settings, EncodeSettings(QUALITY))
+    size, decoded, _, report = train.coded(capture, groups, settings, ENCODING)
     ours, trained = train.evaluate(capture, decoded), train.evaluate(capture, models)
     there = [t for t in range(capture.frame_count) if _subject(capture, t)]
     keyframes = sum(g.parents is None for g in groups)
@@ -111,6 +110,7 @@ def compare(capture: Capture, **budget) -> dict:
         "psnr_fg": _mean(ours, there),
         "psnr_fg_worst": min((ours["per_frame"][t]["psnr_fg"] for t in there), default=None),
         "psnr_fg_uncoded": _mean(trained, there),
+        "quality": report.quality,
         **_alone(capture, ours, there, settings),
         "haze": ours.get("haze"),
         "haze_most": max(r["haze"] for r in ours["per_frame"]),
@@ -135,7 +135,7 @@ def _alone(capture: Capture, ours: dict, there: list[int], settings) -> dict:
     settings = _converged(capture, next((t for t in chosen if t in there), chosen[0]), settings)
     alone, seconds = train.every_frame_alone(capture, chosen, settings)
     part = train.part(capture, chosen)
-    size, decoded, *_ = train.coded(part, alone, settings, EncodeSettings(QUALITY))
+    size, decoded, *_ = train.coded(part, alone, settings, ENCODING)
     theirs = train.evaluate(part, decoded)
     both = [(t, i) for i, t in enumerate(chosen) if t in there]
     lost = [theirs["per_frame"][i]["psnr_fg"] - ours["per_frame"][t]["psnr_fg"] for t, i in both]
