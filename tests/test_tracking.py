@@ -152,7 +152,7 @@ def test_masks_say_where_nothing_is():
     group = GroupModel(tracker.graph, None, models, poses, steps_for(50, 1.0), torch.zeros(200, dtype=torch.bool), TINY)
     end = group.group(None).lifetimes[:, 1]
     assert (end[:100] == 2).all(), "what is left lives in frames 0 and 1"
-    assert (end[100:] == 1).sum() > 70, "what is gone ends, but for some at its rim"
+    assert (end[100:] == 1).sum() > 60, "what is gone ends, but for some at its rim"
     assert set(end) == {1, 2}
 
 

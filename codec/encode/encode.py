@@ -175,15 +175,18 @@ def _code_all(groups: Iterable[ParametricGroup], coder: GroupCoder, writer: Stre
         if coder.settings.bitrate:
             start = QUALITY_DEFAULT if quality is None else quality
             coded, state, quality = code_at_rate(coder, state, group, (writer.frames, writer.bytes, start))
+            report.quality = quality
         else:
             importance = coder.measure(group, writer.frames)
             if quality is None and coder.has_pictures(group):
-                quality, report.chosen_quality = choose_quality(coder, group, importance, writer.frames), True
-            quality = QUALITY_DEFAULT if quality is None else quality
-            coded, state = coder.code(state, group, importance, quality, writer.frames)
-        report.quality, report.loss = quality, coder.settings.loss
+                quality = choose_quality(coder, group, importance, writer.frames)
+                report.chosen_quality = quality is not None
+            report.quality = QUALITY_DEFAULT if quality is None else quality
+            coded, state = coder.code(state, group, importance, report.quality, writer.frames)
+        report.loss = coder.settings.loss
         report.seconds["code"] += clock() - mark
-        kept = {"quality": np.array(quality)} | (state.to_arrays() if state else {})
+        kept = {} if quality is None else {"quality": np.array(quality)}
+        kept |= state.to_arrays() if state else {}
         writer.append(coded.payload, len(group), sync=coded.independent, state=kept)
         _account(report, writer, coded, group)
         if on_group:

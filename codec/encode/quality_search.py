@@ -5,7 +5,7 @@ that of a try over that of the model before coding, or over that of very fine st
 the pictures lowers the error of fine steps below the model's, and would hide what coarse ones cost. The log of the
 excess falls with the quality: by that of 4 for `QUALITY_HALVES` points as a first guess (refined steps lose less), and
 between two tries on either side along their line. A try is refined by a share of the pictures that the group will be
-refined by in the end, and the first group decides for all.
+refined by in the end, and the first group that shows something decides for all.
 """
 
 from __future__ import annotations
@@ -22,13 +22,16 @@ from .adaptive_rounding import AdaptiveRounding
 from .coder import GroupCoder
 
 
-def choose_quality(coder: GroupCoder, group: ParametricGroup, importance: Importance, first_frame: int) -> float:
-    """Quality for a stream whose first group is `group`, which has pictures (`GroupCoder.has_pictures`).
+def choose_quality(coder: GroupCoder, group: ParametricGroup, importance: Importance, first_frame: int) -> float | None:
+    """Quality for a stream whose first group is `group`, which has pictures (`GroupCoder.has_pictures`); None: it has
+    no Gaussians, and tells nothing.
 
     Raises:
         CaptureError: a picture cannot be read.
     """
     s = coder.settings.quality_search
+    if not len(coder.quantized(group, importance, s.finest).integers):
+        return None
     wanted = 10 ** (coder.settings.loss / 10) - 1
     least = min(_errors(coder, group, importance, s.finest, first_frame))
     tried: dict[float, float] = {}  # quality -> log of the excess over the wanted one

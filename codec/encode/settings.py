@@ -43,13 +43,13 @@ class CompandingSettings:
     """Curves of log_scales and logit_opacities (companding.py).
 
     Attributes:
-        least: Gaussians from which sensitivity by value is known well enough to save anything.
+        least: Gaussians from which the curves save more than they take.
         bins: of the histogram of values; tails: percentiles between which they lie.
         steepest: how much coarser a piece may be than where the picture is most sensitive.
         prior: Gaussians of mean sensitivity that each bin counts besides its own.
     """
 
-    least: int = 16000
+    least: int = 2000
     bins: int = 24
     tails: tuple[float, float] = (0.2, 99.8)
     steepest: float = 32.0

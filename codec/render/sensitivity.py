@@ -9,6 +9,7 @@ are not those by which `gscodec eval` judges.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
@@ -141,8 +142,10 @@ def _by_channels(g: Gaussians, grads: dict, name: str) -> np.ndarray:
         own = [[-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]]  # q i, q j, q k
         return np.einsum("kcn,nc->nk", np.stack(own if name == "quats" else scene), grads["quats"])
     if name in ("sh0", "shN"):
-        return (grads[name] @ TO_RGB.astype(np.float32)).reshape(len(g), -1)
-    return grads[name].reshape(len(g), -1)
+        grad = grads[name] @ TO_RGB.astype(np.float32)
+    else:
+        grad = grads[name]
+    return grad.reshape(len(g), math.prod(grad.shape[1:]))
 
 
 def steps_for_error(
