@@ -33,6 +33,27 @@ def test_light_that_comes_on_ends_a_group_and_not_the_subject():
     assert min(psnr_of(g, capture, 5) for g in map(second.frame, range(len(second)))) > still - 2
 
 
+def test_a_frame_is_as_sharp_where_the_others_are_empty():
+    """Empty frames say nothing about what a Gaussian is worth, how fine its steps are, or that tracking went well."""
+    whole = blob(200)
+    none = whole.take(np.zeros(0, int))
+    settings = dataclasses.replace(TINY, keyframe_steps=200, finetune_steps=30)
+
+    def trained(*frames):
+        capture = capture_of(GaussianSequence(25.0, [DenseGroup([g]) for g in frames]))
+        groups = list(train_groups(capture, settings))
+        models = [g.frame(t) for g in groups for t in range(len(g))]
+        return [psnr_of(models[t], capture, t) for t in range(3) if len(frames[t])], [len(g) for g in groups]
+
+    (least, *_), _ = trained(whole, whole, whole)
+    (gone,), lengths = trained(whole, none, none)
+    assert lengths == [3]
+    assert gone > least - 1
+    come, lengths = trained(none, whole, whole)
+    assert lengths == [1, 2]
+    assert min(come) > least - 1
+
+
 def test_groups_come_out_whole_and_a_stopped_run_goes_on(capture, tmp_path):
     done = []
     groups = []

@@ -19,7 +19,8 @@ GOLDEN = (5**0.5 - 1) / 2  # steps of this share of a range visit it evenly, in 
 
 def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanSettings) -> Importance:
     """Importance of the N Gaussians, from the first, the middle and the last frame. Where Gaussians come and go, every
-    frame is seen, in a capture by one of its cameras and by another one: what lives in one frame shows in few views.
+    frame that shows some is seen, in a capture by one of its cameras and by another one: what lives in one frame shows
+    in few views.
 
     Args:
         cameras: from which the subject was captured, if it was.
@@ -34,7 +35,8 @@ def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanS
     views = settings.more_views if frames == 1 or len(g) <= settings.few else settings.views
     if group.lifetimes is not None:
         each = 2 if cameras else 1
-        times = _spread(frames, max(views, each * frames) // each)
+        living = _living(group.lifetimes, frames)
+        times = [living[i] for i in _spread(len(living), max(views, each * len(living)) // each)]
         some = [cameras[i] for i in _spread(len(cameras), len(times))] if cameras else []
         return measure(lambda i: _shown(group, times[i % len(times)]), around, some, each * len(times))
     return measure(lambda i: few[i % len(few)], around, cameras, views)
@@ -44,6 +46,12 @@ def _spread(items: int, count: int) -> list[int]:
     """`count` of so many items; each comes once before any comes again, where `count` is a multiple of `items`."""
     order = np.argsort([(i + 0.5) * GOLDEN % 1 for i in range(items)]).tolist()
     return [order[i % items] for i in range(count)]
+
+
+def _living(lifetimes: np.ndarray, frames: int) -> list[int]:
+    """Frames that show something; all of them if none does."""
+    shown = [t for t in range(frames) if ((lifetimes[:, 0] <= t) & (t < lifetimes[:, 1])).any()]
+    return shown or list(range(frames))
 
 
 def _shown(group: ParametricGroup, t: int) -> Gaussians:

@@ -106,7 +106,7 @@ class _Finetuner:
         if stats.views < self.settings.finetune.topology_views * len(self.views.train_cameras):
             return
         opacities = torch.sigmoid(group.key.params["logit_opacities"])
-        contribution = stats.contribution(opacities)
+        contribution = stats.contribution(opacities) / self._drawn_share()  # to the views that could show it
         keep = contribution >= k.contribution_min
         keep &= stats.max_weight > k.prune_weight
         keep[: group.known] = True
@@ -123,6 +123,12 @@ class _Finetuner:
             self.coefficients.select(keep.numpy())
         self.statistics = Statistics(len(group.key), k.mse_min)
         self._draw_canonical()
+
+    def _drawn_share(self) -> torch.Tensor:
+        """[N], how much of what is drawn each Gaussian lives in."""
+        often = torch.bincount(torch.tensor(_round_of_frames(self.group.frames))).float()
+        until = torch.cat([torch.zeros(1), often.cumsum(0)])
+        return (until[self.group.end] - until[self.group.start]) / until[-1]
 
     def _draw_canonical(self) -> None:
         """The noise and the bits of the canonical Gaussians, held for some steps."""
@@ -205,11 +211,16 @@ def finetune(
     order: list[int] = []
     larger = settings.finetune.views**0.5  # rates, since the gradient of several views has less noise
     for step in range(steps):
-        # The first and the last frame come twice: they have neighbours on one side only.
-        order = order or run.rng.permutation([0, *range(len(frames)), len(frames) - 1]).tolist()
+        order = order or run.rng.permutation(_round_of_frames(len(frames))).tolist()
         if step == round(settings.finetune.topology_at * steps):
             run.change_topology()
         loss = run.step(order.pop(), larger * settings.finetune.rate_decay ** (step / steps))
         for _ in range(settings.finetune.views if on_step else 0):
             on_step(step, loss)
     run.finish()
+
+
+def _round_of_frames(frames: int) -> list[int]:
+    """The frames of a group, in each round of steps. The first and the last one come twice: they have neighbours on one
+    side only."""
+    return [0, *range(frames), frames - 1]

@@ -122,15 +122,14 @@ class Tracker:
 
         Returns:
             Image loss at the end, without the mask term. None: nothing has changed, or no Gaussian is left and no pixel
-            needs one. Infinity: no Gaussian is left, and pixels change.
+            needs one. Infinity: no Gaussian is left, and pixels need some.
         """
         if self.rig is not None:
             self.pose = self.rig.step(self.pose, self.graph, frame)
         self.moving = torch.from_numpy(self._moving(frame))
         self.screen_gradient = torch.zeros(len(self.own))
-        changed = any(m.any() for m in self.masks)
         if not self.alive.any():
-            return np.inf if changed else None
+            return self._missing(frame)
         if self.moving.any():
             self._relocalize(frame)
             found = search(self, frame)
@@ -142,7 +141,19 @@ class Tracker:
         faded = torch.sigmoid(self.own.params["logit_opacities"]) < self.settings.keyframe.prune_opacity
         outside = self.changes.outside(frame, self.model.params["means"].numpy())
         self._remove(torch.from_numpy(outside) | (self.moving & faded))
-        return self.loss if changed and self.alive.any() else None
+        if not self.alive.any():
+            return self._missing(frame)
+        return self.loss if self._changed else None
+
+    @property
+    def _changed(self) -> bool:
+        """Whether the last frame differs from the one before."""
+        return any(m.any() for m in self.masks)
+
+    def _missing(self, frame: int) -> float | None:
+        """`advance` where no Gaussian is left."""
+        seen = (self.views.view(camera, frame).alpha for camera in self.views.train_cameras)
+        return np.inf if self._changed and any(alpha is None or alpha.any() for alpha in seen) else None
 
     def _fit(self, frame: int, on_step: OnStep, searched: bool) -> None:
         """Rounds of `motion_steps`, until the loss is near that of the frame before or falls no more. Stiff ones come

@@ -26,7 +26,7 @@ from .finetune import GroupModel
 from .initialization import initial_model
 from .joint_optimization import finetune
 from .keyframe import train_keyframe
-from .model import Model
+from .model import REMOVED_LOGIT, Model
 from .settings import TrainSettings
 from .subject import Subject
 from .tracking import Tracker
@@ -203,9 +203,9 @@ class _Run:
         """The fine-tuned model of a group."""
         quality = self.settings.quality
         if subject.steps is None:
-            middle = len(frames) // 2
-            cameras = [self.capture.camera(i, frames[middle]) for i in self.views.train_cameras]
-            nominal, g = steps_for(quality, subject.radius), track.models[middle].gaussians()
+            t = track.fullest()
+            cameras = [self.capture.camera(i, frames[t]) for i in self.views.train_cameras]
+            nominal, g = steps_for(quality, subject.radius), track.models[t].gaussians()
             subject.steps = measured_steps(g, quality, nominal, cameras, backend=self.views.backend)
         graph, steps = subject.tracker.graph, subject.steps
         model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), self.settings)
@@ -227,6 +227,11 @@ class _TrackedFrames:
         self.models.append(tracker.model)
         self.poses.append(tracker.pose)
         self.moving.append(tracker.moving)
+
+    def fullest(self) -> int:
+        """The frame in which most Gaussians live; of several the one nearest to the middle."""
+        living = [int((m.params["logit_opacities"] > REMOVED_LOGIT).sum()) for m in self.models]
+        return max(range(len(living)), key=lambda t: (living[t], -abs(t - len(living) // 2)))
 
     def moved(self) -> torch.Tensor:
         """Gaussians that have moved in any frame, [N] bool."""
