@@ -38,6 +38,7 @@ ENDED = {  # ParametricGroup.ended
     "cut": "it cannot be tracked",
     "drift": "tracking had come too far from the keyframe",
     "change": "much that stood still begins to change",
+    "empty": "nothing was seen until then",
 }
 
 
@@ -118,9 +119,10 @@ def encode(
 
 def _print_stream(out: Path | str, result: EncodeReport) -> None:
     r = result.to_json()
+    per_gaussian = r["bits_per_gaussian_frame"]
     stdout.print(
-        f"{out}: {r['frames']} frames, {r['gaussians']} Gaussians, {r['bytes']} bytes, "
-        f"{r['kb_per_frame']:.2f} kB/frame, {r['bits_per_gaussian_frame']:.2f} bits per Gaussian and frame"
+        f"{out}: {r['frames']} frames, {r['gaussians']} Gaussians, {r['bytes']} bytes, {r['kb_per_frame']:.2f} kB/frame"
+        + ("" if per_gaussian is None else f", {per_gaussian:.2f} bits per Gaussian and frame")
     )
     first, later = result.group_rates()
     if first and later:

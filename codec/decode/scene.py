@@ -165,8 +165,7 @@ def _joined(parts: list[Gaussians]) -> Gaussians:
     """One set out of several, whose SH degrees may differ."""
     most = max((p.shN.shape[1] for p in parts), default=0)
     if not parts:
-        empty = [np.zeros((0, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (3,), (0, 3))]
-        return Gaussians(*empty)
+        return Gaussians.none()
     widths = [((0, 0), (0, most - p.shN.shape[1]), (0, 0)) for p in parts]
     return concatenate([replace(p, shN=np.pad(p.shN, w)) for p, w in zip(parts, widths, strict=True)])
 

@@ -56,7 +56,7 @@ class EncodeReport:
         return {
             **self.__dict__,
             "kb_per_frame": self.bytes / frames / 1000,
-            "bits_per_gaussian_frame": 8 * self.bytes / frames / max(self.gaussians, 1),
+            "bits_per_gaussian_frame": 8 * self.bytes / frames / self.gaussians if self.gaussians else None,
         }
 
 

@@ -39,6 +39,11 @@ class Gaussians:
     sh0: np.ndarray
     shN: np.ndarray
 
+    @staticmethod
+    def none() -> Gaussians:
+        """No Gaussians, of SH degree 0."""
+        return Gaussians(*(np.zeros((0, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (3,), (0, 3))))
+
     def __len__(self) -> int:
         return len(self.means)
 

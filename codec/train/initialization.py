@@ -36,13 +36,10 @@ def initial_model(
         look: (camera, frame) -> its picture, from a cache; None: `capture.view`.
 
     Raises:
-        CaptureError: there is no training camera, or no point is seen by two of them.
+        CaptureError: no point is seen by two training cameras.
     """
-    cameras = capture.indices("train")
-    if not cameras:
-        raise CaptureError(f"{capture.name}: no training camera, expected at least one with split 'train'")
     s, look = settings.initialization, look or capture.view
-    pictures = {camera: look(camera, frame) for camera in cameras}
+    pictures = {camera: look(camera, frame) for camera in capture.indices("train")}
     views = [(capture.camera(i, frame), v.rgb, v.alpha) for i, v in pictures.items()]
     depths = [v.depth if s.use_depth else None for v in pictures.values()]
     known = [c for c, _, _ in views]

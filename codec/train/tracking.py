@@ -152,8 +152,7 @@ class Tracker:
 
     def _missing(self, frame: int) -> float | None:
         """`advance` where no Gaussian is left."""
-        seen = (self.views.view(camera, frame).alpha for camera in self.views.train_cameras)
-        return np.inf if self._changed and any(alpha is None or alpha.any() for alpha in seen) else None
+        return np.inf if self._changed and self.views.show(frame) else None
 
     def _fit(self, frame: int, on_step: OnStep, searched: bool) -> None:
         """Rounds of `motion_steps`, until the loss is near that of the frame before or falls no more. Stiff ones come

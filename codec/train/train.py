@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from ..bitstream.quantization import steps_for
+from ..model.gaussians import Gaussians
 from ..model.parametric_group import ParametricGroup
 from ..model.rig import Rig
 from ..render.backend import Backend
@@ -65,8 +67,8 @@ def train_groups(
     A group continues the Gaussians of the one before (`parents`). It ends before a frame whose image loss is
     `cut_ratio` times that of the frame before, or `drift_ratio` times that of the keyframe, and the next group starts
     with a keyframe. It also ends before a frame in which a large fraction of the Gaussians begins to change; then the
-    next group continues. Every segment of `random_access` frames starts with a keyframe: a segment depends on no frames
-    but its own.
+    next group continues. Frames without a subject, until a camera sees something, are a group without Gaussians. Every
+    segment of `random_access` frames starts with a keyframe: a segment depends on no frames but its own.
 
     Args:
         first_frame: where an earlier run stopped, the first frame of a group.
@@ -144,6 +146,11 @@ class _Run:
         ended = "" if self.subject is None else self._track(frames, track)
         parents = self.subject.parents if track.models else None
         if parents is None:  # no Gaussians to track, or cut at once
+            empty = len(list(takewhile(lambda frame: not self.views.show(frame), frames)))
+            if empty:
+                self.subject = None
+                ended = "empty" if empty < len(frames) else ""
+                return ParametricGroup(empty, Gaussians.none(), rate_optimized=False, ended=ended)
             self.subject = self._keyframe(frames)
             track.add(self.subject.tracker)
             ended = self._track(frames[1:], track)

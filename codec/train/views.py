@@ -14,6 +14,7 @@ import numpy as np
 
 from ..capture import View, cropped
 from ..capture.epipolar import epipolar_error
+from ..errors import CaptureError
 from ..model.camera import Calibration, Camera
 from ..model.gaussians import Gaussians
 from ..render.backend import Backend, Crop, PendingLoss, RenderLoss
@@ -56,11 +57,16 @@ class Views:
     Attributes:
         train_cameras: indices of the training cameras in the capture.
         exposure, extrinsics: corrections of each camera.
+
+    Raises:
+        CaptureError: there is no training camera.
     """
 
     def __init__(self, capture, settings: TrainSettings, backend: Backend):
         self.capture, self.backend = capture, backend
         self.train_cameras = capture.indices("train")
+        if not self.train_cameras:
+            raise CaptureError(f"{capture.name}: no training camera, expected at least one with split 'train'")
         self.exposure = Exposure(len(capture.cameras), self.train_cameras, settings, backend)
         self.extrinsics = Extrinsics(len(capture.cameras), self.train_cameras, settings, backend)
         self._seed, self._cache_bytes = settings.seed, settings.cache_bytes
@@ -79,6 +85,11 @@ class Views:
     def view(self, camera: int, frame: int) -> View:
         """Image of camera `camera` at `frame` as the capture gives it."""
         return self._cached((camera, frame), lambda: self.capture.view(camera, frame))
+
+    def show(self, frame: int) -> bool:
+        """Whether a training camera sees something at `frame`: always, where there are no masks."""
+        seen = (self.view(camera, frame).alpha for camera in self.train_cameras)
+        return any(alpha is None or alpha.any() for alpha in seen)
 
     def target(self, camera: int, frame: int, scale: float = 1.0) -> Target:
         """View of camera `camera` at `frame`, cropped to the subject; `scale` (at most 1) times its size."""
@@ -129,8 +140,8 @@ class Views:
         self.exposure.reset()
         if self._poses_learn is None:
             error = epipolar_error(self.capture, frame, self.train_cameras, lambda i: self.view(i, frame))
-            self._poses_learn = error is not None and error > self._pose_error_min
-        self.extrinsics.learns = self._poses_learn
+            self._poses_learn = None if error is None else error > self._pose_error_min
+        self.extrinsics.learns = bool(self._poses_learn)
         self.extrinsics.reset()
         self.extrinsics.set_subject(center, radius)
 
