@@ -116,7 +116,8 @@ class _Run:
     def __init__(self, capture, settings: TrainSettings, backend: Backend, on_progress, rig: Rig | None):
         self.capture, self.on_progress, self.rig = capture, on_progress, rig
         self.views = Views(capture, settings, backend)
-        self.settings = with_frame_budget(settings if capture.has_alpha else settings.of_room(), self.views, 0)
+        first = next((t for t in range(capture.frame_count) if self.views.show(t)), 0)  # the same in every segment
+        self.settings = with_frame_budget(settings if capture.has_alpha else settings.of_room(), self.views, first)
         self.progress = Progress(0)
         self.subject: Subject | None = None
 
