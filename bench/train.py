@@ -171,7 +171,7 @@ def measure(run: Run, data: Path) -> Iterator[dict]:
             "seconds_per_frame": round(seconds / len(chosen), 2),
             **{k: result[k] for k in KEYS},
             "kb_per_frame": size / 1000 / len(chosen) if size else None,
-            "psnr_of_frame": [round(r["psnr_fg"], 2) for r in result["per_frame"]],
+            "psnr_of_frame": [r["psnr_fg"] and round(r["psnr_fg"], 2) for r in result["per_frame"]],
             "flicker_of_frame": [r["flicker"] and round(r["flicker"], 3) for r in result["per_frame"]],
             **dict(*more),
         }

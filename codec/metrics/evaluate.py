@@ -79,9 +79,9 @@ def evaluate_capture(
         progress: called with (images done, images).
 
     Returns:
-        frames, gaussians (mean per frame), bytes, kb_per_frame, bits_per_gaussian_frame, psnr, psnr_fg, psnr_corrected
-        (of the subject, after a gain and an offset for each view and channel), ssim, haze (8-bit levels), vmaf,
-        vmaf_crop (one per camera), flicker (8-bit levels), stability (dB), per_frame,
+        frames, gaussians (mean per frame), bytes, kb_per_frame, bits_per_gaussian_frame, psnr, psnr_fg (of the subject,
+        over the pictures that show it), psnr_corrected (the same after a gain and an offset for each view and channel),
+        ssim, haze (8-bit levels), vmaf, vmaf_crop (one per camera), flicker (8-bit levels), stability (dB), per_frame,
         views, split.
 
     Raises:
@@ -117,13 +117,14 @@ def _compare(g: Gaussians, camera: Camera, view: View, temporal: TemporalMeter, 
 
     reference, image = composite(view, BACKGROUND), render_image(g, camera, background=BACKGROUND)
     inside = None if view.alpha is None else foreground(view.alpha)
+    shown = inside is None or inside.any()
     flicker = temporal.add(reference, image, inside)
     if vmaf:
         vmaf.add(reference, image, view.alpha)
     return {
         "psnr": psnr(reference, image),
-        "psnr_fg": psnr(reference, image, inside),
-        "psnr_corrected": psnr_corrected(reference, image, inside),
+        "psnr_fg": psnr(reference, image, inside) if shown else None,
+        "psnr_corrected": psnr_corrected(reference, image, inside) if shown else None,
         "ssim": ssim(reference, image),
         "haze": haze(reference, image, view.alpha),
         "flicker": flicker,
