@@ -4,6 +4,7 @@ import json
 import sys
 import types
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -285,6 +286,17 @@ def test_evaluate_capture(alpha):
     assert report["flicker"] > 0.5
     assert (report["haze"], report["views"], report["vmaf"], report["codec_psnr"]) == (0, ["c1"], None, None)
     assert seen[-1] == (6, 6)
+
+
+@pytest.mark.usefixtures("stub")
+def test_frames_without_the_subject_have_no_psnr_of_it():
+    capture = capture_of(100)
+    empty = replace(
+        capture, read=lambda i, t: replace(capture.read(i, t), alpha=np.full((64, 64), 255 * (t < 3), np.uint8))
+    )
+    report = evaluate_capture(lambda t: gaussians(level=110), empty, with_vmaf=False)
+    assert [r["psnr_fg"] is None for r in report["per_frame"]] == [False] * 3 + [True] * 3
+    assert report["psnr_fg"] == report["per_frame"][0]["psnr_fg"]
 
 
 @pytest.mark.usefixtures("stub")
