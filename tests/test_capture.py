@@ -72,6 +72,19 @@ def test_reads_cameras_frames_and_alpha(rig):
     np.testing.assert_array_equal(np.dstack([view.rgb, view.alpha]), pixels(1, 1))
 
 
+@pytest.mark.parametrize("masked", [[], [1]])
+def test_an_alpha_channel_without_masks_says_nothing(rig, masked):
+    """Many tools write one: all of it would pass for the subject."""
+    folder, _, save = rig
+    for k in {0, 1, 2} - {*masked}:
+        opaque = pixels(k, 0)
+        opaque[..., 3] = 255
+        write_image(folder / f"images/cam{k}/000.png", opaque)
+    capture = save()
+    assert capture.has_alpha == bool(masked)
+    assert (capture.view(1, 1).alpha is not None) == bool(masked)
+
+
 def test_pose_becomes_opencv_world_to_camera(rig):
     camera = rig[2]().cameras[1]
     expected = look_at((3 * np.cos(1), 3 * np.sin(1), 1), (0, 0, 0), (0, 0, 1))

@@ -44,7 +44,7 @@ class Feed:
         path: of the video or the first image.
         masks: the mask file of each frame, empty where there are none.
         width, height: of the video or the first image; later images are checked against the camera.
-        has_alpha: views have an alpha channel, of their own or from masks.
+        has_alpha: views have an alpha channel, of their own or from masks; False drops their own.
 
     Raises:
         CaptureError: an image is missing or not readable, or only some frames have masks or depth images.
@@ -96,7 +96,19 @@ class Feed:
 
     def picture(self, t: int) -> View:
         """Frame `t` as it was recorded, without the mask of a file."""
-        return View(self._source.frame(t)) if isinstance(self._source, Video) else read_image(self._source[t])
+        if isinstance(self._source, Video):
+            return View(self._source.frame(t))
+        view = read_image(self._source[t])
+        return view if self.has_alpha else replace(view, alpha=None)
+
+    def opaque(self) -> bool:
+        """Whether the first picture has an alpha channel, of its own, that says nothing."""
+        if self.masks or not self.has_alpha:
+            return False
+        try:
+            return bool((self.picture(0).alpha == 255).all())
+        except CaptureError:  # whoever needs the picture says so
+            return False
 
     def name(self, t: int) -> Path:
         """The file that has frame `t`."""
@@ -158,6 +170,9 @@ def assemble(
     def poses(index: int, frame: int) -> Camera:
         return _at(pinholes[index], frame)
 
+    if all(f.opaque() for f in feeds):  # many tools write an alpha channel without masks
+        for feed in feeds:
+            feed.has_alpha = False
     alpha = any(f.has_alpha for f in feeds)
     moving = any(len(track) > 1 for track in tracks)
     cameras = [track[0] for track in pinholes]
