@@ -147,11 +147,9 @@ class _Run:
         ended = "" if self.subject is None else self._track(frames, track)
         parents = self.subject.parents if track.models else None
         if parents is None:  # no Gaussians to track, or cut at once
-            empty = len(list(takewhile(lambda frame: not self.views.show(frame), frames)))
-            if empty:
-                self.subject = None
-                ended = "empty" if empty < len(frames) else ""
-                return ParametricGroup(empty, Gaussians.none(), rate_optimized=False, ended=ended)
+            self.subject = None
+            if empty := len(list(takewhile(lambda frame: not self.views.show(frame), frames))):
+                return ParametricGroup(empty, Gaussians.none(), ended="empty" if empty < len(frames) else "")
             self.subject = self._keyframe(frames)
             track.add(self.subject.tracker)
             ended = self._track(frames[1:], track)
