@@ -14,7 +14,7 @@ CI_TESTS := $(if $(CI),tools neon fuzz committed)
 CI_ENV := $(if $(CI),PATH="$(TOOLS)/node_modules/.bin:$$PATH")
 ifdef CI
 EXTRAS := encode,charts,bench,dev,ray
-MAKEFLAGS += --jobs=2 --output-sync=target
+MAKEFLAGS += --jobs=2
 else
 EXTRAS := encode,charts,bench,dev
 endif

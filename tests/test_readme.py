@@ -61,6 +61,16 @@ def test_table_of_training():
         assert all(map(agrees, figures, values)), (name, preset, figures, values)
 
 
+def test_table_of_stress():
+    found, table = {e["case"]: e for e in result("stress")["entries"]}, rows("stress case")
+    assert {name for name, *_ in table} == set(found)
+    keys = ("psnr_fg", "psnr_fg_alone", "psnr_fg_worst", "floor", "kb_per_frame", "kb_per_frame_alone", "keyframes")
+    for name, *figures, verdict in table:
+        e = found[name]
+        assert all(map(agrees, figures, [e[k] for k in keys])), (name, figures)
+        assert e["verdict"].startswith(verdict.split(",")[0]), (name, verdict)
+
+
 def test_tables_of_streams():
     captures, keys, demo = rows("what was captured"), ("kb_per_frame", "psnr_fg"), result("demo")
     assert len(captures) >= 4
