@@ -55,7 +55,7 @@ rust: lint
 
 # Programs that tests use, and that a developer may lack: their tests are skipped then. After the browser, since one
 # installation of packages waits for no other.
-tools: venv browser
+tools: browser
 	@command -v npm >/dev/null || { $(APT) npm >/dev/null; }
 	@{ command -v qemu-aarch64 && command -v aarch64-linux-gnu-gcc; } >/dev/null \
 		|| { $(APT) qemu-user gcc-aarch64-linux-gnu libc6-dev-arm64-cross >/dev/null; }
@@ -74,7 +74,7 @@ fuzz: venv
 	$(BIN)/python -m bench.fuzz --seconds 40 --dry
 
 # The page's module and script are those of the sources. After `neon`: one installation of a Rust target at a time.
-committed: venv tools neon
+committed: venv neon
 	$(BIN)/python player/build.py --committed
 
 lint: venv

@@ -137,8 +137,8 @@ def test_what_jumps_is_found_and_what_is_gone_is_not():
 def test_masks_say_where_nothing_is():
     """A part of the subject is gone in frame 1, everything in frame 2: what is dead ends its lifetime."""
     left, right = (
-        dataclasses.replace(g, means=0.4 * g.means + np.float32([x, 0, 0]), log_scales=g.log_scales - 1)
-        for g, x in ((blob(100), -0.7), (blob(100, seed=1), 0.7))
+        dataclasses.replace(g, means=0.35 * g.means + np.float32([x, 0, 0]), log_scales=g.log_scales - 1)
+        for g, x in ((blob(100), -0.8), (blob(100, seed=1), 0.8))
     )
     whole, none = concatenate([left, right]), left.take(np.zeros(0, int))
     capture = capture_of(GaussianSequence(25.0, [DenseGroup([g]) for g in (whole, left, none, none)]))
@@ -152,7 +152,7 @@ def test_masks_say_where_nothing_is():
     group = GroupModel(tracker.graph, None, models, poses, steps_for(50, 1.0), torch.zeros(200, dtype=torch.bool), TINY)
     end = group.group(None).lifetimes[:, 1]
     assert (end[:100] == 2).all(), "what is left lives in frames 0 and 1"
-    assert (end[100:] == 1).sum() > 60, "what is gone ends, but for some at its rim"
+    assert (end[100:] == 1).sum() > 70, "what is gone ends, but for some at its rim"
     assert set(end) == {1, 2}
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from .. import _native
 from ..bitstream.channels import channel_values
 from ..bitstream.color import correlate
-from ..model.gaussians import Gaussians
+from ..model.gaussians import Gaussians, living
 from ..render.cpu import CpuBackend
 from ..render.optimizer import Adam
 from ..render.sensitivity import derivatives
@@ -125,8 +125,7 @@ class AdaptiveRounding:
         life = self._quantized.form.lifetimes
         if life is None:
             return g
-        shown = (life[:, 0] <= t) & (t < life[:, 1])
-        return replace(g, logit_opacities=np.where(shown, g.logit_opacities, np.float32(HIDDEN)))
+        return replace(g, logit_opacities=np.where(living(life, t), g.logit_opacities, np.float32(HIDDEN)))
 
 
 def _with_values(g: Gaussians, values: dict[str, np.ndarray]) -> Gaussians:

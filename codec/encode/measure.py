@@ -8,7 +8,7 @@ import numpy as np
 
 from ..model.attributes import ATTRIBUTES
 from ..model.camera import Camera
-from ..model.gaussians import Gaussians
+from ..model.gaussians import Gaussians, living
 from ..model.parametric_group import ParametricGroup
 from ..render.sensitivity import Importance, measure
 from .settings import PlanSettings
@@ -35,8 +35,8 @@ def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanS
     views = settings.more_views if frames == 1 or len(g) <= settings.few else settings.views
     if group.lifetimes is not None:
         each = 2 if cameras else 1
-        living = _living(group.lifetimes, frames)
-        times = [living[i] for i in _spread(len(living), max(views, each * len(living)) // each)]
+        times = _living_frames(group.lifetimes, frames)
+        times = [times[i] for i in _spread(len(times), max(views, each * len(times)) // each)]
         some = [cameras[i] for i in _spread(len(cameras), len(times))] if cameras else []
         return measure(lambda i: _shown(group, times[i % len(times)]), around, some, each * len(times))
     return measure(lambda i: few[i % len(few)], around, cameras, views)
@@ -48,14 +48,13 @@ def _spread(items: int, count: int) -> list[int]:
     return [order[i % items] for i in range(count)]
 
 
-def _living(lifetimes: np.ndarray, frames: int) -> list[int]:
+def _living_frames(lifetimes: np.ndarray, frames: int) -> list[int]:
     """Frames that show something; all of them if none does."""
-    shown = [t for t in range(frames) if ((lifetimes[:, 0] <= t) & (t < lifetimes[:, 1])).any()]
+    shown = [t for t in range(frames) if living(lifetimes, t).any()]
     return shown or list(range(frames))
 
 
 def _shown(group: ParametricGroup, t: int) -> Gaussians:
     """All Gaussians at frame `t`; those outside of their lifetime are transparent."""
-    g, life = group.frame(t), group.lifetimes
-    shown = (life[:, 0] <= t) & (t < life[:, 1])
+    g, shown = group.frame(t), living(group.lifetimes, t)
     return replace(g, logit_opacities=np.where(shown, g.logit_opacities, np.float32(HIDDEN)))

@@ -20,6 +20,7 @@ from ..render.cpu import CpuBackend
 from ..render.sensitivity import Importance, params_of
 from .adaptive_rounding import AdaptiveRounding
 from .coder import GroupCoder
+from .quantize import Quantized
 
 
 def choose_quality(coder: GroupCoder, group: ParametricGroup, importance: Importance, first_frame: int) -> float | None:
@@ -30,14 +31,15 @@ def choose_quality(coder: GroupCoder, group: ParametricGroup, importance: Import
         CaptureError: a picture cannot be read.
     """
     s = coder.settings.quality_search
-    if not len(coder.quantized(group, importance, s.finest).integers):
+    finest = coder.quantized(group, importance, s.finest)
+    if not len(finest.integers):
         return None
     wanted = 10 ** (coder.settings.loss / 10) - 1
-    least = min(_errors(coder, group, importance, s.finest, first_frame))
+    least = min(_errors(coder, group, finest, first_frame))
     tried: dict[float, float] = {}  # quality -> log of the excess over the wanted one
     quality = s.start
     while len(tried) < s.tries and quality not in tried:
-        model, decoded = _errors(coder, group, importance, quality, first_frame)
+        model, decoded = _errors(coder, group, coder.quantized(group, importance, quality), first_frame)
         excess = decoded / max(min(model, least), 1e-12) - 1
         tried[quality] = math.log(max(excess, s.excess_min) / wanted)
         if abs(tried[quality]) < s.tolerance:
@@ -57,12 +59,10 @@ def _next(tried: dict[float, float]) -> float:
     return coarse + (fine - coarse) * share
 
 
-def _errors(
-    coder: GroupCoder, group: ParametricGroup, importance: Importance, quality: float, first_frame: int
-) -> tuple[float, float]:
-    """Mean squared error against the pictures, of the frames before coding and of those decoded with `quality`."""
+def _errors(coder: GroupCoder, group: ParametricGroup, quantized: Quantized, first_frame: int) -> tuple[float, float]:
+    """Mean squared error against the pictures, of the frames before coding and of those decoded from `quantized`."""
     s, backend, errors = coder.settings.quality_search, CpuBackend(), np.zeros(2)
-    rounding = AdaptiveRounding(coder.quantized(group, importance, quality), coder.settings)
+    rounding = AdaptiveRounding(quantized, coder.settings)
     coder.refine_by_pictures(group, first_frame, rounding, s.frame_pictures * len(group))
     count = max(s.judged, len(group))
     for t, camera, background, picture in coder.refine_by_pictures.pictures(group, first_frame, count, s.seed):

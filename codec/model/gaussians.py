@@ -99,8 +99,13 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
     return Gaussians(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)})
 
 
+def living(lifetimes: np.ndarray, t: int) -> np.ndarray:
+    """[N] bool: whether frame `t` is in the lifetimes [t0, t1) of the rows ([N, 2])."""
+    return (lifetimes[:, 0] <= t) & (t < lifetimes[:, 1])
+
+
 def shown_at(g: Gaussians, lifetimes: np.ndarray | None, t: int) -> Gaussians:
     """The Gaussians of `g` that live at frame `t`; all of them without `lifetimes` ([N, 2])."""
     if lifetimes is None:
         return g
-    return g.take((lifetimes[:, 0] <= t) & (t < lifetimes[:, 1]))
+    return g.take(living(lifetimes, t))

@@ -141,10 +141,9 @@ def _by_channels(g: Gaussians, grads: dict, name: str) -> np.ndarray:
         scene = [[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]]  # i q, j q, k q: [3, 4, N]
         own = [[-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]]  # q i, q j, q k
         return np.einsum("kcn,nc->nk", np.stack(own if name == "quats" else scene), grads["quats"])
+    grad = grads[name]
     if name in ("sh0", "shN"):
-        grad = grads[name] @ TO_RGB.astype(np.float32)
-    else:
-        grad = grads[name]
+        grad = grad @ TO_RGB.astype(np.float32)
     return grad.reshape(len(g), math.prod(grad.shape[1:]))
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..errors import CaptureError
-from ..model.gaussians import Gaussians
+from ..model.gaussians import Gaussians, living
 from ..model.parametric_group import ParametricGroup
 from ..model.temporal_transform import dct_basis
 
@@ -43,7 +43,7 @@ def with_colors(
 def _shown(group: ParametricGroup, t: int) -> np.ndarray:
     """[N] bool: Gaussians that frame `t` shows."""
     life = group.lifetimes
-    return np.ones(len(group.canonical), bool) if life is None else (life[:, 0] <= t) & (t < life[:, 1])
+    return np.ones(len(group.canonical), bool) if life is None else living(life, t)
 
 
 def _check_places(means: np.ndarray, expected: np.ndarray, name: str) -> None:

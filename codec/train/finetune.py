@@ -97,7 +97,7 @@ class GroupModel:
         counts = torch.tensor([len(m) for m in tracked])
         self.start = (counts[:, None] <= torch.arange(counts[-1])).sum(0)
         tracked = [_padded(m, tracked[-1]) for m in tracked]
-        removed = torch.stack([m.params["logit_opacities"] <= REMOVED_LOGIT for m in tracked])
+        removed = torch.stack([~m.alive for m in tracked])
         removed &= torch.arange(len(tracked))[:, None] > self.start  # the padding is of the last frame
         self.end = len(tracked) - removed.sum(0)
         self.known = 0 if key is None else len(key)

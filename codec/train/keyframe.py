@@ -152,7 +152,7 @@ class _Run:
         self.views.exposure.learn(view.target.index, result.grad_exposure[0], decay)
         if view.step >= k.appearance_from * self.steps:
             self.views.extrinsics.learn(view.target.index, model.params, result.grads, decay)
-        result.grads["shN"].add_(model.params["shN"], alpha=k.harmonics_weight / max(len(model), 1))
+        result.grads["shN"].add_(model.params["shN"], alpha=k.harmonics_weight / len(model))
         means_rate = self.radius * k.rates["means"] * (k.means_rate_end / k.rates["means"]) ** progress
         model.step(result.grads, {**k.rates.scaled(self.radius, decay), "means": means_rate})
 

@@ -61,6 +61,11 @@ class Model:
         if self._adam is not None:
             self._adam.resize("shN", count)
 
+    @property
+    def alive(self) -> torch.Tensor:
+        """[N] bool: Gaussians that have not been removed."""
+        return self.params["logit_opacities"] > REMOVED_LOGIT
+
     def gaussians(self) -> Gaussians:
         """A copy in numpy, quaternions normalised."""
         arrays = {n: p.detach().numpy().copy() for n, p in self.params.items()}

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..bitstream.color import TO_RGB, correlate, decorrelate
-from ..model.gaussians import SH_C0, Gaussians
+from ..model.gaussians import SH_C0, Gaussians, living
 from ..model.parametric_group import ParametricGroup
 from ..model.temporal_transform import dct_basis
 from ..render.cpu import CpuBackend
@@ -134,7 +134,7 @@ def _shown(group: ParametricGroup, t: int) -> Gaussians:
     g, life = group.frame(t), group.lifetimes
     if life is None:
         return g
-    shown = (life[:, 0] <= t) & (t < life[:, 1])
+    shown = living(life, t)
     return replace(g, logit_opacities=np.where(shown, g.logit_opacities, np.float32(HIDDEN)))
 
 

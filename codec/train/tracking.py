@@ -115,7 +115,7 @@ class Tracker:
     @property
     def alive(self) -> torch.Tensor:
         """[N] bool: Gaussians that have not been removed."""
-        return self.own.params["logit_opacities"] > REMOVED_LOGIT
+        return self.own.alive
 
     def advance(self, frame: int, on_step: OnStep = None) -> float | None:
         """Tracks on to `frame`, the next one.

@@ -28,7 +28,7 @@ from .finetune import GroupModel
 from .initialization import initial_model
 from .joint_optimization import finetune
 from .keyframe import train_keyframe
-from .model import REMOVED_LOGIT, Model
+from .model import Model
 from .settings import TrainSettings
 from .subject import Subject
 from .tracking import Tracker
@@ -236,7 +236,7 @@ class _TrackedFrames:
 
     def fullest(self) -> int:
         """The frame in which most Gaussians live; of several the one nearest to the middle."""
-        living = [int((m.params["logit_opacities"] > REMOVED_LOGIT).sum()) for m in self.models]
+        living = [int(m.alive.sum()) for m in self.models]
         return max(range(len(living)), key=lambda t: (living[t], -abs(t - len(living) // 2)))
 
     def moved(self) -> torch.Tensor:
