@@ -282,7 +282,7 @@ def every_frame_alone(capture: Capture, frames: Sequence[int], settings) -> tupl
         budget = keyframe_budget(views, frame, settings)
         model, radius = initial_model(capture, frame, budget.points, settings)
         train_keyframe(model, views, frame, settings, steps=budget.steps, radius=radius)
-        groups.append(ParametricGroup(1, model.gaussians(), calibration=views.calibration()))
+        groups.append(ParametricGroup(1, model.gaussians(), calibration=views.calibration(range(frame, frame + 1))))
     return groups, time.perf_counter() - start
 
 

@@ -137,6 +137,25 @@ def test_fine_tuning_removes_and_adds_gaussians(capture, monkeypatch):
     assert psnr_of(second.frame(1), capture, 4) > 21
 
 
+@pytest.mark.parametrize("drift", [0.2, 0.0])
+def test_a_camera_whose_brightness_drifts_is_followed(capture, drift):
+    """In each frame, up to what all cameras share; one that does not drift is the same in all frames."""
+    gains = np.exp(drift * np.linspace(0, 1, 3)[:, None] * np.sin(np.arange(len(capture.cameras))))
+
+    def rolled(camera, frame):
+        view = capture.read(camera, frame)
+        return dataclasses.replace(view, rgb=np.rint(gains[frame, camera] * view.rgb).clip(0, 255).astype(np.uint8))
+
+    drifting = dataclasses.replace(capture, frame_count=3, read=rolled)
+    settings = dataclasses.replace(TINY, keyframe_steps=300, finetune_steps=200)
+    (group,) = train_groups(drifting, settings)
+    trained = capture.indices("train")
+    found, true = (np.log(g[:, trained]) for g in (group.calibration.gains, gains))
+    since = found - found[0]
+    off = since - (true - true.mean(1, keepdims=True))[..., None]
+    assert np.abs(off).max() < (0.06 if drift else 0.02)
+
+
 def test_a_group_goes_on_from_what_was_fine_tuned(capture):
     """The tracker shows the last frame as the group does, whatever fine-tuning changed."""
     key = from_gaussians(turning(300, frames=5).frame(0))

@@ -197,8 +197,8 @@ def test_exposure_of_each_camera_is_found(darkest):
     train_keyframe(model, views, 0, TINY, steps=600, radius=1.0)
     true = np.log(gains[:-1]) - np.log(gains[:-1]).mean()
     np.testing.assert_allclose(views.exposure.values[:-1, :3], true[:, None] + np.zeros(3), atol=0.07)
-    gain, offset = views.exposure.of(0)
-    shown = render_image(views.exposure.applied_to(model.gaussians(), 0), capture.cameras[0], (0, 0, 0))
+    gain, offset = views.exposure.of(0, 0)
+    shown = render_image(views.exposure.applied_to(model.gaussians(), 0, 0), capture.cameras[0], (0, 0, 0))
     plain = render_image(model.gaussians(), capture.cameras[0], (0, 0, 0))
     np.testing.assert_allclose(shown, plain * gain + 255 * offset * (plain.max(2, keepdims=True) > 0), atol=3)
 

@@ -108,10 +108,8 @@ def test_a_trained_group_comes_nearer_to_its_pictures(frames):
     gains = np.geomspace(0.7, 1 / 0.7, len(cameras), dtype=np.float32)[:, None].repeat(3, 1)
     wrong = np.random.default_rng(1).normal(0, 0.15, truth[0].sh0.shape).astype(np.float32)
     model = [replace(g, sh0=g.sh0 + wrong) for g in truth]
-    capture, calibration = (
-        pictures_of(truth, cameras, gains),
-        Calibration(np.tile(np.eye(4), (16, 1, 1)), gains, 0 * gains),
-    )
+    capture = pictures_of(truth, cameras, gains)
+    calibration = replace(Calibration.plain(16, frames), gains=gains[None].repeat(frames, 0))
     found = []
     for told in (None, calibration):
         settings = EncodeSettings(keep_all=True, layers=1, refine=80)
@@ -133,9 +131,8 @@ def test_a_cleaner_capture_gets_a_finer_quality():
     cameras = [
         replace(c, K=c.K / 8 + np.diag([0, 0, 7 / 8]), width=64, height=64, split="train") for c in codec_cameras(truth)
     ]
-    even = np.ones((16, 3), np.float32)
-    calibration, chosen = Calibration(np.tile(np.eye(4), (16, 1, 1)), even, 0 * even), []
-    refine = PictureRefinement(pictures_of(truth, cameras, even))
+    calibration, chosen = Calibration.plain(16, 1), []
+    refine = PictureRefinement(pictures_of(truth, cameras, calibration.gains[0]))
     coder = GroupCoder(EncodeSettings(layers=1), refine_by_pictures=refine)
     for noise in (0.05, 0.2):
         wrong = np.random.default_rng(1).normal(0, noise, truth[0].sh0.shape).astype(np.float32)

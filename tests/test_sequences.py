@@ -125,7 +125,7 @@ def parametric_group():
     trajectories = {"means": values(3, 3, 50), "sh0": values(2, 3, 50)}
     lifetimes = np.tile(np.array([0, 4], np.int32), (50, 1))
     lifetimes[:5] = (1, 3)
-    told = Calibration(random.normal(size=(2, 4, 4)), values(2, 3), values(2, 3))
+    told = Calibration(random.normal(size=(2, 4, 4)), values(4, 2, 3), values(4, 2, 3))
     return ParametricGroup(4, gaussians(50, 3), nodes, trajectories, lifetimes, None, told, rate_optimized=True)
 
 

@@ -158,11 +158,10 @@ def _of_pictures(capture: Capture, settings: EncodeSettings):
 
     limit_torch_threads()
     refinement, recipe = PictureRefinement(capture, views=settings.refine), RecolorSettings()
-    cameras, n = len(capture.indices("train")), len(capture.cameras)
-    plain = Calibration(np.tile(np.eye(4), (n, 1, 1)), np.ones((n, 3), np.float32), np.zeros((n, 3), np.float32))
+    cameras = len(capture.indices("train"))
 
     def colors(group: ParametricGroup, first: int) -> ParametricGroup:
-        group = replace(group, calibration=plain)
+        group = replace(group, calibration=Calibration.plain(len(capture.cameras), len(group)))
         count = picture_count(cameras, len(group), recipe)
         few = refinement.pictures(group, first, recipe.map_pictures, seed=1)
         return fit_colors(group, few, refinement.pictures(group, first, count, seed=2), count, recipe)

@@ -60,21 +60,28 @@ class Camera:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What training has found out about the C cameras of a capture. It holds for all frames, also of moving cameras.
+    """What training has found out about the C cameras of a capture in the T frames of a group.
 
     Attributes:
-        corrections: [C, 4, 4] f64, rigid motions of the world: the true viewmat is viewmat @ correction.
-        gains: [C, 3] f32, by which the images of a camera are brighter than the scene.
-        offsets: [C, 3] f32, in 0..1, by which they are brighter besides.
+        corrections: [C, 4, 4] f64, rigid motions of the world: the true viewmat is viewmat @ correction, in all frames,
+            also of moving cameras.
+        gains: [T, C, 3] f32, by which the images of a camera are brighter than the scene.
+        offsets: [T, C, 3] f32, in 0..1, by which they are brighter besides.
     """
 
     corrections: np.ndarray
     gains: np.ndarray
     offsets: np.ndarray
 
-    def evened(self, rgb: np.ndarray, index: int) -> np.ndarray:
-        """Colours of camera `index` (0 to 255) as the scene has them, f32."""
-        return ((rgb - 255 * self.offsets[index]) / self.gains[index]).astype(np.float32)
+    @staticmethod
+    def plain(cameras: int, frames: int) -> Calibration:
+        """Cameras that are as the capture says."""
+        gains = np.ones((frames, cameras, 3), np.float32)
+        return Calibration(np.tile(np.eye(4), (cameras, 1, 1)), gains, 0 * gains)
+
+    def evened(self, rgb: np.ndarray, index: int, t: int) -> np.ndarray:
+        """Colours of camera `index` (0 to 255) at frame `t` of the group as the scene has them, f32."""
+        return ((rgb - 255 * self.offsets[t, index]) / self.gains[t, index]).astype(np.float32)
 
     def camera(self, camera: Camera, index: int) -> Camera:
         """`camera`, which is camera `index` of the capture in any frame or a crop of it, with the true viewmat."""

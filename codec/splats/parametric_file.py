@@ -39,6 +39,10 @@ def from_arrays(arrays: Mapping[str, np.ndarray]) -> ParametricGroup:
         own = {n.partition(".")[2]: a for n, a in arrays.items() if n.startswith(f"{name}.")}
         return kind(**{f.name: own[f.name] for f in fields(kind) if f.name != "rig"}) if own else None
 
+    calibration = part("calibration", Calibration)
+    if calibration is not None and calibration.gains.ndim == 2:  # of an earlier version: the same in all frames
+        every = (np.repeat(a[None], int(arrays["frame_count"]), 0) for a in (calibration.gains, calibration.offsets))
+        calibration = Calibration(calibration.corrections, *every)
     nodes, rig = part("nodes", NodeMotion), part("rig", RigMotion)
     return ParametricGroup(
         int(arrays["frame_count"]),
@@ -46,7 +50,7 @@ def from_arrays(arrays: Mapping[str, np.ndarray]) -> ParametricGroup:
         replace(nodes, rig=rig) if rig else nodes,
         {n.partition(".")[2]: a for n, a in arrays.items() if n.startswith("trajectories.")},
         *(arrays.get(n) for n in OPTIONAL),
-        part("calibration", Calibration),
+        calibration,
         bool(arrays["rate_optimized"]),
         str(arrays["ended"]),
     )

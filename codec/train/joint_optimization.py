@@ -5,9 +5,9 @@ node and frame.
 The loss is that of the image and a rate term (V3's residual-entropy loss, made differentiable): the entropy of the
 coefficients under noise-relaxed quantization at the step sizes of the stream, with a learned Laplace scale for each
 attribute and temporal frequency. It pulls coefficients to zero that lower the image loss by less than they cost.
-Canonical attributes have noise in place of their quantization and a rate term of their own (entropy_model.py). A step
-has the gradients of some views of one frame. While they are rendered, the step before is taken: a gradient is one step
-old.
+Canonical attributes have noise in place of their quantization and a rate term of their own (entropy_model.py). The
+exposure of each camera is learned in each frame, since that of a keyframe may drift. A step has the gradients of some
+views of one frame. While they are rendered, the step before is taken: a gradient is one step old.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .finetune import Frame, GroupModel
 from .keyframe import Statistics, split_or_clone
 from .motion_field import MotionField
 from .settings import TrainSettings
-from .views import Views, start_photometric_loss
+from .views import Target, Views, start_photometric_loss
 
 
 class _Finetuner:
@@ -48,28 +48,30 @@ class _Finetuner:
         self.steps = 0
         self._draw_canonical()
         self.statistics = Statistics(len(group.key), settings.keyframe.mse_min)
-        self.started: tuple[int, Frame, PendingLoss, float] | None = None  # frame of the group, decay of the rates
+        self.started: tuple[int, Frame, list[Target], PendingLoss, float] | None = None  # as `step` says
         self.bits = sum(self._step_coefficients(0, None, 0.0, 0.0))
 
     def step(self, t: int, decay: float) -> float:
-        """Starts some views of frame `t`, whose step has all learning rates times `decay`, and meanwhile takes the step
-        along those before; returns the mean loss of a view of late."""
+        """Starts some views of frame `t` of the group, whose step has all learning rates times `decay`, and meanwhile
+        takes the step along those before; returns the mean loss of a view of late."""
         frame, backend = self.group.frame(t, self.views.backend, self.noise), self.views.backend
         targets = [self.views.draw(self.frames[t]) for _ in range(self.settings.finetune.views)]
         pending = start_photometric_loss(frame.params, targets, self.settings, self.rng, backend)
         self.finish()
-        self.started = t, frame, pending, decay
+        self.started = t, frame, targets, pending, decay
         return self.loss / self.settings.finetune.views
 
     def finish(self) -> None:
         """Takes the step along the views that were started last."""
         if self.started is None:
             return
-        t, frame, pending, decay = self.started
+        t, frame, targets, pending, decay = self.started
         self.started = None
         f, group, result = self.settings.finetune, self.group, pending()
         self.loss += (result.loss - self.loss) * (f.loss_smoothing if self.loss else 1.0)
         self.statistics.add(result, f.views)
+        for target, by_exposure in zip(targets, result.grad_exposure, strict=True):
+            self.views.exposure.learn_in(self.frames[t], target.index, by_exposure, decay)
         k = self.settings.keyframe
         result.grads["shN"].add_(group.key.params["shN"], alpha=f.views * k.harmonics_weight / len(group.key))
         residuals, canonical, by_rotations = group.gradients(frame, result.grads)
@@ -218,6 +220,7 @@ def finetune(
         for _ in range(settings.finetune.views if on_step else 0):
             on_step(step, loss)
     run.finish()
+    views.exposure.go_on(frames[-1])
 
 
 def _round_of_frames(frames: int) -> list[int]:

@@ -88,5 +88,5 @@ class PictureRefinement:
             i = order[t].pop()
             view, camera = cached(i, t)
             background = tuple(random.uniform(0, 1, 3).tolist())
-            evened = replace(view, rgb=calibration.evened(view.rgb, i))
+            evened = replace(view, rgb=calibration.evened(view.rgb, i, t))
             yield t, camera, background, np.ascontiguousarray(blend(evened, background) / 255, np.float32)

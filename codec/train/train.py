@@ -96,11 +96,12 @@ def train_groups(
         while start < segment.stop:
             run.estimate(capture.frame_count - start)
             group = run.group(range(start, min(start + settings.gop, segment.stop)))
+            calibration = run.views.calibration(range(start, start + len(group)))
             start += len(group)
             if start == segment.stop:
                 run.subject = None
             store.save(start, run.subject.state() if run.subject else None)
-            yield replace(group, calibration=run.views.calibration())
+            yield replace(group, calibration=calibration)
 
 
 def segments(frame_count: int, gop: int, random_access: int) -> list[range]:

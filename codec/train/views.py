@@ -99,18 +99,18 @@ class Views:
 
         target = self._cached((camera, frame, scale), load)
         moved = self.extrinsics.camera(camera, target.camera)
-        return replace(target, camera=moved, exposure=self.exposure.of(camera))
+        return replace(target, camera=moved, exposure=self.exposure.of(camera, frame))
 
     def camera(self, index: int, frame: int) -> Camera:
         """Camera `index` at `frame`, in its calibrated pose."""
         return self.extrinsics.camera(index, self.capture.camera(index, frame))
 
-    def calibration(self) -> Calibration:
-        """Corrections of the poses, and exposures, of all cameras."""
+    def calibration(self, frames: range) -> Calibration:
+        """Corrections of the poses, and exposures, of all cameras in `frames`."""
         every = range(len(self.capture.cameras))
         corrections = np.stack([self.extrinsics.correction(i) for i in every])
-        gains, offsets = (np.stack(a) for a in zip(*(self.exposure.of(i) for i in every), strict=True))
-        return Calibration(corrections, gains, offsets)
+        exposures = np.array([[self.exposure.of(i, frame) for i in every] for frame in frames], np.float32)
+        return Calibration(corrections, exposures[:, :, 0], exposures[:, :, 1])
 
     def render(self, g: Gaussians, index: int, frame: int, size: Sequence[int] | None = None) -> np.ndarray:
         """Gaussians as camera `index` shows them at `frame`, with its exposure, over mid-grey; [H, W, 3] u8.
@@ -120,7 +120,7 @@ class Views:
         """
         camera = self.camera(index, frame)
         camera = camera if size is None else camera.resized(*size)
-        image, _ = self.backend.render(params_of(self.exposure.applied_to(g, index)), camera, GREY)
+        image, _ = self.backend.render(params_of(self.exposure.applied_to(g, index, frame)), camera, GREY)
         return np.floor(255 * image.clip(0, 1) + 0.5).astype(np.uint8)
 
     def _cached(self, key: tuple, load: Callable[[], View | Target]) -> View | Target:

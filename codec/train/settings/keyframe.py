@@ -70,11 +70,14 @@ class PlaneSweepSettings:
 
 @dataclass(frozen=True)
 class CameraCalibrationSettings:
-    """Colour (log gain and offset of each channel) and pose of each training camera, learned with a keyframe."""
+    """Colour (log gain and offset of each channel) and pose of each training camera, learned with a keyframe; the
+    colour also in each frame of a group."""
 
     exposure_rate: float = 2e-2  # log gain
     offset_unit: float = 0.1  # of 0..1: an offset is learned so much more slowly than a log gain
     exposure_weight: float = 0.02  # of half the square of both in the loss: shading, too, looks like exposure
+    frame_weight: float = 0.003  # of what differs from the keyframe in a frame, in the loss
+    frame_free: float = 0.01  # difference below which the weight falls: a Huber loss, which small errors do not pass
     pose_rate: float = 3e-3  # radians, radii
     refine_poses: bool | None = None  # None: where `pose_error_min` says so
     pose_error_min: float = 0.75  # pixels, median distance of features from their epipolar lines; good rigs have 0.25
