@@ -3,13 +3,16 @@ more than their bits cost.
 
 Rounding each value on its own leaves errors that another value could make up for. The decoded frame is drawn and
 compared with a target picture; the gradient of the squared difference moves the latent under each integer, straight
-through the rounding (Bengio et al. 2013). Integers that others are decoded from stay: positions, nodes, rotations. Of a
-single frame, sizes move too, and its rotations are coded again; of a predicted group, only trajectories move.
+through the rounding (Bengio et al. 2013). Positions and nodes stay, which all else is decoded from. Sizes move first,
+since the steps of the rotations follow from them; then the rotations are coded again, and the rest makes up for their
+rounding. Of a predicted group, only trajectories move.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property
 
@@ -28,9 +31,9 @@ from .refinement_views import Target
 from .rounding_variables import CanonicalVariable, TrajectoryVariable, trajectory_variable
 from .settings import EncodeSettings
 
-MOVING_CANONICAL = ("logit_opacities", "sh0", "shN")  # rotations follow from sizes, and everything from positions
-MOVING_STILL = ("log_scales", *MOVING_CANONICAL)
-MOVING_OVER_TIME = ("means", "log_scales", *MOVING_CANONICAL)
+SIZES = "log_scales"
+MOVING_CANONICAL = (SIZES, "logit_opacities", "sh0", "shN")
+MOVING_OVER_TIME = ("means", *MOVING_CANONICAL)
 HIDDEN = -30.0  # logit of an opacity that no renderer shows
 
 
@@ -40,6 +43,7 @@ class AdaptiveRounding:
     Args:
         quantized: the group. reference: what it is predicted from.
         only: attributes that may move; None: all that can.
+        sizes: whether canonical sizes may move.
     """
 
     def __init__(
@@ -48,17 +52,18 @@ class AdaptiveRounding:
         settings: EncodeSettings,
         reference: ReferenceGroup | None = None,
         only: Sequence[str] | None = None,
+        sizes: bool = True,
     ):
         self._quantized, self._settings, self._reference = quantized, settings, reference
-        self._still = quantized.form.frames == 1 and reference is None and only is None
-        canonical = MOVING_STILL if self._still else MOVING_CANONICAL if reference is None else ()
         may = lambda n: only is None or n in only  # noqa: E731
+        canonical = [n for n in MOVING_CANONICAL if reference is None and (sizes or n != SIZES)]
         moving = [n for n in canonical if n in quantized.integers.channels and may(n)]
         self._variables: list[CanonicalVariable | TrajectoryVariable] = [
             trajectory_variable(n, quantized, settings)
             for n in MOVING_OVER_TIME
             if n in quantized.integers.trajectories and may(n)
         ] + [CanonicalVariable(n, quantized, settings) for n in moving]
+        self._pool = ThreadPoolExecutor(os.cpu_count() or 1)
 
     @property
     def frames(self) -> int:
@@ -82,23 +87,32 @@ class AdaptiveRounding:
             rate: quantization steps that the first target moves a latent; it falls to 0 linearly.
         """
         backend, names = CpuBackend(), {v.attribute for v in self._variables}
-        adam = Adam(backend, self._settings.rounding.adam)
+        adam, settled = Adam(backend, self._settings.rounding.adam), round(self._settings.rounding.sizes_until * count)
         for step, (t, camera, background, picture) in enumerate(prefetched(targets)):
+            if step == settled:
+                self._settle_sizes()
             off = lambda image, picture=picture: np.ascontiguousarray(image - picture)  # noqa: E731
             derivative = derivatives(backend, self.frame(t), camera, off, names, background)
-            grads = [v.by_integers(derivative[v.attribute], t) for v in self._variables]
-            latents = {k: v.latents.values for k, v in enumerate(self._variables)}
-            adam.step(latents, dict(enumerate(grads)), dict.fromkeys(latents, rate * (1 - step / count)))
-            for v in self._variables:
-                v.latents.round()
+            by_integers = lambda v, d=derivative, t=t: v.by_integers(d[v.attribute], t)  # noqa: E731
+            grads = self._pool.map(by_integers, self._variables)
+            latents = {id(v): v.latents.values for v in self._variables}
+            rates = dict.fromkeys(latents, rate * (1 - step / count))
+            adam.step(latents, dict(zip(latents, grads, strict=True)), rates)
+            list(self._pool.map(lambda v: v.latents.round(), self._variables))
 
     def frame(self, t: int) -> Gaussians:
         """Frame `t` as decoded with the integers as they are now."""
         before, values = self._before[t]
-        now = {n: v.copy() for n, v in values.items()}
-        for v in self._variables:
-            v.add(now[v.attribute], t)
-        return self._shown(_with_values(before, now), t)
+
+        def now(attribute: str) -> np.ndarray:
+            moved = values[attribute].copy()
+            for v in self._variables:
+                if v.attribute == attribute:
+                    v.add(moved, t)
+            return moved
+
+        moved = dict(zip(values, self._pool.map(now, values), strict=True))
+        return self._shown(_with_values(before, moved), t)
 
     def quantized(self) -> Quantized:
         """The group with the integers as they are now."""
@@ -106,18 +120,27 @@ class AdaptiveRounding:
         channels, trajectories = dict(q.integers.channels), dict(q.integers.trajectories)
         for v in self._variables:
             v.put(channels, trajectories)
-        q = replace(q, integers=replace(q.integers, channels=channels, trajectories=trajectories))
-        return with_rotations(q, self._settings.rdo) if self._still else q
+        return replace(q, integers=replace(q.integers, channels=channels, trajectories=trajectories))
+
+    def _settle_sizes(self) -> None:
+        """From now on sizes stay as they are, and rotations are coded for them."""
+        moving = [v for v in self._variables if isinstance(v, CanonicalVariable) and v.attribute == SIZES]
+        if not moving:
+            return
+        q = self._quantized
+        channels = dict(q.integers.channels)
+        moving[0].put(channels, {})
+        q = replace(q, integers=replace(q.integers, channels=channels))
+        self._quantized = with_rotations(q, self._settings.rdo)
+        self._variables.remove(moving[0])
+        vars(self).pop("_before", None)  # decoded anew
 
     @cached_property
     def _before(self) -> list[tuple[Gaussians, dict[str, np.ndarray]]]:
-        """Each frame as decoded at the start, as Gaussians and as coded values. Rotations of a single frame, which are
-        coded again, are those of the source."""
+        """Each frame as decoded with the integers that variables start from, as Gaussians and as coded values."""
         reference = self._reference.decoded if self._reference else None
         decoded = _native.DecodedGroup.reconstruct(self._quantized.integers, reference)
         frames = [Gaussians(**decoded.frame(t)) for t in range(self.frames)]
-        if self._still:
-            frames = [replace(frames[0], quats=self._quantized.form.coded_rotations)]
         return [(g, {n: v for n, v in channel_values(g).items() if n in MOVING_OVER_TIME}) for g in frames]
 
     def _shown(self, g: Gaussians, t: int) -> Gaussians:

@@ -205,13 +205,15 @@ class GroupCoder:
     def _refined(self, quantized, group, first_frame, reference) -> Quantized:
         if self.settings.refine == 0 or not len(quantized.integers):
             return quantized
-        rounding = AdaptiveRounding(quantized, self.settings, reference)
         if self.has_pictures(group):
+            rounding = AdaptiveRounding(quantized, self.settings, reference)
             self.refine_by_pictures(group, first_frame, rounding)
             return rounding.quantized()
         views, middle = self._drawn_views(group), len(group) // 2
         if not views:
             return quantized
+        sizes = len(group) == 1  # few views of what is right say little about them
+        rounding = AdaptiveRounding(quantized, self.settings, reference, sizes=sizes)
         form, rate = quantized.form, self.settings.rounding.drawn_rate / views**0.5
         cameras = sensitivity_cameras(form.means[middle], list(self.cameras(first_frame + middle)), views)
         rounding.follow(drawn_views(rounding.source, cameras, form.frames), views, rate)

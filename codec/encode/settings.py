@@ -106,12 +106,14 @@ class RoundingSettings:
         adam: of the latents; epsilon is in the sum of squared differences by a step: what changes less stays, since its
             square may be 0 in f32.
         inside: steps by which a latent starts within the interval of its integer, at least.
+        sizes_until: share of the targets by which sizes move, and the rotations still differ from those that are coded.
         drawn_rate: steps that the first drawn view moves a latent, times the root of the number of views.
         frame_views: drawn views a frame by which a small group of splats is refined; still_views: of a single frame.
     """
 
     adam: AdamSettings = field(default_factory=lambda: AdamSettings(eps=1e-6))
     inside: float = 0.02
+    sizes_until: float = 0.7
     drawn_rate: float = 0.1
     frame_views: int = 10
     still_views: int = 100
@@ -184,7 +186,7 @@ class EncodeSettings:
     layers: int | None = None
     refine: int | None = None
     doubt: float = 0.7
-    loss: float = 0.2
+    loss: float = 0.15
     quality_search: QualitySearchSettings = field(default_factory=QualitySearchSettings)
     plan: PlanSettings = field(default_factory=PlanSettings)
     companding: CompandingSettings = field(default_factory=CompandingSettings)
