@@ -98,7 +98,7 @@ def pictures_of(truth, cameras, gains):
     return Capture("synthetic", 30.0, cameras, len(truth), True, read)
 
 
-@pytest.mark.parametrize("attribute, gain", [("sh0", 0.5), ("log_scales", 0.3)])
+@pytest.mark.parametrize(("attribute", "gain"), [("sh0", 0.5), ("log_scales", 0.3)])
 @pytest.mark.parametrize("frames", [1, 4])
 def test_a_trained_group_comes_nearer_to_its_pictures(frames, attribute, gain):
     """What training has left wrong, too, here colours or sizes; each picture in the brightness of its camera."""

@@ -186,7 +186,7 @@ class EncodeSettings:
     layers: int | None = None
     refine: int | None = None
     doubt: float = 0.7
-    loss: float = 0.15
+    loss: float = 0.1
     quality_search: QualitySearchSettings = field(default_factory=QualitySearchSettings)
     plan: PlanSettings = field(default_factory=PlanSettings)
     companding: CompandingSettings = field(default_factory=CompandingSettings)

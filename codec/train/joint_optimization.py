@@ -109,7 +109,7 @@ class _Finetuner:
             return
         opacities = torch.sigmoid(group.key.params["logit_opacities"])
         contribution = stats.contribution(opacities) / self._drawn_share()  # to the views that could show it
-        keep = contribution >= k.contribution_min
+        keep = contribution >= min(k.contribution_min, torch.quantile(contribution, k.thinning).item())
         keep &= stats.max_weight > k.prune_weight
         keep[: group.known] = True
         gradient = stats.mean_screen_gradient() * keep
@@ -208,7 +208,8 @@ def finetune(
         radius: of the moving Gaussians, world units.
         on_step: called with (step, loss) for each view of a step.
     """
-    steps = -(-settings.finetune_steps * len(frames) // settings.finetune.views)
+    least = 0 if group.known else settings.finetune.frames_min
+    steps = -(-settings.finetune_steps * max(len(frames), least) // settings.finetune.views)
     run = _Finetuner(group, views, frames, settings, radius)
     order: list[int] = []
     larger = settings.finetune.views**0.5  # rates, since the gradient of several views has less noise

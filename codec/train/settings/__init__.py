@@ -150,7 +150,7 @@ PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
     "medium": {"gradient_min": 3e-4, "contribution_min": 8.0},
     "slow": {"gradient_min": 1.5e-4, "contribution_min": 3.0},
 }
-LOSS = {"fast": 0.5, "medium": 0.15, "slow": 0.1}  # decibels by which very fine steps may be better, without a quality
+LOSS = {"fast": 0.5, "medium": 0.1, "slow": 0.05}  # decibels by which very fine steps may be better, without a quality
 
 
 MOTIONS = {  # --motion
