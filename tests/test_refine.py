@@ -8,6 +8,7 @@ from synthetic import blob, coded, moved
 
 from gscodec import _native
 from gscodec.capture import Capture, View
+from gscodec.encode.adaptive_rounding import AdaptiveRounding
 from gscodec.encode.coder import GroupCoder
 from gscodec.encode.quality_search import choose_quality
 from gscodec.encode.rounding_variables import Latents
@@ -124,6 +125,22 @@ def test_a_trained_group_comes_nearer_to_its_pictures(frames, attribute, gain):
     (plain, before), (refined, after) = found
     assert after > before + gain
     assert refined < 1.1 * plain
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_rotations_fit_the_sizes_after_few_pictures(views):
+    truth = [moved(blob(300), [0, 0.05 * t, 0], [0, 0, 0]) for t in range(2)]
+    cameras = [replace(c, split="train") for c in codec_cameras(truth)[:3]]
+    group = next(fit_groups([DenseGroup(truth)]))
+    group = replace(group, calibration=Calibration.plain(3, 2))
+    coder = GroupCoder(EncodeSettings(keep_all=True, layers=1))
+    rounding = AdaptiveRounding(coder.quantized(group, coder.measure(group, 0), 50), coder.settings)
+    capture = pictures_of(truth, cameras, np.ones((3, 3), np.float32))
+    rounding.follow(PictureRefinement(capture).pictures(group, 0, views), views, 2.0)
+    decoded = _native.DecodedGroup.reconstruct(rounding.quantized().integers, None)
+    for t in range(2):
+        for name in ("quats", "log_scales"):
+            np.testing.assert_allclose(getattr(rounding.frame(t), name), decoded.frame(t)[name], atol=1e-4)
 
 
 def test_a_cleaner_capture_gets_a_finer_quality():

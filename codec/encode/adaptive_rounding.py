@@ -87,7 +87,8 @@ class AdaptiveRounding:
             rate: quantization steps that the first target moves a latent; it falls to 0 linearly.
         """
         backend, names = CpuBackend(), {v.attribute for v in self._variables}
-        adam, settled = Adam(backend, self._settings.rounding.adam), round(self._settings.rounding.sizes_until * count)
+        adam = Adam(backend, self._settings.rounding.adam)
+        settled = int(self._settings.rounding.sizes_until * count)  # before the last target
         for step, (t, camera, background, picture) in enumerate(prefetched(targets)):
             if step == settled:
                 self._settle_sizes()
