@@ -143,14 +143,15 @@ class TrainSettings:
 PRESETS = {
     "fast": {"keyframe_steps": 1400, "motion_steps": 130, "finetune_steps": 170},
     "medium": {},
-    "slow": {"keyframe_steps": 7000, "motion_steps": 250, "finetune_steps": 900},
+    "slow": {"keyframe_steps": 7000, "finetune_steps": 600},
 }
 PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
     "fast": {"gradient_min": 4e-4, "contribution_min": 10.0},
     "medium": {"gradient_min": 3e-4, "contribution_min": 8.0},
-    "slow": {"gradient_min": 1.5e-4, "contribution_min": 3.0},
+    "slow": {"gradient_min": 2e-4, "contribution_min": 5.0},
 }
-LOSS = {"fast": 0.5, "medium": 0.1, "slow": 0.05}  # decibels by which very fine steps may be better, without a quality
+DRIFT = {"fast": 2.0, "medium": 2.0, "slow": 3.5}  # drift_ratio: a keyframe of more steps fits its own pictures better
+LOSS = {"fast": 0.5, "medium": 0.1, "slow": 0.1}  # decibels by which very fine steps may be better, without a quality
 
 
 MOTIONS = {  # --motion
@@ -175,5 +176,9 @@ def train_settings(preset: str, quality: float | None = None, *, motion: str = "
         raise UsageError(f"--motion {motion} does not exist, expected one of {', '.join(MOTIONS)}")
     if quality is not None:
         changes["quality"] = quality
-    recipe = {"keyframe": KeyframeSettings(**PRICES[preset]), "motion_field": MOTIONS[motion]}
+    recipe = {
+        "keyframe": KeyframeSettings(**PRICES[preset]),
+        "motion_field": MOTIONS[motion],
+        "group": GroupSettings(drift_ratio=DRIFT[preset]),
+    }
     return TrainSettings(**{**PRESETS[preset], **recipe, **changes})
