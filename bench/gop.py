@@ -1,10 +1,11 @@
-"""Length of a group: size, quality and time of a walk of 150 frames, by the most frames that a group may have.
+"""Length of a group, and frames between independent groups: size, quality and time of a walk of 150 frames.
 
-usage: python -m bench.gop [--gop 20,30] [--preset fast] [--data FOLDER]
+usage: python -m bench.gop [--gop 20,30] [--random-access 60,150] [--preset fast] [--data FOLDER]
 
 The walk is that of lumberjack, five times round, at half its size. Two training cameras are held out and measured,
-since the length is chosen by them. bench/results/gop.json has an entry a length: PSNR of the decoded subject over all
-frames, in the first and in the last group, and at the edges of groups; kB/frame of the first and of later groups.
+since the lengths are chosen by them. bench/results/gop.json has an entry for each pair of lengths: PSNR of the decoded
+subject over all frames, in the first and in the last group, and at the edges of groups; kB/frame of the first and of
+later groups. What differs in random access alone is trained once, all 150 frames in one go.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from .train import CASES, coded, evaluate, held_out, sequence, shown
 
 HELD_OUT = ("cam08", "cam12")
 RESULTS = Path("bench/results/gop.json")
+KEY = ("capture", "preset", "gop", "random_access")  # of an entry
 
 
 def walk(data: Path) -> Capture:
@@ -32,52 +34,57 @@ def walk(data: Path) -> Capture:
     return held_out(replace(CASES["lumberjack-150"], scale=0.5).open(data), HELD_OUT)
 
 
-def measure(gop: int, preset: str, data: Path) -> Iterator[dict]:
-    """The entry of one length."""
+def measure(gop: int, lengths: list[int], preset: str, data: Path) -> Iterator[dict]:
+    """The entries of one length of groups, for each length of random access."""
     from gscodec.encode.settings import EncodeSettings
-    from gscodec.train.settings import LOSS, train_settings
+    from gscodec.train.settings import coding_loss, train_settings
 
     capture, settings = walk(data), train_settings(preset, gop=gop)
     groups, trained = sequence(capture, settings)
     model = evaluate(capture, shown(groups))
-    size, decoded, seconds, report = coded(capture, groups, settings, EncodeSettings(None, loss=LOSS[preset]))
-    result = evaluate(capture, decoded)
-    psnr = np.array([f["psnr_fg"] for f in result["per_frame"]])
     starts = np.cumsum([0, *(len(g) for g in groups)])
     edges = sorted({int(t) for a, b in pairwise(starts) for t in (a, b - 1)})
-    first, later = report.group_rates()
-    yield {
-        "capture": "lumberjack-150, half size",
-        "held_out": list(HELD_OUT),
-        "preset": preset,
-        "gop": gop,
-        "seconds_per_frame": round((trained + seconds) / len(decoded), 2),
-        "psnr_of_model": round(model["psnr_fg"], 3),
-        "psnr": round(result["psnr_fg"], 3),
-        "psnr_of_first_group": round(float(psnr[: starts[1]].mean()), 3),
-        "psnr_of_last_group": round(float(psnr[starts[-2] :].mean()), 3),
-        "psnr_at_edges": round(float(psnr[edges].mean()), 3),
-        "flicker": result["flicker"],
-        "coded_quality": round(report.quality, 2),
-        "kb_per_frame": round(size / 1000 / len(decoded), 3),
-        "kb_per_frame_of_first_group": round(first, 3),
-        "kb_per_frame_of_later_groups": later and round(later, 3),
-        "groups": report.group_list,
-    }
+    for random_access in lengths:
+        encoding = EncodeSettings(None, loss=coding_loss(preset, capture), random_access=random_access)
+        size, decoded, seconds, report = coded(capture, groups, settings, encoding)
+        result = evaluate(capture, decoded)
+        psnr = np.array([f["psnr_fg"] for f in result["per_frame"]])
+        first, later = report.group_rates()
+        yield {
+            "capture": "lumberjack-150, half size",
+            "held_out": list(HELD_OUT),
+            "preset": preset,
+            "gop": gop,
+            "random_access": random_access,
+            "seconds_per_frame": round((trained + seconds) / len(decoded), 2),
+            "psnr_of_model": round(model["psnr_fg"], 3),
+            "psnr": round(result["psnr_fg"], 3),
+            "psnr_of_first_group": round(float(psnr[: starts[1]].mean()), 3),
+            "psnr_of_last_group": round(float(psnr[starts[-2] :].mean()), 3),
+            "psnr_at_edges": round(float(psnr[edges].mean()), 3),
+            "flicker": result["flicker"],
+            "coded_quality": round(report.quality, 2),
+            "kb_per_frame": round(size / 1000 / len(decoded), 3),
+            "kb_per_frame_of_first_group": round(first, 3),
+            "kb_per_frame_of_later_groups": later and round(later, 3),
+            "groups": report.group_list,
+        }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--gop", default="20,30", help="lengths, comma-separated")
+    parser.add_argument("--gop", default="20,30", help="lengths of a group, comma-separated")
+    parser.add_argument("--random-access", default="60,150", help="frames from one independent group to the next")
     parser.add_argument("--preset", default="fast", choices=("fast", "medium", "slow"))
     parser.add_argument("--data", type=Path, default=os.environ.get("GSCODEC_DATA"), help="folder with the captures")
     parser.add_argument("--out", type=Path, default=RESULTS, help="the result file; its other entries stay")
     args = parser.parse_args()
     if args.data is None:
         parser.error("needs the data folder, set --data or GSCODEC_DATA")
+    lengths = [int(n) for n in args.random_access.split(",")]
     for gop in (int(g) for g in args.gop.split(",")):
-        entries = measure(gop, args.preset, Path(args.data))
-        for e in update_entries(args.out, entries, lambda e: [e[k] for k in ("capture", "preset", "gop")]):
+        entries = measure(gop, lengths, args.preset, Path(args.data))
+        for e in update_entries(args.out, entries, lambda e: [e[k] for k in KEY]):
             print({k: v for k, v in e.items() if k != "groups"}, flush=True)
 
 

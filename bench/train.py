@@ -153,12 +153,12 @@ def measure(run: Run, data: Path) -> Iterator[dict]:
         UsageError: the capture is not in the data folder.
     """
     from gscodec.encode.settings import EncodeSettings
-    from gscodec.train.settings import LOSS, train_settings
+    from gscodec.train.settings import coding_loss, train_settings
 
     capture = CASES[run.case].open(data)
     chosen = range(capture.frame_count)[slice(*(int(x) if x else None for x in (run.frames or ":").split(":")))]
     settings = train_settings(run.preset, run.quality)
-    encoding = EncodeSettings(run.quality, loss=LOSS[run.preset])
+    encoding = EncodeSettings(run.quality, loss=coding_loss(run.preset, capture))
     recipe = {"gscodec": _ours, "alone": _alone, "v3": _v3}[run.recipe]
     for name, seconds, size, models, *more in recipe(capture, chosen, settings, encoding):
         result = evaluate(part(capture, chosen), models, vmaf=CASES[run.case].vmaf)

@@ -270,12 +270,12 @@ def trained_source(
     """
     from ..train.checkpoint import Checkpoint
     from ..train.refinement import PictureRefinement
-    from ..train.settings import LOSS
+    from ..train.settings import coding_loss
 
     limit_torch_threads()
     recipe = _recipe(options, settings)
     recipe = replace(recipe, keyframe_steps=round(longer * recipe.keyframe_steps))
-    settings = replace(settings, loss=LOSS[options.preset])
+    settings = replace(settings, loss=coding_loss(options.preset, capture))
     work, trained = out.with_name(out.name + ".work"), capture.indices("train")
     return Source(
         partial(_local_groups, capture, recipe, settings.random_access, work, rig, bar),

@@ -53,7 +53,7 @@ def train_to_folder(
     require("torch", "training a capture")
     from ..splats import SequenceWriter
     from ..train.checkpoint import Checkpoint
-    from ..train.settings import LOSS, train_settings
+    from ..train.settings import coding_loss, train_settings
     from ..train.train import train_groups
     from .sources import limit_torch_threads, open_rig_of_capture
 
@@ -70,7 +70,7 @@ def train_to_folder(
         "sh_degree": recipe.sh_degree,
         "gaussians": recipe.gaussians_max,
         "frames": options.gop,
-        "loss": LOSS[options.preset],
+        "loss": coding_loss(options.preset, capture),
     }
     same = _goes_on(unfinished, made_by)
     writer = SequenceWriter(folder, capture.fps, capture.cameras, training=training, resume=same)

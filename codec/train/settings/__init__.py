@@ -60,6 +60,7 @@ __all__ = [
     "TrackingSettings",
     "TrainSettings",
     "VisualHullSettings",
+    "coding_loss",
     "train_settings",
 ]
 
@@ -152,12 +153,18 @@ PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
 }
 DRIFT = {"fast": 2.0, "medium": 2.0, "slow": 3.5}  # drift_ratio: a keyframe of more steps fits its own pictures better
 LOSS = {"fast": 0.5, "medium": 0.1, "slow": 0.1}  # decibels by which very fine steps may be better, without a quality
+LOSS_OF_ROOM = 0.3  # at least so many without masks: few views of a room are fitted far better than others see it
 
 
 MOTIONS = {  # --motion
     "field": MotionFieldSettings(),
     "nodes": MotionFieldSettings(tracking=False, finetune=False),
 }
+
+
+def coding_loss(preset: str, capture) -> float:
+    """Decibels of the PSNR on the capture's own pictures that coding may cost where nobody names a quality."""
+    return LOSS[preset] if capture.has_alpha else max(LOSS[preset], LOSS_OF_ROOM)
 
 
 def train_settings(preset: str, quality: float | None = None, *, motion: str = "field", **changes) -> TrainSettings:
