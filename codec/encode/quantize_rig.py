@@ -11,11 +11,13 @@ from .quantization_plan import Grid
 
 ARM = 0.25  # of the extent of the skeleton: how far from a joint an error of a step is one of the nodes' step
 ROTATION_STEP_MOST = 0.05  # radians
+JOINT_STEP = 1.4  # of the step of the nodes, which take up what the joints leave
 MAX_VALUE = 2**24
 
 
 def quantize_rig(rig: RigMotion, grid: Grid, step: float) -> QuantizedRig:
-    """The integers of a rig of a group on `grid`; `step`: of translations of nodes, world units, and of joints."""
+    """The integers of a rig of a group on `grid`; `step`: of translations of nodes, world units."""
+    step = float(np.float32(JOINT_STEP * step))
     extent = float(np.ptp(rig.joints, axis=0).max(initial=0.0))
     rotation_step = float(np.float32(min(step / max(ARM * extent, 1e-12), ROTATION_STEP_MOST)))
     steps = np.repeat([rotation_step, step], 3)
