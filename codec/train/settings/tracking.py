@@ -85,7 +85,7 @@ class TrackingSettings:
     searched_scale: float = 0.25  # of the images in the first of two stiff rounds behind a search
     # Without a known velocity, or with that of a search, first rounds: stiff nodes and slow attributes, or else
     # far-moved Gaussians take the colours of what they lie over.
-    first_round_rigidity: float = 25.0  # times `rigidity`
+    first_round_rigidity: float = 8.0  # times `rigidity`
     first_round_rates: float = 0.1  # times `rates`
     mask_factor: float = 3.0  # times mask_lambda: the silhouette does not depend on light
     gradient_quantile: float = 0.995  # of the screen gradients in a keyframe: the reference for densification
