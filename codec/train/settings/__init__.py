@@ -153,7 +153,7 @@ PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
 }
 DRIFT = {"fast": 2.0, "medium": 2.0, "slow": 3.5}  # drift_ratio: a keyframe of more steps fits its own pictures better
 LOSS = {"fast": 0.5, "medium": 0.1, "slow": 0.1}  # decibels by which very fine steps may be better, without a quality
-LOSS_OF_ROOM = 0.3  # at least so many without masks: few views of a room are fitted far better than others see it
+LOSS_OF_ROOM = 0.5  # at least so many without masks: few views of a room are fitted far better than others see it
 
 
 MOTIONS = {  # --motion
