@@ -129,14 +129,12 @@ def training(work: Path) -> Iterator[dict]:
 
 
 def whole(entries: list[dict]) -> dict:
-    """With the change of the size at equal PSNR."""
+    """With the change of the size at equal PSNR of each case whose entries are all there, and of one commit."""
     saved = {}
     for case in ("splats", "training"):
-        curves = [
-            [(e["bytes"], e["psnr"]) for e in entries if (e["case"], e["rig"]) == (case, r)] for r in (False, True)
-        ]
-        if all(len(c) == len(QUALITIES) for c in curves):
-            saved[case] = bd_rate(*curves)
+        own = [e for e in entries if e["case"] == case]
+        if len(own) == 2 * len(QUALITIES) and len({e["measured"]["commit"] for e in own}) == 1:
+            saved[case] = bd_rate(*([(e["bytes"], e["psnr"]) for e in own if e["rig"] == r] for r in (False, True)))
     figures = {"splats": SPLATS, "training": TRAINED | {"cameras": CAMERAS, "held_out": HELD_OUT, "size": SIZE}}
     return {"settings": figures, "size_at_equal_psnr_percent": saved, "entries": entries}
 
