@@ -24,14 +24,13 @@ from gscodec.capture import Capture
 from gscodec.encode.settings import EncodeSettings
 from gscodec.errors import UsageError
 from gscodec.model.gaussians import Gaussians
-from gscodec.train.settings import LOSS, train_settings
+from gscodec.train.settings import coding_loss, train_settings
 
 from . import train
 from .machine import update_entries
 from .stress_scenes import CASES, Stress
 
 PRESET = "fast"
-ENCODING = EncodeSettings(loss=LOSS[PRESET])
 BUDGET = {"gaussians_max": 3750, "initial_points": 2000}  # for pictures of 128 x 128
 BUDGETS = {  # case -> changes of the budget
     "300 frames": {
@@ -96,13 +95,13 @@ def verdict(found: dict, case: Stress) -> str:
 
 def compare(capture: Capture, **budget) -> dict:
     """Results of one capture; `budget`: changes of the training settings."""
-    settings = train_settings(PRESET, **budget)
+    settings, encoding = train_settings(PRESET, **budget), EncodeSettings(loss=coding_loss(PRESET, capture))
     for camera in range(len(capture.cameras)):  # traced and cached here, so that training is timed without it
         for t in range(capture.frame_count):
             capture.view(camera, t)
     groups, seconds = train.sequence(capture, settings)
     models = train.shown(groups)
-    size, decoded, _, report = train.coded(capture, groups, settings, ENCODING)
+    size, decoded, _, report = train.coded(capture, groups, settings, encoding)
     ours, trained = train.evaluate(capture, decoded), train.evaluate(capture, models)
     there = [t for t in range(capture.frame_count) if _subject(capture, t)]
     keyframes = sum(g.parents is None for g in groups)
@@ -111,7 +110,7 @@ def compare(capture: Capture, **budget) -> dict:
         "psnr_fg_worst": min((ours["per_frame"][t]["psnr_fg"] for t in there), default=None),
         "psnr_fg_uncoded": _mean(trained, there),
         "quality": report.quality,
-        **_alone(capture, ours, there, settings),
+        **_alone(capture, ours, there, settings, encoding),
         "haze": ours.get("haze"),
         "haze_most": max(r["haze"] for r in ours["per_frame"]),
         "flicker": ours["flicker"],
@@ -129,13 +128,13 @@ def compare(capture: Capture, **budget) -> dict:
     }
 
 
-def _alone(capture: Capture, ours: dict, there: list[int], settings) -> dict:
+def _alone(capture: Capture, ours: dict, there: list[int], settings, encoding: EncodeSettings) -> dict:
     """What frames alone reach, coded, and what the sequence (`ours`) has lost against them in the frames `there`."""
     chosen = range(0, capture.frame_count, -(-capture.frame_count // ALONE_MOST))
     settings = _converged(capture, next((t for t in chosen if t in there), chosen[0]), settings)
     alone, seconds = train.every_frame_alone(capture, chosen, settings)
     part = train.part(capture, chosen)
-    size, decoded, *_ = train.coded(part, alone, settings, ENCODING)
+    size, decoded, *_ = train.coded(part, alone, settings, encoding)
     theirs = train.evaluate(part, decoded)
     both = [(t, i) for i, t in enumerate(chosen) if t in there]
     lost = [theirs["per_frame"][i]["psnr_fg"] - ours["per_frame"][t]["psnr_fg"] for t, i in both]
