@@ -4,7 +4,8 @@ usage: python -m bench.player FOLDER [statue] [demo] ...
 
 Streams lie in FOLDER; a missing one is encoded first, which is not measured:
   demo         the bundled capture
-  demo_slow    the same with the preset slow: 14,271 Gaussians, about as many as lumberjack has at 512 x 512 (medium)
+  demo_slow    the same with the preset slow
+  lumberjack   the lumberjack of the data folder at 512 x 512, with the default preset
   statue       the moving statue of the data folder (GSCODEC_DATA), 40 frames, without Gaussians that no view shows
   statue_all   the same with all of its 101,275 Gaussians
   long         the same as statue with 300 frames, for the memory
@@ -44,6 +45,7 @@ LOADS = 5
 SLOW = {"offline": False, "latency": 40, "downloadThroughput": 2e6 / 8, "uploadThroughput": 2e6 / 8}
 PLAYER = "document.querySelector('gsv-player')"
 DEMOS = {"demo": (), "demo_slow": ("--preset", "slow")}
+CAPTURES = ("lumberjack",)
 STATUES = {"statue": (40, ()), "statue_all": (40, ("--keep-all",)), "long": (300, ())}
 
 # keeps the time of the first picture in the page
@@ -136,6 +138,8 @@ def streams(folder: Path, names: list[str]) -> dict[str, Path]:
         path = folder / f"{name}.gsv"
         if not path.exists() and name in DEMOS:
             gscodec("encode", ROOT / "examples" / "lumberjack", path, *DEMOS[name])
+        elif not path.exists() and data and name in CAPTURES:
+            gscodec("encode", data / name, path)
         elif not path.exists() and data:
             frames, options = STATUES[name]
             gscodec("encode", animated(data, folder, frames), path, *options)
@@ -243,7 +247,7 @@ def measure(browsers: Browsers, name: str, path: Path) -> dict:
 
 def main() -> None:
     """Measures the streams named on the command line, all by default."""
-    all_ = [*DEMOS, *STATUES]
+    all_ = [*DEMOS, *CAPTURES, *STATUES]
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="where the streams are made and kept")
     parser.add_argument("streams", nargs="*", metavar="STREAM", help=f"of {', '.join(all_)}; all by default")
