@@ -1,38 +1,50 @@
-"""Ablation: two captures are trained without one loss or tool at a time, and with other cut ratios.
+"""Ablation: captures are trained without one loss or tool at a time.
 
-lumberjack is the bundled capture, a subject with masks; stage (in the data folder, at half its size) is a full room
-into which a ball drops. bench/results/ablation.json has one entry per capture and variant, all from the same seed and
-preset. `psnr` is that of the model before coding, `psnr_coded` that of the decoded stream; both are measured on the
-test cameras, of the subject where there are masks. A variant is a change of the training settings, so that each entry
-can be repeated by any caller of the training.
+lumberjack is the bundled capture, a subject with masks; stage and basketball (in the data folder, at half their size)
+are full rooms, into one of which a ball drops; the others are stress cases. bench/results/ablation.json has one entry
+per capture and variant, all from the same seed and preset; "another seed" says which differences mean nothing. `psnr`
+is that of the model before coding, `psnr_coded` that of the decoded stream; both are measured on the test cameras, of
+the subject where there are masks. A variant is a change of the training settings, so that each entry can be repeated by
+any caller of the training. What moves the nodes is compared at equal time: a variant that is faster or slower than the
+whole recipe is trained again with as many more steps a frame, or fewer.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gscodec.capture import Capture
 from gscodec.encode.settings import EncodeSettings
 from gscodec.errors import UsageError
+from gscodec.model.parametric_group import ParametricGroup
 from gscodec.train.settings import MOTIONS, TrackingSettings, TrainSettings, train_settings
 
 from . import train
 from .machine import ROOT, update_entries
+from .stress_scenes import CASES as STRESS
+from .stress_scenes import drawn
 
 WHOLE = "whole recipe"
-LUMBERJACK, STAGE = "lumberjack", "stage"
-FRAMES = {LUMBERJACK: (0, 10), STAGE: (7, 15)}  # the ball comes at 10
+LUMBERJACK, STAGE, BASKETBALL, FAST, FEW = "lumberjack", "stage", "basketball", "fast motion", "4 cameras"
+FRAMES = {LUMBERJACK: (0, 10), STAGE: (7, 15), BASKETBALL: (0, 8), FAST: (0, 12), FEW: (0, 12)}  # the ball comes at 10
+EQUAL = 0.05  # share by which times may differ
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A change of the settings, and the captures that use what it takes away."""
+    """A change of the settings.
+
+    Attributes:
+        captures: those that use what it takes away.
+        equal_time: the steps of a frame are scaled until training takes as long as the whole recipe.
+    """
 
     change: Callable[[TrainSettings], TrainSettings]
     captures: tuple[str, ...] = (LUMBERJACK, STAGE)
+    equal_time: bool = False
 
 
 def run_with(**values) -> Callable[[TrainSettings], TrainSettings]:
@@ -47,20 +59,24 @@ def stage_with(stage: str, **values) -> Callable[[TrainSettings], TrainSettings]
 
 TRACKING = TrackingSettings()
 VARIANTS = {
-    WHOLE: Variant(run_with()),
+    WHOLE: Variant(run_with(), tuple(FRAMES)),
+    "another seed": Variant(run_with(seed=1), tuple(FRAMES)),
     "no D-SSIM": Variant(run_with(ssim_lambda=0.0)),
     "no mask term": Variant(run_with(mask_lambda=0.0), (LUMBERJACK,)),
     "no rigidity": Variant(run_with(rigidity=0.0)),
-    "nodes alone": Variant(run_with(motion_field=MOTIONS["nodes"])),
+    "nodes alone": Variant(run_with(motion_field=MOTIONS["nodes"]), tuple(FRAMES), equal_time=True),
     "field alone": Variant(  # the nodes have no variables of their own
         lambda s: stage_with("finetune", node_rotation_rate=0.0, node_translation_rate=0.0)(
             stage_with("tracking", node_rotation_rate=0.0, node_translation_rate=0.0)(s)
-        )
+        ),
+        tuple(FRAMES),
+        equal_time=True,
     ),
     "no rate term": Variant(run_with(rate_lambda=0.0)),
     "no fine-tuning": Variant(run_with(finetune_steps=0)),
-    "no cuts": Variant(lambda s: stage_with("group", drift_ratio=math.inf)(replace(s, cut_ratio=math.inf))),
-    "cut ratio 3": Variant(run_with(cut_ratio=3.0)),
+    "no cuts": Variant(lambda s: stage_with("group", drift_ratio=math.inf)(replace(s, cut_ratio=math.inf)), (FAST,)),
+    "no search": Variant(stage_with("motion_search", ratio=math.inf), (FAST,)),
+    "first rounds not stiff": Variant(stage_with("tracking", first_round_rigidity=1.0), (FAST,)),
     "colours held in tracking": Variant(stage_with("tracking", rates=TRACKING.rates.but(sh0=0.0, shN=0.0))),
     "full-size pictures only": Variant(stage_with("tracking", small_scale=1.0)),
     "nothing held still": Variant(stage_with("change_detection", threshold=-1.0)),
@@ -81,12 +97,12 @@ VARIANTS = {
 
 
 def run(
-    captures: Iterable[str], names: list[str] | None, preset: str, quality: float, data: Path | None, out: Path
+    captures: Iterable[str], names: Sequence[str] | None, preset: str, quality: float, data: Path | None, out: Path
 ) -> Iterator[dict]:
     """Yields the entries of each capture and puts them into the result file `out` as they come.
 
     Args:
-        names: variants; None: all that use the capture.
+        names: variants; None: all that use the capture. The whole recipe is measured first, if one is at equal time.
 
     Raises:
         UsageError: a capture is not in the data folder.
@@ -94,30 +110,52 @@ def run(
     for capture in captures:
         opened = _open(capture, data)
         chosen = names or [n for n, v in VARIANTS.items() if capture in v.captures]
-        entries = ({"capture": capture, **_entry(opened, name, preset, quality)} for name in chosen)
+        entries = ({"capture": capture, **entry} for entry in _entries(opened, chosen, preset, quality))
         yield from update_entries(out, entries, lambda e: [e["capture"], e["variant"], e["preset"]])
 
 
 def _open(capture: str, data: Path | None) -> Capture:
     from gscodec.capture import open_capture
 
+    first, end = FRAMES[capture]
     if capture == LUMBERJACK:
-        return open_capture(ROOT / "examples" / "lumberjack").frames(*FRAMES[capture])
+        return open_capture(ROOT / "examples" / "lumberjack").frames(first, end)
+    if capture in STRESS:
+        return drawn(STRESS[capture].capture(end))
     if data is None:
         raise UsageError(f"--capture {capture} needs the data folder, expected --data or GSCODEC_DATA")
-    return train.CASES[capture].open(data).frames(*FRAMES[capture]).scaled(0.5)
+    return train.CASES[capture].open(data).frames(first, end).scaled(0.5)
 
 
-def _entry(capture: Capture, name: str, preset: str, quality: float) -> dict:
-    variant = VARIANTS[name]
-    settings = variant.change(train_settings(preset, quality=quality))
-    groups, seconds = train.sequence(capture, settings)
+def _entries(capture: Capture, names: Sequence[str], preset: str, quality: float) -> Iterator[dict]:
+    whole = None  # seconds of the whole recipe
+    if any(VARIANTS[name].equal_time for name in names):
+        names = [WHOLE, *(name for name in names if name != WHOLE)]
+    for name in names:
+        variant = VARIANTS[name]
+        settings = variant.change(train_settings(preset, quality=quality))
+        groups, seconds = train.sequence(capture, settings)
+        if name == WHOLE:
+            whole = seconds
+        elif variant.equal_time and abs(whole / seconds - 1) > EQUAL:
+            settings = _with_steps(settings, whole / seconds)
+            groups, seconds = train.sequence(capture, settings)
+        yield {"variant": name, "preset": preset, **_measured(capture, groups, seconds, settings, quality)}
+
+
+def _with_steps(settings: TrainSettings, factor: float) -> TrainSettings:
+    """The settings with `factor` times the steps of a frame."""
+    steps = {name: round(factor * getattr(settings, name)) for name in ("motion_steps", "finetune_steps")}
+    return replace(settings, **steps)
+
+
+def _measured(
+    capture: Capture, groups: list[ParametricGroup], seconds: float, settings: TrainSettings, quality: float
+) -> dict:
     models = train.shown(groups)
     size, decoded, *_ = train.coded(capture, groups, settings, EncodeSettings(quality))
     model, stream = (train.evaluate(capture, frames) for frames in (models, decoded))
     return {
-        "variant": name,
-        "preset": preset,
         "quality": quality,
         "frames": len(models),
         "psnr": model["psnr_fg"] or model["psnr"],
@@ -127,5 +165,6 @@ def _entry(capture: Capture, name: str, preset: str, quality: float) -> dict:
         "flicker": stream["flicker"],
         "gaussians": model["gaussians"],
         "groups": [len(g) for g in groups],
+        "steps": [settings.motion_steps, settings.finetune_steps],
         "seconds_per_frame": round(seconds / len(models), 2),
     }

@@ -28,7 +28,7 @@ from gscodec.train.settings import coding_loss, train_settings
 
 from . import train
 from .machine import update_entries
-from .stress_scenes import CASES, Stress
+from .stress_scenes import CASES, Stress, drawn
 
 PRESET = "fast"
 BUDGET = {"gaussians_max": 3750, "initial_points": 2000}  # for pictures of 128 x 128
@@ -96,10 +96,7 @@ def verdict(found: dict, case: Stress) -> str:
 def compare(capture: Capture, **budget) -> dict:
     """Results of one capture; `budget`: changes of the training settings."""
     settings, encoding = train_settings(PRESET, **budget), EncodeSettings(loss=coding_loss(PRESET, capture))
-    for camera in range(len(capture.cameras)):  # traced and cached here, so that training is timed without it
-        for t in range(capture.frame_count):
-            capture.view(camera, t)
-    groups, seconds = train.sequence(capture, settings)
+    groups, seconds = train.sequence(drawn(capture), settings)
     models = train.shown(groups)
     size, decoded, _, report = train.coded(capture, groups, settings, encoding)
     ours, trained = train.evaluate(capture, decoded), train.evaluate(capture, models)

@@ -108,6 +108,14 @@ def basketball(frames: int) -> Capture:
     return CAPTURES["basketball"].open(data_folder()).frames(0, frames).scaled(0.5)
 
 
+def drawn(capture: Capture) -> Capture:
+    """The capture, its pictures drawn and kept, so that training is timed without that."""
+    for camera in range(len(capture.cameras)):
+        for t in range(capture.frame_count):
+            capture.view(camera, t)
+    return capture
+
+
 @dataclass(frozen=True)
 class Stress:
     """A case.

@@ -8,6 +8,7 @@ model         our training before coding, without a size
 gscodec       the same decoded from the stream, with still_gaussians and still_bits (still.py)
 alone         a keyframe for every frame with the keyframe budget of the preset: the reference for tracking
 alone-coded   the same decoded from our stream, every frame a group of its own
+full          a keyframe for every frame with all the steps and Gaussians that help (FULL): what the pictures allow
 v3            V3's recipe in about the time of our preset medium (baselines/v3.py)
 v3-coded      the same through V3's packing (baselines/videogs.py)
 """
@@ -36,7 +37,9 @@ from .still import still_share
 if TYPE_CHECKING:
     from gscodec.encode.encode import EncodeReport
 
-RECIPES = ("gscodec", "alone", "v3")
+RECIPES = ("gscodec", "alone", "full", "v3")
+FULL = {"keyframe_steps": 12_000, "gaussians_max": 156_250}  # of which a keyframe may have 125,000
+FULL_PRICES = {"gradient_min": 1e-4, "contribution_min": 1.0}
 V3_PACKING = {"qp": 25, "raw": True}  # its default qp, and the better of its two scripts
 V3_GOP = 20  # frames in a group of V3
 KEYS = ("psnr", "psnr_fg", "psnr_corrected", "ssim", "vmaf", "gaussians", "kb_per_frame", "flicker")
@@ -159,7 +162,7 @@ def measure(run: Run, data: Path) -> Iterator[dict]:
     chosen = range(capture.frame_count)[slice(*(int(x) if x else None for x in (run.frames or ":").split(":")))]
     settings = train_settings(run.preset, run.quality)
     encoding = EncodeSettings(run.quality, loss=coding_loss(run.preset, capture))
-    recipe = {"gscodec": _ours, "alone": _alone, "v3": _v3}[run.recipe]
+    recipe = {"gscodec": _ours, "alone": _alone, "full": _full, "v3": _v3}[run.recipe]
     for name, seconds, size, models, *more in recipe(capture, chosen, settings, encoding):
         result = evaluate(part(capture, chosen), models, vmaf=CASES[run.case].vmaf)
         yield {
@@ -202,6 +205,12 @@ def _alone(capture: Capture, frames: range, settings, encoding) -> Iterator[tupl
     yield "alone", seconds, None, shown(alone)
     size, decoded, more, _ = coded(part(capture, frames), alone, settings, encoding)
     yield "alone-coded", seconds + more, size, decoded
+
+
+def _full(capture: Capture, frames: range, settings, _) -> Iterator[tuple]:
+    settings = replace(settings, **FULL, keyframe=replace(settings.keyframe, **FULL_PRICES))
+    alone, seconds = every_frame_alone(capture, frames, settings)
+    yield "full", seconds, None, shown(alone)
 
 
 def _v3(capture: Capture, frames: range, settings, _) -> Iterator[tuple]:
@@ -276,6 +285,7 @@ def every_frame_alone(capture: Capture, frames: Sequence[int], settings) -> tupl
     from gscodec.train.views import Views
 
     torch.set_num_threads(1)  # as the commands do
+    settings = settings if capture.has_alpha else settings.of_room()
     groups, start = [], time.perf_counter()
     for frame in frames:
         views = Views(capture, settings, CpuBackend())

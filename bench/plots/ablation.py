@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from ..machine import stamp
 
 WHOLE = "whole recipe"
@@ -20,13 +22,14 @@ def ablation_chart(result: dict):
         entries = {e["variant"]: e for e in result["entries"] if e["capture"] == capture}
         whole = entries.pop(WHOLE)
         for axes, (key, label) in zip(row, PANELS.items(), strict=True):
-            change = [e[key] - whole[key] for e in entries.values()]
+            at = whole[key]  # None: no pixel stands still, so that none flickers
+            change = [math.nan if None in (at, e[key]) else e[key] - at for e in entries.values()]
             colors = [LESS if c < 0 else MORE for c in change]
             axes.barh(list(entries), change, color=colors, height=0.7)
             axes.axvline(0, color="#444444", linewidth=0.8)
             axes.invert_yaxis()
             axes.grid(axis="x", alpha=0.25)
-            axes.set(xlabel=f"{label}, less {whole[key]:.2f} of the whole recipe")
+            axes.set(xlabel=f"{label}, less {math.nan if at is None else at:.2f} of the whole recipe")
             axes.tick_params(axis="y", length=0, labelleft=key == "psnr_coded")
         row[0].set_title(f"{capture}, {whole['frames']} frames, {whole['preset']}", loc="left", weight="bold")
     text = f"test cameras; {stamp(result['entries'])}"

@@ -11,6 +11,7 @@ LOOK = {  # recipe -> name, colour
     "gscodec": ("gscodec", "#1f5fb4"),
     "alone": ("every frame alone", "#e0a96d"),
     "alone-coded": ("every frame alone, coded", "#c76f14"),
+    "full": ("every frame alone, in full", "#5a9a4a"),
     "v3": ("V3's recipe", "#9a9a9a"),
     "v3-coded": ("V3's recipe and packing", "#555555"),
 }
@@ -46,6 +47,8 @@ def _panel(axes, entries: Sequence[dict], key: str) -> None:
         x, y, presets = zip(*points, strict=True)
         ours = recipe == "gscodec"
         axes.plot(x, y, marker="o", color=color, label=name, linewidth=2.4 if ours else 1.2, zorder=3 if ours else 2)
+        if recipe == "full":  # of no preset
+            continue
         for at, preset in zip(zip(x, y, strict=True), presets, strict=True):
             axes.annotate(preset, at, (4, -9), textcoords="offset points", fontsize=7, color=color)
     axes.grid(alpha=0.25)

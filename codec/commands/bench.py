@@ -97,7 +97,7 @@ def rd(
 @bench.command()
 def train(
     capture: Annotated[str | None, typer.Option(help="Comma-separated cases, see bench/train.py.")] = None,
-    recipe: Annotated[str | None, typer.Option(help="Comma-separated: gscodec, alone (every frame), v3.")] = None,
+    recipe: Annotated[str | None, typer.Option(help="Comma-separated: gscodec, alone (every frame), full, v3.")] = None,
     preset: Preset = PRESET,
     frames: Annotated[str | None, typer.Option(metavar="A:B:STEP", help="Only these frames.")] = None,
     quality: Quality = None,
@@ -127,7 +127,9 @@ def train(
 
 @bench.command()
 def ablation(
-    capture: Annotated[str, typer.Option(help="Comma-separated: lumberjack (bundled), stage.")] = "lumberjack",
+    capture: Annotated[
+        str, typer.Option(help="Comma-separated: lumberjack (bundled), stage, basketball, fast motion, 4 cameras.")
+    ] = "lumberjack",
     variant: Annotated[str | None, typer.Option(help="Comma-separated variants, see bench/ablation.py.")] = None,
     preset: Preset = "fast",
     quality: Quality = 50.0,

@@ -23,7 +23,7 @@ from .finetune import Frame, GroupModel
 from .keyframe import Statistics, split_or_clone
 from .motion_field import MotionField
 from .settings import TrainSettings
-from .views import Target, Views, start_photometric_loss
+from .views import Target, Views, add_harmonics_prior, start_photometric_loss
 
 
 class _Finetuner:
@@ -72,8 +72,7 @@ class _Finetuner:
         self.statistics.add(result, f.views)
         for target, by_exposure in zip(targets, result.grad_exposure, strict=True):
             self.views.exposure.learn_in(self.frames[t], target.index, by_exposure, decay)
-        k = self.settings.keyframe
-        result.grads["shN"].add_(group.key.params["shN"], alpha=f.views * k.harmonics_weight / len(group.key))
+        add_harmonics_prior(result.grads, group.key.params, self.views, self.settings, f.views)
         residuals, canonical, by_rotations = group.gradients(frame, result.grads)
         self._step_nodes(t, frame, result.grads["means"], by_rotations, decay)
         if self.settings.rate_lambda and self.rng.integers(f.rate_every) == 0:

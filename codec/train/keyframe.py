@@ -19,7 +19,7 @@ from ..model.rotations import quat_normalize, rotate
 from ..render.backend import PendingLoss, RenderLoss
 from .model import REMOVED_LOGIT, Model
 from .settings import KeyframeSettings, TrainSettings
-from .views import Target, Views, start_photometric_loss, view_losses
+from .views import Target, Views, add_harmonics_prior, start_photometric_loss, view_losses
 
 
 class Statistics:
@@ -144,15 +144,15 @@ class _Run:
         if self._started is None:
             return
         view, self._started = self._started, None
-        k, model, result = self.settings.keyframe, self.model, view.pending()
+        k, model, views, result = self.settings.keyframe, self.model, self.views, view.pending()
         self.statistics.add(result)
         self.losses.append(result.image_loss)
         progress = view.step / max(self.steps - 1, 1)
         decay = k.rate_decay**progress
-        self.views.exposure.learn(view.target.index, result.grad_exposure[0], decay)
+        views.exposure.learn(view.target.index, result.grad_exposure[0], decay)
         if view.step >= k.appearance_from * self.steps:
-            self.views.extrinsics.learn(view.target.index, model.params, result.grads, decay)
-        result.grads["shN"].add_(model.params["shN"], alpha=k.harmonics_weight / len(model))
+            views.extrinsics.learn(view.target.index, model.params, result.grads, decay)
+        add_harmonics_prior(result.grads, model.params, views, self.settings)
         means_rate = self.radius * k.rates["means"] * (k.means_rate_end / k.rates["means"]) ** progress
         model.step(result.grads, {**k.rates.scaled(self.radius, decay), "means": means_rate})
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from ..capture import View, cropped
 from ..capture.epipolar import epipolar_error
@@ -218,6 +219,15 @@ def _lambdas(settings: TrainSettings) -> dict[str, float]:
         "mask_lambda": settings.mask_lambda,
         "depth_lambda": settings.depth_lambda,
     }
+
+
+def add_harmonics_prior(
+    grads: dict[str, torch.Tensor], params: dict, views: Views, settings: TrainSettings, pictures: int = 1
+) -> None:
+    """Adds to the gradients of `pictures` those of a normal prior of the harmonics around 0, which every round of the
+    training cameras counts once: the more views there are, the more they say themselves."""
+    shN, rounds = params["shN"], pictures / len(views.train_cameras)
+    grads["shN"].add_(shN, alpha=rounds * settings.harmonics_lambda / len(shN))
 
 
 def view_losses(

@@ -80,6 +80,8 @@ class TrainSettings:
         ssim_lambda: share of D-SSIM in the image loss (3D Gaussian Splatting: 0.2).
         mask_lambda: weight of the alpha loss where the capture has masks.
         depth_lambda: weight of the depth loss where the capture has depth images.
+        harmonics_lambda: weight of half the square of the harmonics in a round of the training cameras, mean over the
+            Gaussians: few views say little of them, and they cost bits.
         cut_ratio: a frame whose image loss exceeds that of the frame before by this factor starts anew.
         rigidity: weight of the as-rigid-as-possible term.
         rate_lambda: share by which the image loss may rise where bits fall by one share.
@@ -98,6 +100,7 @@ class TrainSettings:
     ssim_lambda: float = 0.2
     mask_lambda: float = 0.1
     depth_lambda: float = 0.1
+    harmonics_lambda: float = 0.5
     cut_ratio: float = 1.5
     rigidity: float = 0.3
     rate_lambda: float = 0.4
@@ -134,6 +137,7 @@ class TrainSettings:
         return replace(
             self,
             rigidity=self.room.rigidity * self.rigidity,
+            harmonics_lambda=self.room.harmonics * self.harmonics_lambda,
             cut_ratio=self.room.cut_ratio * self.cut_ratio,
             group=replace(self.group, drift_ratio=self.room.drift_ratio * self.group.drift_ratio),
             graph=replace(self.graph, nodes=round(self.room.nodes * self.graph.nodes)),

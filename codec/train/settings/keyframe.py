@@ -120,7 +120,6 @@ class KeyframeSettings:
     contribution_min: float = 5.0  # increase of the error without a Gaussian, in shares of the error per Gaussian
     mse_min: float = 1e-8  # mean squared error of an image below which shares of it mean nothing
     harmonics_gain_min: float = 0.02  # a coefficient of SH stays if the error grows by this share without it
-    harmonics_weight: float = 0.15  # of half the square of shN in the loss, over the Gaussians: few views say little
     prune_opacity: float = 0.02  # a Gaussian below it is removed
     prune_weight: float = 0.02  # largest blending weight in any view; a Gaussian below it is hidden and removed
     split_shrink: float = 1.6  # by which the scales of a Gaussian are divided when it is split
