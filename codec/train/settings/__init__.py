@@ -149,14 +149,14 @@ PRESETS = {
     "fast": {"keyframe_steps": 1400, "motion_steps": 130, "finetune_steps": 170},
     "medium": {},
     # A keyframe of more steps fits its own pictures better, so that the same loss is more times its own.
-    "slow": {"keyframe_steps": 7000, "finetune_steps": 600, "group": GroupSettings(drift_ratio=3.5)},
+    "slow": {"keyframe_steps": 7000, "finetune_steps": 750, "group": GroupSettings(drift_ratio=3.8)},
 }
 PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
     "fast": {"gradient_min": 4e-4, "contribution_min": 10.0},
     "medium": {"gradient_min": 3e-4, "contribution_min": 8.0},
-    "slow": {"gradient_min": 2e-4, "contribution_min": 5.0},
+    "slow": {"gradient_min": 1.5e-4, "contribution_min": 3.5},
 }
-LOSS = {"fast": 0.5, "medium": 0.1, "slow": 0.1}  # decibels by which very fine steps may be better, without a quality
+LOSS = {"fast": 0.5, "medium": 0.25, "slow": 0.2}  # decibels by which very fine steps may be better, without a quality
 LOSS_OF_ROOM = 0.5  # at least so many without masks: few views of a room are fitted far better than others see it
 
 
