@@ -1,6 +1,7 @@
 """Keyframes of tiny captures with known truth: initial points, calibration, densification, harmonics."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from gscodec.train.model import from_gaussians
 from gscodec.train.plane_sweep import shell, sweep
 from gscodec.train.sparse_points import triangulated
 from gscodec.train.train import train_groups
-from gscodec.train.views import Views
+from gscodec.train.views import Views, add_harmonics_prior
 from gscodec.train.visual_hull import hull_points, project
 
 
@@ -241,6 +242,16 @@ def test_harmonics_stay_where_colours_depend_on_the_view(gloss, kept):
     _, decoded, *_ = coded(capture, [group], settings, EncodeSettings(50.0))
     assert decoded[1].shN.shape[1] == kept
     assert psnr_of(decoded[1], capture, 1) > psnr_of(group.frame(1), capture, 1) - 1
+
+
+def test_prior_of_harmonics_weighs_as_much_with_few_cameras_as_with_many():
+    """Against the data of one round of the cameras, however many pictures a step has."""
+    shN = torch.from_numpy(np.random.default_rng(0).normal(size=(50, 15, 3)).astype(np.float32))
+    for cameras, pictures in ((4, 1), (20, 1), (20, 2)):
+        grads, views = {"shN": torch.zeros_like(shN)}, SimpleNamespace(train_cameras=range(cameras))
+        for _ in range(0, cameras, pictures):
+            add_harmonics_prior(grads, {"shN": shN}, views, TINY, pictures)
+        torch.testing.assert_close(grads["shN"], TINY.harmonics_lambda * shN / 50)
 
 
 def test_growing_and_pruning_keep_the_moments_in_step():
