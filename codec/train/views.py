@@ -224,10 +224,9 @@ def _lambdas(settings: TrainSettings) -> dict[str, float]:
 def add_harmonics_prior(
     grads: dict[str, torch.Tensor], params: dict, views: Views, settings: TrainSettings, pictures: int = 1
 ) -> None:
-    """Adds to the gradients of `pictures` those of a normal prior of the harmonics around 0, which every round of the
-    training cameras counts once: the more views there are, the more they say themselves."""
-    shN, rounds = params["shN"], pictures / len(views.train_cameras)
-    grads["shN"].add_(shN, alpha=rounds * settings.harmonics_lambda / len(shN))
+    """Adds to the gradients of `pictures` those of half the square of the harmonics."""
+    shN, many = params["shN"], len(views.train_cameras) / settings.harmonics_views
+    grads["shN"].add_(shN, alpha=pictures * settings.harmonics_lambda / max(1.0, many) ** 2 / len(shN))
 
 
 def view_losses(

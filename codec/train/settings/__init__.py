@@ -80,8 +80,9 @@ class TrainSettings:
         ssim_lambda: share of D-SSIM in the image loss (3D Gaussian Splatting: 0.2).
         mask_lambda: weight of the alpha loss where the capture has masks.
         depth_lambda: weight of the depth loss where the capture has depth images.
-        harmonics_lambda: weight of half the square of the harmonics in a round of the training cameras, mean over the
-            Gaussians: few views say little of them, and they cost bits.
+        harmonics_lambda: weight of half the square of the harmonics, mean over the Gaussians: they cost bits.
+        harmonics_views: training cameras up to which it has that weight; with more, which say more of them themselves,
+            it falls with their square.
         cut_ratio: a frame whose image loss exceeds that of the frame before by this factor starts anew.
         rigidity: weight of the as-rigid-as-possible term.
         rate_lambda: share by which the image loss may rise where bits fall by one share.
@@ -100,7 +101,8 @@ class TrainSettings:
     ssim_lambda: float = 0.2
     mask_lambda: float = 0.1
     depth_lambda: float = 0.1
-    harmonics_lambda: float = 0.5
+    harmonics_lambda: float = 0.15
+    harmonics_views: float = 10.0
     cut_ratio: float = 1.5
     rigidity: float = 0.3
     rate_lambda: float = 0.4
@@ -137,7 +139,7 @@ class TrainSettings:
         return replace(
             self,
             rigidity=self.room.rigidity * self.rigidity,
-            harmonics_lambda=self.room.harmonics * self.harmonics_lambda,
+            harmonics_views=self.room.harmonics_views,
             cut_ratio=self.room.cut_ratio * self.cut_ratio,
             group=replace(self.group, drift_ratio=self.room.drift_ratio * self.group.drift_ratio),
             graph=replace(self.graph, nodes=round(self.room.nodes * self.graph.nodes)),

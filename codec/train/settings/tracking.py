@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from ...render.optimizer import AdamSettings
@@ -59,7 +60,7 @@ class RoomSettings:
     rigidity: float = 1 / 3  # times that of a subject
     cut_ratio: float = 5 / 3  # times that of a subject, since few views of a room fit its keyframe far too well
     drift_ratio: float = 4.0  # times that of a subject, for the same reason
-    harmonics: float = 4.0  # times the weight of their prior: here they gain nothing for other views
+    harmonics_views: float = math.inf  # here more of them gain nothing for other views
     field_in_tracking: bool = False  # it drags what stands still with what moves beside it
 
 
