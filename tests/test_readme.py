@@ -87,7 +87,7 @@ def test_tables_of_streams():
 
 def test_table_of_the_player():
     streams = {e["stream"]: e for e in result("player")["entries"]}
-    names = ("demo", "demo_slow", "statue", "statue_all")
+    names = ("demo", "demo_slow", "lumberjack", "statue", "statue_all")
     for (name, *figures), found in zip(rows("512 x 512, CPU path"), map(streams.get, names), strict=True):
         shown = ("gaussians", "first_picture_ms", "fps_clock", "fps_free")
         values = [*(found[k] for k in shown), found["decode"]["wasm_ms"], found["decode"]["ratio"]]
