@@ -285,7 +285,7 @@ def every_frame_alone(capture: Capture, frames: Sequence[int], settings) -> tupl
     from gscodec.train.views import Views
 
     torch.set_num_threads(1)  # as the commands do
-    settings = settings if capture.has_alpha else settings.of_room()
+    settings = settings.of_capture(capture)
     groups, start = [], time.perf_counter()
     for frame in frames:
         views = Views(capture, settings, CpuBackend())

@@ -118,7 +118,7 @@ class _Run:
         self.capture, self.on_progress, self.rig = capture, on_progress, rig
         self.views = Views(capture, settings, backend)
         first = next((t for t in range(capture.frame_count) if self.views.show(t)), 0)  # the same in every segment
-        self.settings = with_frame_budget(settings if capture.has_alpha else settings.of_room(), self.views, first)
+        self.settings = with_frame_budget(settings.of_capture(capture), self.views, first)
         self.progress = Progress(0)
         self.subject: Subject | None = None
 

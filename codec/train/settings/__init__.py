@@ -133,8 +133,10 @@ class TrainSettings:
         if self.gop < 1:
             raise UsageError(f"--gop {self.gop} is out of range, expected at least 1 frame in a group")
 
-    def of_room(self) -> TrainSettings:
-        """The settings for a capture without masks."""
+    def of_capture(self, capture) -> TrainSettings:
+        """The settings for a capture: those of a room where it has no masks."""
+        if capture.has_alpha:
+            return self
         field = self.motion_field.tracking and self.room.field_in_tracking
         return replace(
             self,
