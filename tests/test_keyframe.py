@@ -21,7 +21,7 @@ from gscodec.render.cpu import CpuBackend
 from gscodec.render.image import render_image, render_rgba
 from gscodec.train.calibration import Extrinsics
 from gscodec.train.initialization import initial_model
-from gscodec.train.keyframe import Statistics, densify, prune, train_keyframe
+from gscodec.train.keyframe import Statistics, add_opacity_decay, densify, move_at_random, prune, train_keyframe
 from gscodec.train.model import from_gaussians
 from gscodec.train.plane_sweep import shell, sweep
 from gscodec.train.sparse_points import triangulated
@@ -250,6 +250,25 @@ def test_prior_of_harmonics_falls_with_the_square_of_many_cameras(cameras, pictu
     grads, views = {"shN": torch.zeros_like(shN)}, SimpleNamespace(train_cameras=range(cameras))
     add_harmonics_prior(grads, {"shN": shN}, views, TINY, pictures)
     torch.testing.assert_close(grads["shN"], share * TINY.harmonics_lambda * shN / 50)
+
+
+def test_opacity_decay_has_the_gradient_of_the_mean_opacity():
+    params = from_gaussians(blob(50)).params
+    logits = params["logit_opacities"].clone().requires_grad_()
+    (0.3 * torch.sigmoid(logits).mean()).backward()
+    grads = {"logit_opacities": torch.zeros(50)}
+    add_opacity_decay(grads, params, 0.3)
+    torch.testing.assert_close(grads["logit_opacities"], logits.grad)
+
+
+def test_only_what_shows_nothing_moves_at_random():
+    model = from_gaussians(blob(1000))
+    before = model.params["means"].clone()
+    model.params["logit_opacities"][:] = torch.where(torch.arange(1000) < 500, 6.0, -6.0)
+    move_at_random(model.params, 0.3, np.random.default_rng(0))
+    spread = (model.params["means"] - before).norm(dim=1) / model.params["log_scales"].exp().mean(1)
+    assert spread[:500].max() < 1e-6
+    assert spread[500:].square().mean().sqrt() == pytest.approx(0.3 * 3**0.5, rel=0.15)
 
 
 def test_growing_and_pruning_keep_the_moments_in_step():

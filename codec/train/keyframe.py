@@ -21,6 +21,8 @@ from .model import REMOVED_LOGIT, Model
 from .settings import KeyframeSettings, TrainSettings
 from .views import Target, Views, add_harmonics_prior, start_photometric_loss, view_losses
 
+NOISE_POWER = 4  # of the transparency, in the noise of positions
+
 
 class Statistics:
     """Statistics of N Gaussians over the steps since the last round of densification.
@@ -153,8 +155,11 @@ class _Run:
         if view.step >= k.appearance_from * self.steps:
             views.extrinsics.learn(view.target.index, model.params, result.grads, decay)
         add_harmonics_prior(result.grads, model.params, views, self.settings)
+        add_opacity_decay(result.grads, model.params, k.opacity_decay)
         means_rate = self.radius * k.rates["means"] * (k.means_rate_end / k.rates["means"]) ** progress
         model.step(result.grads, {**k.rates.scaled(self.radius, decay), "means": means_rate})
+        if k.position_noise:
+            move_at_random(model.params, k.position_noise * means_rate / (self.radius * k.rates["means"]), self.rng)
 
     def set_degree(self, degree: int | None) -> None:
         """Gives the Gaussians harmonics of this degree; None: of the one that pays."""
@@ -172,6 +177,20 @@ class _Run:
         elif step >= k.densify_until * self.steps:
             prune(self.model, self.statistics, k, thin=step < k.thin_until * self.steps)
         self.statistics = Statistics(len(self.model), k.mse_min)
+
+
+def add_opacity_decay(grads: dict[str, torch.Tensor], params: dict[str, torch.Tensor], weight: float) -> None:
+    """Adds to the gradients those of the mean opacity times `weight`."""
+    if weight:
+        opacities = torch.sigmoid(params["logit_opacities"])
+        grads["logit_opacities"].add_(opacities * (1 - opacities), alpha=weight / len(opacities))
+
+
+def move_at_random(params: dict[str, torch.Tensor], share: float, rng: np.random.Generator) -> None:
+    """Moves each Gaussian by `share` of a random offset drawn from it, times its transparency to the power of
+    `NOISE_POWER`: one that holds nothing looks elsewhere."""
+    transparency = 1 - torch.sigmoid(params["logit_opacities"])
+    params["means"].addcmul_(random_offset(params, rng), share * transparency.pow(NOISE_POWER)[:, None])
 
 
 def _without_some(params: dict[str, torch.Tensor], share: float, rng: np.random.Generator) -> dict[str, torch.Tensor]:

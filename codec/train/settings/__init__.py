@@ -137,14 +137,16 @@ class TrainSettings:
         """The settings for a capture: those of a room where it has no masks."""
         if capture.has_alpha:
             return self
-        field = self.motion_field.tracking and self.room.field_in_tracking
+        room = self.room
+        field = self.motion_field.tracking and room.field_in_tracking
         return replace(
             self,
-            rigidity=self.room.rigidity * self.rigidity,
-            harmonics_views=self.room.harmonics_views,
-            cut_ratio=self.room.cut_ratio * self.cut_ratio,
-            group=replace(self.group, drift_ratio=self.room.drift_ratio * self.group.drift_ratio),
-            graph=replace(self.graph, nodes=round(self.room.nodes * self.graph.nodes)),
+            rigidity=room.rigidity * self.rigidity,
+            harmonics_views=room.harmonics_views,
+            cut_ratio=room.cut_ratio * self.cut_ratio,
+            keyframe=replace(self.keyframe, opacity_decay=room.opacity_decay, position_noise=room.position_noise),
+            group=replace(self.group, drift_ratio=room.drift_ratio * self.group.drift_ratio),
+            graph=replace(self.graph, nodes=round(room.nodes * self.graph.nodes)),
             motion_field=replace(self.motion_field, tracking=field),
         )
 

@@ -61,6 +61,8 @@ class RoomSettings:
     cut_ratio: float = 5 / 3  # times that of a subject, since few views of a room fit its keyframe far too well
     drift_ratio: float = 4.0  # times that of a subject, for the same reason
     harmonics_views: float = math.inf  # here more of them gain nothing for other views
+    opacity_decay: float = 0.003  # of a keyframe: no mask removes what floats before the cameras
+    position_noise: float = 3.0  # likewise
     field_in_tracking: bool = False  # it drags what stands still with what moves beside it
 
 
