@@ -2,8 +2,10 @@
 
 The recipe of 3D Gaussian Splatting (Kerbl et al. 2023), shortened: of the Gaussians with the largest screen gradients
 small ones are cloned and large ones split, and Gaussians with a small contribution to all views are pruned. Spherical
-harmonics are added on the way, and removed again where they lower the error by less than their bits cost. While one
-view is rendered, the step along the one before is taken: a gradient is one step old.
+harmonics are added on the way, and removed again where they lower the error by less than their bits cost. Without
+masks opacities decay and transparent Gaussians move at random (3DGS-MCMC, Kheradmand et al. 2024): few views of a room
+do not contradict what floats before the cameras. While one view is rendered, the step along the one before is taken: a
+gradient is one step old.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ class RoomSettings:
     drift_ratio: float = 4.0  # times that of a subject, for the same reason
     harmonics_views: float = math.inf  # here more of them gain nothing for other views
     opacity_decay: float = 0.003  # of a keyframe: no mask removes what floats before the cameras
-    position_noise: float = 3.0  # likewise
+    position_noise: float = 3.0  # of a keyframe, for the same reason
     field_in_tracking: bool = False  # it drags what stands still with what moves beside it
 
 
