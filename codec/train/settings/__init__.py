@@ -162,7 +162,7 @@ PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
     "medium": {"gradient_min": 3e-4, "contribution_min": 8.0},
     "slow": {"gradient_min": 1.5e-4, "contribution_min": 3.5},
 }
-LOSS = {"fast": 0.5, "medium": 0.25, "slow": 0.3}  # decibels by which very fine steps may be better, without a quality
+LOSS = {"fast": 0.5, "medium": 0.3, "slow": 0.3}  # decibels by which very fine steps may be better, without a quality
 LOSS_OF_ROOM = 0.5  # at least so many without masks: few views of a room are fitted far better than others see it
 
 
