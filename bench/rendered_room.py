@@ -1,24 +1,28 @@
-"""A room to choose parameters on, which is not reported: path-traced with Blender (`pip install bpy`, Python 3.11).
+"""A room to choose parameters on, which is not reported: path-traced with Blender's Python package.
 
 Two heads of an ape turn, a ring rolls, floor and globe are glossy. 14 cameras for training stand in two arcs of 110
-degrees, 4 val cameras between them. `python bench/rendered_room.py FOLDER FRAMES` writes a capture, about 100 seconds a
-frame on two cores.
+degrees, 4 val cameras between them. `python -m bench.rendered_room FOLDER FRAMES` takes about 100 seconds a frame on
+two cores.
 """
 
+from __future__ import annotations
+
+import argparse
 import json
 import math
-import sys
 from pathlib import Path
 
-import bpy
-from mathutils import Vector
+try:
+    import bpy
+    from mathutils import Vector
+except ImportError:
+    bpy = None
 
 WIDTH, HEIGHT, FIELD_OF_VIEW = 512, 384, math.radians(55)
 SAMPLES = 16
 DISTANCE = 3.3  # of the cameras, metres
 ARC = 110  # degrees
 TEXTURES = {name: f"ShaderNodeTex{name.title()}" for name in ("noise", "brick", "wave", "checker", "voronoi")}
-Mesh = bpy.ops.mesh
 
 
 def material(texture, colors, scale, roughness):
@@ -56,7 +60,7 @@ def add(shape, surface, *, turned=(0, 0, 0), smooth=False, **at):
 
 def head(surface, location, size):
     """The head of an ape, smoothed."""
-    made = add(Mesh.primitive_monkey_add, surface, smooth=True, size=size, location=location)
+    made = add(bpy.ops.mesh.primitive_monkey_add, surface, smooth=True, size=size, location=location)
     made.modifiers.new("smooth", "SUBSURF").render_levels = 2
     return made
 
@@ -78,24 +82,24 @@ def lamp(location, size, energy, color):
 
 def build():
     """The room; returns what moves: (two heads, the ring)."""
-    quarter = math.pi / 2
-    add(Mesh.primitive_plane_add, material("checker", ((0.5, 0.45, 0.4), (0.2, 0.25, 0.3)), 2.5, 0.3), size=9)
+    shapes, quarter = bpy.ops.mesh, math.pi / 2
+    add(shapes.primitive_plane_add, material("checker", ((0.5, 0.45, 0.4), (0.2, 0.25, 0.3)), 2.5, 0.3), size=9)
     wall = material("voronoi", ((0.25, 0.3, 0.2), (0.65, 0.65, 0.5)), 3, 0.7)
-    add(Mesh.primitive_plane_add, wall, turned=(quarter, 0, 0), size=9, location=(0, 2.5, 2))
+    add(shapes.primitive_plane_add, wall, turned=(quarter, 0, 0), size=9, location=(0, 2.5, 2))
     wall = material("wave", ((0.5, 0.4, 0.3), (0.35, 0.2, 0.2)), 1.2, 0.6)
-    add(Mesh.primitive_plane_add, wall, turned=(quarter, 0, quarter), size=9, location=(-3.2, 0, 2))
+    add(shapes.primitive_plane_add, wall, turned=(quarter, 0, quarter), size=9, location=(-3.2, 0, 2))
     for i, (*location, size) in enumerate([(-1.9, 1.6, 0.4, 0.8), (1.6, 1.7, 0.3, 0.6), (2.2, 0.9, 0.5, 1.0)]):
         surface = material("brick", ((0.2 + 0.2 * i, 0.3, 0.5), (0.7, 0.6 - 0.2 * i, 0.3)), 4 + i, 0.4)
-        add(Mesh.primitive_cube_add, surface, turned=(0, 0, 0.5 * i), size=size, location=location)
+        add(shapes.primitive_cube_add, surface, turned=(0, 0, 0.5 * i), size=size, location=location)
     globe = material("noise", ((0.1, 0.2, 0.5), (0.6, 0.7, 0.3)), 4, 0.12)
-    add(Mesh.primitive_uv_sphere_add, globe, smooth=True, radius=0.35, location=(0.2, 1.5, 0.35))
+    add(shapes.primitive_uv_sphere_add, globe, smooth=True, radius=0.35, location=(0.2, 1.5, 0.35))
     lamp((2, -3, 3.4), 1.2, 220, (1, 0.96, 0.9))
     lamp((-2.5, -2.8, 2.8), 1.8, 110, (0.9, 0.94, 1))
     first = head(material("noise", ((0.35, 0.2, 0.1), (0.75, 0.55, 0.35)), 6, 0.45), (-0.8, 0.1, 0.7), 1.1)
     second = head(material("voronoi", ((0.5, 0.1, 0.1), (0.8, 0.6, 0.2)), 5, 0.25), (0.8, -0.1, 0.6), 0.9)
     surface = material("checker", ((0.8, 0.8, 0.7), (0.1, 0.3, 0.2)), 8, 0.3)
     size = {"major_radius": 0.3, "minor_radius": 0.1}
-    return first, second, add(Mesh.primitive_torus_add, surface, smooth=True, location=(0, -0.5, 0.4), **size)
+    return first, second, add(shapes.primitive_torus_add, surface, smooth=True, location=(0, -0.5, 0.4), **size)
 
 
 def move(things, frame):
@@ -129,7 +133,7 @@ def start():
     return scene
 
 
-def main(folder: Path, frames: int):
+def render(folder: Path, frames: int):
     """Renders the capture and writes its transforms.json."""
     scene = start()
     things = build()
@@ -153,5 +157,16 @@ def main(folder: Path, frames: int):
     (folder / "transforms.json").write_text(json.dumps({"camera_model": "OPENCV", **lens, "fps": 30, "frames": listed}))
 
 
+def main():
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="where the capture is written")
+    parser.add_argument("frames", type=int, help="how many")
+    options = parser.parse_args()
+    if bpy is None:
+        parser.error("Blender's Python package is missing, expected `pip install bpy` in a Python of its version")
+    render(options.folder.absolute(), options.frames)
+
+
 if __name__ == "__main__":
-    main(Path(sys.argv[1]).absolute(), int(sys.argv[2]))
+    main()
