@@ -22,6 +22,7 @@ from gscodec.render.cpu import CpuBackend
 from gscodec.train.deformation_graph import NodeGraph, Pose
 from gscodec.train.entropy_model import CanonicalRate, laplace_bits
 from gscodec.train.finetune import GroupModel
+from gscodec.train.joint_optimization import finetune
 from gscodec.train.model import from_gaussians
 from gscodec.train.tracking import Tracker
 from gscodec.train.train import train_groups
@@ -174,3 +175,17 @@ def test_a_group_goes_on_from_what_was_fine_tuned(capture):
     for name, values in shown.items():
         np.testing.assert_allclose(model[name].detach().numpy(), values.detach().numpy(), atol=2e-5, err_msg=name)
     assert len(tracker.moving) == 320
+
+
+def test_nodes_that_carry_only_what_rests_stay(capture):
+    key, views = from_gaussians(turning(300, frames=5).frame(0)), Views(capture, TINY, CpuBackend())
+    tracker = Tracker.start(key, views, TINY, 0.01, range(3))
+    moved = key.params["means"][:, 0] > 0.5
+    model, pose = tracker.model, tracker.pose
+    group = GroupModel(tracker.graph, None, [model] * 3, [pose] * 3, steps_for(50, 1.0), moved, TINY)
+    carriers = group.graph.carriers(moved)
+    assert 0.05 < carriers.float().mean() < 0.7
+    finetune(group, views, range(3), TINY, radius=1.0)
+    far = np.linalg.norm(group.nodes().translations, axis=2).max(0)
+    assert far[~carriers.numpy()].max() == 0
+    assert far[carriers.numpy()].min() > 0
