@@ -76,7 +76,7 @@ class GroupModel:
         log_scales: attribute -> [K] f32, log of the Laplace scale of its coefficients.
         turns, shifts: T times [M, 3], corrections of the poses of the nodes: rotation vectors, world units.
         field: of the group, adds to them; None: there is none.
-        movable: [M, 1] bool, nodes that are corrected.
+        carriers: [M, 1] bool, nodes that carry a Gaussian that moved; only these are corrected.
         origin: [N] index of each Gaussian in the last frame of tracking; -1: it was added here.
     """
 
@@ -96,7 +96,7 @@ class GroupModel:
         self.turns = [torch.zeros_like(p.nodes) for p in self._tracked_poses]
         self.shifts = [torch.zeros_like(p.nodes) for p in self._tracked_poses]
         self.field: MotionField | None = None
-        self.movable = self.graph.carriers(moved)[:, None]
+        self.carriers = self.graph.carriers(moved)[:, None]
         counts = torch.tensor([len(m) for m in tracked])
         self.start = (counts[:, None] <= torch.arange(counts[-1])).sum(0)
         tracked = [_padded(m, tracked[-1]) for m in tracked]
@@ -190,7 +190,7 @@ class GroupModel:
         turn, shift = self.turns[t], self.shifts[t]
         if self.field is not None:
             by_field = self.field(t)
-            turn, shift = turn + by_field[0] * self.movable, shift + by_field[1] * self.movable
+            turn, shift = turn + by_field[0] * self.carriers, shift + by_field[1] * self.carriers
         return self._tracked_poses[t].moved(turn, shift), turn
 
     def by_nodes(
@@ -199,7 +199,7 @@ class GroupModel:
         """Gradients [M, 3] and [M, 3] by the turns and shifts of the nodes at frame `t` (`NodeGraph.gradients`)."""
         base = self._tracked_poses[t].rotations, frame.turn
         by_turns, by_shifts = self.graph.gradients(frame.rest, base, frame.pose, by_carried, rigidity)
-        return by_turns * self.movable, by_shifts * self.movable
+        return by_turns * self.carriers, by_shifts * self.carriers
 
     def frame(self, t: int, backend: Backend, noise: dict[str, torch.Tensor] | None = None) -> Frame:
         """Frame `t`.

@@ -157,11 +157,13 @@ class _Run:
         if view.step >= k.appearance_from * self.steps:
             views.extrinsics.learn(view.target.index, model.params, result.grads, decay)
         add_harmonics_prior(result.grads, model.params, views, self.settings)
-        add_opacity_decay(result.grads, model.params, k.opacity_decay)
-        means_rate = self.radius * k.rates["means"] * (k.means_rate_end / k.rates["means"]) ** progress
+        if k.opacity_decay:
+            add_opacity_decay(result.grads, model.params, k.opacity_decay)
+        means_decay = (k.means_rate_end / k.rates["means"]) ** progress
+        means_rate = self.radius * k.rates["means"] * means_decay
         model.step(result.grads, {**k.rates.scaled(self.radius, decay), "means": means_rate})
         if k.position_noise:
-            move_at_random(model.params, k.position_noise * means_rate / (self.radius * k.rates["means"]), self.rng)
+            move_at_random(model.params, k.position_noise * means_decay, self.rng)
 
     def set_degree(self, degree: int | None) -> None:
         """Gives the Gaussians harmonics of this degree; None: of the one that pays."""
@@ -183,9 +185,8 @@ class _Run:
 
 def add_opacity_decay(grads: dict[str, torch.Tensor], params: dict[str, torch.Tensor], weight: float) -> None:
     """Adds to the gradients those of the mean opacity times `weight`."""
-    if weight:
-        opacities = torch.sigmoid(params["logit_opacities"])
-        grads["logit_opacities"].add_(opacities * (1 - opacities), alpha=weight / len(opacities))
+    opacities = torch.sigmoid(params["logit_opacities"])
+    grads["logit_opacities"].add_(opacities * (1 - opacities), alpha=weight / len(opacities))
 
 
 def move_at_random(params: dict[str, torch.Tensor], share: float, rng: np.random.Generator) -> None:

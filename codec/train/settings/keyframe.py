@@ -123,8 +123,7 @@ class KeyframeSettings:
     prune_opacity: float = 0.02  # a Gaussian below it is removed
     prune_weight: float = 0.02  # largest blending weight in any view; a Gaussian below it is hidden and removed
     opacity_decay: float = 0.0  # weight of the mean opacity in the loss
-    position_noise: float = 0.0  # of its spread, by which a transparent Gaussian moves in the first step; falls with
-    # the rate of the means
+    position_noise: float = 0.0  # of its spread: first move of a transparent Gaussian, decays as the rate of means
     split_shrink: float = 1.6  # by which the scales of a Gaussian are divided when it is split
     split_offset: float = 0.7  # of a random offset drawn from the Gaussian, for both halves
     clone_offset: float = 0.3  # of the same, for the copy
