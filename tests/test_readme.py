@@ -71,6 +71,14 @@ def test_table_of_stress():
         assert e["verdict"].startswith(verdict.split(",")[0]), (name, verdict)
 
 
+def test_table_of_what_moves_the_nodes():
+    found = {(e["capture"], e["variant"]): e for e in result("ablation")["entries"]}
+    for name, *figures in rows("capture | hash grid and nodes"):
+        variants = ("whole recipe", "another seed", "nodes alone", "field alone")
+        of_capture = [found[re.split(" as | at |,", name)[0], v] for v in variants]
+        assert figures == [f"{e['psnr_coded']:.2f} at {e['kb_per_frame']:.2f}" for e in of_capture], name
+
+
 def test_tables_of_streams():
     captures, keys, demo = rows("what was captured"), ("kb_per_frame", "psnr_fg"), result("demo")
     assert len(captures) >= 4

@@ -16,9 +16,10 @@ def ablation_chart(result: dict):
     from matplotlib.figure import Figure
 
     captures = list(dict.fromkeys(e["capture"] for e in result["entries"]))
-    most = max(sum(e["capture"] == c for e in result["entries"]) for c in captures)
-    figure = Figure(figsize=(11, len(captures) * (0.24 * most + 0.8)), layout="constrained")
-    for row, capture in zip(figure.subplots(len(captures), 3, squeeze=False), captures, strict=True):
+    heights = [0.24 * sum(e["capture"] == c for e in result["entries"]) + 0.8 for c in captures]
+    figure = Figure(figsize=(11, sum(heights)), layout="constrained")
+    rows = figure.subplots(len(captures), 3, squeeze=False, gridspec_kw={"height_ratios": heights})
+    for row, capture in zip(rows, captures, strict=True):
         entries = {e["variant"]: e for e in result["entries"] if e["capture"] == capture}
         whole = entries.pop(WHOLE)
         for axes, (key, label) in zip(row, PANELS.items(), strict=True):
