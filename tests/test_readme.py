@@ -73,9 +73,10 @@ def test_table_of_stress():
 
 def test_table_of_what_moves_the_nodes():
     found = {(e["capture"], e["variant"]): e for e in result("ablation")["entries"]}
-    for name, *figures in rows("capture | hash grid and nodes"):
-        variants = ("whole recipe", "another seed", "nodes alone", "field alone")
-        of_capture = [found[re.split(" as | at |,", name)[0], v] for v in variants]
+    table = {re.split(" as | at |,", name)[0]: figures for name, *figures in rows("capture | hash grid and nodes")}
+    assert set(table) == {capture for capture, _ in found}
+    for name, figures in table.items():
+        of_capture = [found[name, v] for v in ("whole recipe", "another seed", "nodes alone", "field alone")]
         assert figures == [f"{e['psnr_coded']:.2f} at {e['kb_per_frame']:.2f}" for e in of_capture], name
 
 

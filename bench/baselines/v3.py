@@ -27,7 +27,7 @@ from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, photometric_loss
 
 POINTS = 8000  # of the keyframe, to start from
-STEPS = (90, 225)  # per frame, motion and fine-tuning: the time of our preset medium, in the proportion 800 : 2000
+STEPS = (90, 225)  # per frame, motion and fine-tuning: 8 s a frame of lumberjack, in the proportion 800 : 2000
 FIELD_RATES = {"grid": 2e-2, "mlp": 2e-3}
 FINE_SHARE = 1.0  # of the keyframe's learning rates
 MEANS_RATE = 1e-3  # radii

@@ -18,7 +18,7 @@ def ablation_chart(result: dict):
     captures = list(dict.fromkeys(e["capture"] for e in result["entries"]))
     heights = [0.24 * sum(e["capture"] == c for e in result["entries"]) + 0.8 for c in captures]
     figure = Figure(figsize=(11, sum(heights)), layout="constrained")
-    rows = figure.subplots(len(captures), 3, squeeze=False, gridspec_kw={"height_ratios": heights})
+    rows = figure.subplots(len(captures), 3, squeeze=False, height_ratios=heights)
     for row, capture in zip(rows, captures, strict=True):
         entries = {e["variant"]: e for e in result["entries"] if e["capture"] == capture}
         whole = entries.pop(WHOLE)
