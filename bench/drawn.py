@@ -1,4 +1,4 @@
-"""A moving scene of Gaussians -> a capture: its pictures, drawn from a rig of cameras around it as they are asked for.
+"""A moving scene of Gaussians -> a capture: its pictures, drawn from a rig of cameras around it and kept as PNG files.
 
 So any splats that `animate_splat` moves, or that others trained, become a capture of any size with exact calibration
 and test cameras between the training ones. What is drawn is what a Gaussian model can show, so that such a capture says
@@ -7,18 +7,18 @@ how much of it training finds, and not how well Gaussians stand for the world.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 
-from gscodec.capture import Capture, View
+from gscodec.atomic_write import part_file
+from gscodec.capture import Capture
+from gscodec.capture.images import read_image
 from gscodec.errors import UsageError
 from gscodec.model.camera import NEAR, Camera, look_at
 from gscodec.model.gaussian_sequence import GaussianSequence
-from gscodec.model.gaussians import Gaussians
 from gscodec.render.image import render_rgba
 from gscodec.render.movie import up_vector
 from gscodec.splats import open_sequence
@@ -27,7 +27,6 @@ from .animate_splat import Motion, animate_splat
 
 HEIGHTS = (-0.15, 0.15, 0.55)  # of the rings of cameras, in distances from the subject
 FIELD = 0.9  # of the shorter side of the picture that the subject's bounding sphere fills
-CACHED = 64  # pictures
 
 
 @dataclass(frozen=True)
@@ -72,26 +71,23 @@ class Rig:
         return rig
 
 
-def draw(sequence: GaussianSequence, name: str, rig: Rig) -> Capture:
-    """The capture that `rig` takes of a sequence, RGBA."""
-    return drawn(sequence.frame, sequence.frame_count, sequence.fps, name, rig)
-
-
-def drawn(frame: Callable[[int], Gaussians], frames: int, fps: float, name: str, rig: Rig) -> Capture:
-    """As `draw`, of `frame(t)` for t < frames."""
-    cameras, there = rig.cameras(frame(0).means), lru_cache(2)(frame)
-
-    @lru_cache(CACHED)
-    def read(camera: int, t: int) -> View:
-        rgba = render_rgba(there(t), cameras[camera])
-        rgb = rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6)
-        return View(_u8(rgb), _u8(rgba[..., 3]))
-
-    return Capture(name, fps, cameras, frames, True, read)
+def draw(sequence: GaussianSequence, name: str, rig: Rig, folder: Path) -> Capture:
+    """The capture that `rig` takes of a sequence, RGBA, its pictures drawn into `folder` unless they are there."""
+    cameras = rig.cameras(sequence.frame(0).means)
+    file = lambda camera, t: folder / cameras[camera].name / f"{t:04}.png"  # noqa: E731
+    for camera in cameras:
+        (folder / camera.name).mkdir(parents=True, exist_ok=True)
+    for t in range(sequence.frame_count):
+        missing = [i for i in range(len(cameras)) if not file(i, t).exists()]
+        shown = sequence.frame(t) if missing else None
+        for i in missing:
+            _write(file(i, t), render_rgba(shown, cameras[i]))
+    read = lambda camera, t: read_image(file(camera, t))  # noqa: E731
+    return Capture(name, sequence.fps, cameras, sequence.frame_count, True, read)
 
 
 def animated_capture(splat: Path, work: Path, frames: int, rig: Rig) -> Capture:
-    """The capture of a static splat that `animate_splat` moves; its frames are kept in the folder `work`.
+    """The capture of a static splat that `animate_splat` moves; its frames and pictures are kept in the folder `work`.
 
     Raises:
         UsageError: there is no such file.
@@ -102,8 +98,13 @@ def animated_capture(splat: Path, work: Path, frames: int, rig: Rig) -> Capture:
     if not (done := folder / ".done").exists():
         animate_splat(splat, folder, frames, Motion(up=rig.up))
         done.touch()
-    return draw(open_sequence(folder), splat.stem, rig)
+    return draw(open_sequence(folder), splat.stem, rig, work / f"{folder.name}-{rig.width}x{rig.height}")
 
 
-def _u8(x: np.ndarray) -> np.ndarray:
-    return np.rint(255 * x.clip(0, 1)).astype(np.uint8)
+def _write(file: Path, rgba: np.ndarray) -> None:
+    """Writes [H, W, 4] f32, premultiplied, as PNG."""
+    alpha = rgba[..., 3:]
+    straight = np.concatenate([rgba[..., :3] / np.maximum(alpha, 1e-6), alpha], 2).clip(0, 1)
+    _, data = cv2.imencode(".png", cv2.cvtColor(np.rint(255 * straight).astype(np.uint8), cv2.COLOR_RGBA2BGRA))
+    with part_file(file) as part:
+        part.write_bytes(data)
