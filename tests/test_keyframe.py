@@ -23,7 +23,7 @@ from gscodec.train.calibration import Extrinsics
 from gscodec.train.initialization import initial_model
 from gscodec.train.keyframe import Statistics, add_opacity_decay, densify, move_at_random, prune, train_keyframe
 from gscodec.train.model import from_gaussians
-from gscodec.train.plane_sweep import shell, sweep
+from gscodec.train.plane_sweep import shell, sweep, unproject
 from gscodec.train.sparse_points import triangulated
 from gscodec.train.train import train_groups
 from gscodec.train.views import Views, add_harmonics_prior
@@ -59,6 +59,19 @@ def test_sweep_finds_a_textured_wall():
     behind, _ = shell(views, TINY.plane_sweep)
     assert len(behind) > 5
     assert (behind[:, 1] > 8).all()
+
+
+def test_depth_of_a_sweep_lies_between_its_planes():
+    """A painted wall y = 0. Planes are 0.15 apart there, so that planes alone are off by 0.04."""
+    views = []
+    for camera in arc():
+        y, x = np.mgrid[: camera.height, : camera.width]
+        paint = unproject(camera, x.ravel(), y.ravel(), np.ones(x.size)) - camera.center
+        x, z = (camera.center - paint * (camera.center[1] / paint[:, 1:2]))[:, ::2].T
+        grey = 128 + 40 * (np.sin(13 * x + 7 * z) + np.sin(5 * x - 11 * z) + np.sin(17 * z))
+        views.append((camera, np.rint(grey).astype(np.uint8).reshape(camera.height, -1, 1).repeat(3, 2), None))
+    points, _ = sweep(views, 1000, 0, TINY.plane_sweep)
+    assert np.median(np.abs(points[:, 1])) < 0.02
 
 
 def test_sweep_finds_a_floor_seen_from_sides_far_apart():

@@ -2,8 +2,9 @@
 
 In: views of one frame. Out: points and colours. Each view is compared with its neighbours over planes parallel to its
 image (Collins 1996) by normalised cross-correlation in small windows, so that exposure does not matter. The better half
-of the neighbours makes the score, because the others may not see the surface (Kang et al. 2001). A depth is kept where
-the correlation is high and another depth map agrees.
+of the neighbours makes the score, because the others may not see the surface (Kang et al. 2001). Between planes the
+depth is that of the vertex of a parabola through three scores. It is kept where the correlation is high and another
+depth map agrees.
 
 Two views that look from directions far apart see a surface at such different slants that windows parallel to one image
 never match. A view without near neighbours is compared with the nearest ones there are over planes of several
@@ -58,7 +59,7 @@ def sweep(
             neighbours = _neighbours(cameras, i, s)
             normals += world_normals(cameras, s.upright_planes)
         near.append(neighbours)
-        depths.append(_depth(cameras, greys, where[i], i, neighbours, _planes(camera, normals, inverse), s))
+        depths.append(_depth(cameras, greys, where[i], i, neighbours, _facing(camera, normals), inverse, s))
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for i, camera in enumerate(cameras):
         y, x = np.nonzero(depths[i])
@@ -116,10 +117,9 @@ def world_normals(cameras, upright: int) -> list[np.ndarray]:
     return [up, *(np.cos(a) * side + np.sin(a) * np.cross(up, side) for a in angles)]
 
 
-def _planes(camera, normals: list[np.ndarray], inverse: np.ndarray) -> list[np.ndarray]:
-    """Planes n . x = 1 in the camera's axes, as n [3]: of each normal on both sides of the camera; `inverse`: [P],
-    1 / distance."""
-    return [side * d * (camera.viewmat[:3, :3] @ n) for n in normals for side in (1, -1) for d in inverse]
+def _facing(camera, normals: list[np.ndarray]) -> list[np.ndarray]:
+    """Both directions [3] of each normal, in the camera's axes."""
+    return [side * (camera.viewmat[:3, :3] @ n) for n in normals for side in (1, -1)]
 
 
 def unproject(camera, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -158,15 +158,64 @@ def _windows(grey: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
     return mean, np.sqrt(np.maximum(cv2.blur(grey * grey, (side, side)) - mean * mean, 1e-6))
 
 
+class _Best:
+    """The best score of each pixel over planes, [H, W], and the inverse depth there; `second` is the best at another
+    depth.
+
+    Planes come in order of their distance, so that the scores on both sides of the best one are known.
+    """
+
+    def __init__(self, shape: tuple[int, int], other_depth: float):
+        self.score, self.second, self._before, self._behind = (np.full(shape, -1, np.float32) for _ in range(4))
+        self._at, self._step = (np.zeros(shape, np.float32) for _ in range(2))
+        self._other = other_depth
+        self.start()
+
+    def start(self) -> None:
+        """The next plane does not follow the last one."""
+        self._last, self._better = np.float32(-1), None
+
+    def add(self, score: np.ndarray, inverse_depth: np.ndarray, step: np.ndarray) -> None:
+        """The scores of the next plane, its inverse depth, and the difference of that to the plane before; [H, W]."""
+        if self._better is not None:
+            self._behind[self._better] = score[self._better]
+        better = score > self.score
+        other = np.abs(inverse_depth - self._at) > self._other * self._at
+        self.second = np.maximum(self.second, np.where(other, np.minimum(score, self.score), -1))
+        before = np.broadcast_to(self._last, score.shape)
+        new = ((self.score, score), (self._before, before), (self._at, inverse_depth), (self._step, step))
+        for own, values in new:
+            own[better] = values[better]
+        self._behind[better] = -1
+        self._last, self._better = score, better
+
+    def depth(self) -> np.ndarray:
+        """[H, W], at the vertex of the parabola through the best score and those beside it; infinite where no plane has
+        a score."""
+        bend = self._before - 2 * self.score + self._behind
+        known = (self._before > -1) & (self._behind > -1) & (bend < 0)
+        vertex = np.where(known, 0.5 * (self._before - self._behind) / np.where(known, bend, -1), 0)
+        with np.errstate(divide="ignore"):
+            return 1 / (self._at + vertex.clip(-0.5, 0.5) * self._step)
+
+
 def _depth(
-    cameras, greys, where: np.ndarray, i: int, near: list[int], planes: list[np.ndarray], settings: PlaneSweepSettings
+    cameras,
+    greys,
+    where: np.ndarray,
+    i: int,
+    near: list[int],
+    directions: list[np.ndarray],
+    inverse: np.ndarray,
+    settings: PlaneSweepSettings,
 ) -> np.ndarray:
     """Depth of view `i`, [H, W], 0 where it is unknown.
 
     Args:
         where: [H, W] bool, pixels whose depth is searched.
         near: indices of the neighbours.
-        planes: n [3] of each plane n . x = 1 in the axes of the camera.
+        directions: normals [3] of the planes in the axes of the camera.
+        inverse: [P], 1 / distance of the planes of each direction.
     """
     import cv2
 
@@ -178,36 +227,36 @@ def _depth(
     part = (slice(top, bottom), slice(left, right))
     camera, grey = cameras[i].cropped(left, top, right - left, bottom - top), greys[i][part]
     mean, deviation = _windows(grey, settings.window)
-    best, depth = np.full(grey.shape, -1, np.float32), np.zeros(grey.shape, np.float32)
-    second = np.full(grey.shape, -1, np.float32)  # best score at another depth
+    best = _Best(grey.shape, settings.other_depth)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     y, x = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
     rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.K).T
     slant = settings.slant_cosine_min * np.linalg.norm(rays, axis=2)
-    for plane in planes:
-        inverse_depth = rays @ plane
-        faces = (inverse_depth > slant * np.linalg.norm(plane)) & (inverse_depth * camera.near < 1)
-        if np.count_nonzero(faces) < settings.window**2:
-            continue
-        scores = np.empty((len(near), *grey.shape), np.float32)
-        for score, j in zip(scores, near, strict=True):
-            ray_map = _ray_map(camera, cameras[j], plane)
-            H = _homography(camera, cameras[j], ray_map)
-            seen = cv2.warpPerspective(greys[j], H, grey.shape[::-1], flags=flags, borderValue=-1)
-            inside = (seen >= 0) & faces & (rays @ ray_map[2] > 0)
-            score[:] = -1
-            if not inside.any():
+    for direction in directions:
+        best.start()
+        along = rays @ direction
+        for d in inverse:
+            inverse_depth = d * along
+            faces = (along > slant) & (inverse_depth * camera.near < 1)
+            if np.count_nonzero(faces) < settings.window**2:
                 continue
-            mean_seen, deviation_seen = _windows(seen, settings.window)
-            score[:] = cv2.blur(grey * seen, (settings.window, settings.window)) - mean * mean_seen
-            score /= deviation * np.maximum(deviation_seen, settings.contrast_min)
-            score[~inside] = -1
-        score = np.sort(scores, 0)[-settings.scored_neighbours :].mean(0)
-        better = score > best
-        other = np.abs(depth * inverse_depth - 1) > settings.other_depth
-        second = np.maximum(second, np.where(other, np.minimum(score, best), -1))
-        best[better], depth[better] = score[better], 1 / inverse_depth[better]
-    best[best - second < settings.unique_min] = -1
-    depth[(best < settings.correlation_min) | (deviation < settings.contrast_min) | ~where[part]] = 0
+            scores = np.empty((len(near), *grey.shape), np.float32)
+            for score, j in zip(scores, near, strict=True):
+                ray_map = _ray_map(camera, cameras[j], d * direction)
+                H = _homography(camera, cameras[j], ray_map)
+                seen = cv2.warpPerspective(greys[j], H, grey.shape[::-1], flags=flags, borderValue=-1)
+                inside = (seen >= 0) & faces & (rays @ ray_map[2] > 0)
+                score[:] = -1
+                if not inside.any():
+                    continue
+                mean_seen, deviation_seen = _windows(seen, settings.window)
+                score[:] = cv2.blur(grey * seen, (settings.window, settings.window)) - mean * mean_seen
+                score /= deviation * np.maximum(deviation_seen, settings.contrast_min)
+                score[~inside] = -1
+            score = np.sort(scores, 0)[-settings.scored_neighbours :].mean(0)
+            best.add(score, inverse_depth, (inverse[1] - inverse[0]) * along)
+    depth = best.depth()
+    unsure = (best.score < settings.correlation_min) | (best.score - best.second < settings.unique_min)
+    depth[unsure | (deviation < settings.contrast_min) | ~where[part]] = 0
     whole[part] = depth
     return whole
