@@ -38,13 +38,15 @@ def keyframe_budget(views: Views, frame: int, settings: TrainSettings) -> Budget
 
 def with_frame_budget(settings: TrainSettings, views: Views, frame: int) -> TrainSettings:
     """Settings with the steps of a tracked frame: a large picture has fewer, since each costs more, and all frames of a
-    group together refine its Gaussians."""
-    covered = _covered(views, frame)
-    share = _smaller(covered, settings.budget) / _larger(covered, settings.budget)
+    group together refine its Gaussians. And with the bound of drift behind a keyframe of so many steps."""
+    covered, g = _covered(views, frame), settings.group
+    larger = _larger(covered, settings.budget)
+    fit = max(1.0, larger * settings.keyframe_steps / g.drift_steps) ** g.drift_exponent
+    group, share = replace(g, drift_ratio=fit * g.drift_ratio), _smaller(covered, settings.budget) / larger
     of_size = lambda steps: max(1, round(share * steps))  # noqa: E731
     densification = replace(settings.densification, steps=of_size(settings.densification.steps))
     frame = {"motion_steps": of_size(settings.motion_steps), "finetune_steps": of_size(settings.finetune_steps)}
-    return replace(settings, densification=densification, **frame)
+    return replace(settings, densification=densification, group=group, **frame)
 
 
 def _larger(covered: float, settings: BudgetSettings) -> float:

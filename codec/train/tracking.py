@@ -16,6 +16,7 @@ fewer steps.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING
@@ -160,17 +161,22 @@ class Tracker:
         fit = FrameFit(self, np.random.default_rng([self.settings.seed, frame, 1]))
         s = self.settings.tracking
         bound, loss = s.loss_ratio * self.loss + s.loss_floor, np.inf
-        stiff = [s.searched_scale] if searched else []
-        stiff += [s.small_scale] if searched or not self.pose.velocity.any() else []
+        small = self._of_usual(s.small_scale)
+        stiff = [self._of_usual(s.searched_scale)] if searched else []
+        stiff += [small] if searched or not self.pose.velocity.any() else []
         for scale in stiff:
             self._round(fit, frame, on_step, scale, stiff=True)
         for i in range(s.rounds_max):
-            before, loss = loss, self._round(fit, frame, on_step, s.small_scale if i == 0 else 1.0)
+            before, loss = loss, self._round(fit, frame, on_step, small if i == 0 else 1.0)
             if loss < bound or loss > s.progress_ratio * before:
                 break
         self.own, self.pose = fit.result()
         self.loss = loss
         self.screen_gradient = fit.statistics.mean_screen_gradient()
+
+    def _of_usual(self, scale: float) -> float:
+        """`scale` of images of the usual size, which makes larger ones as small, to halves."""
+        return scale * 0.5 ** max(0, round(math.log2(self.views.largest_side / self.settings.tracking.usual_side)))
 
     def _round(self, fit: FrameFit, frame: int, on_step: OnStep, scale: float, *, stiff: bool = False) -> float:
         """`motion_steps` views at `scale` times their size in the first half, or, if `stiff`, in all steps; returns the
@@ -273,7 +279,7 @@ class Tracker:
         model, s = self.model, self.settings.tracking
         if not any(m.any() for m in masks):
             return np.zeros(len(model), bool)
-        losses = view_losses(model.params, self.views, frame, self.settings, s.small_scale)
+        losses = view_losses(model.params, self.views, frame, self.settings, self._of_usual(s.small_scale))
         visible = [result.max_weight > s.visible_weight for result in losses]
         return self.changes.behind(frame, masks, model.params["means"].numpy(), visible)
 

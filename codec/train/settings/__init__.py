@@ -154,8 +154,7 @@ class TrainSettings:
 PRESETS = {
     "fast": {"keyframe_steps": 1400, "motion_steps": 130, "finetune_steps": 170},
     "medium": {},
-    # A keyframe of more steps fits its own pictures better, so that the same loss is more times its own.
-    "slow": {"keyframe_steps": 7000, "finetune_steps": 750, "group": GroupSettings(drift_ratio=3.8)},
+    "slow": {"keyframe_steps": 7000, "finetune_steps": 750},
 }
 PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
     "fast": {"gradient_min": 4e-4, "contribution_min": 10.0},

@@ -59,7 +59,7 @@ class RoomSettings:
     nodes: float = 2.5  # times those of a subject: much of what seems to move is what lies behind it
     rigidity: float = 1 / 3  # times that of a subject
     cut_ratio: float = 5 / 3  # times that of a subject, since few views of a room fit its keyframe far too well
-    drift_ratio: float = 4.0  # times that of a subject, for the same reason
+    drift_ratio: float = 2.6  # times that of a subject, for the same reason
     harmonics_views: float = math.inf  # here more of them gain nothing for other views
     opacity_decay: float = 0.003  # of a keyframe: no mask removes what floats before the cameras
     position_noise: float = 3.0  # of a keyframe, for the same reason
@@ -86,6 +86,7 @@ class TrackingSettings:
     progress_ratio: float = 0.9  # a round that leaves more of the loss than this is the last
     loss_window: int = 20  # steps whose mean is the loss of a round: about every view once
     small_scale: float = 0.5  # of the images in the first half of the first round: large motion, cheap steps
+    usual_side: float = 512.0  # pixels of the longer side; larger images are as small there, to halves
     searched_scale: float = 0.25  # of the images in the first of two stiff rounds behind a search
     # Without a known velocity, or with that of a search, first rounds: stiff nodes and slow attributes, or else
     # far-moved Gaussians take the colours of what they lie over.
@@ -144,6 +145,8 @@ class GroupSettings:
     """Where a group ends early."""
 
     drift_ratio: float = 2.0  # image loss over the keyframe's from which frames start anew
+    drift_steps: int = 2400  # of a keyframe for which that is meant: with more it fits its own pictures better
+    drift_exponent: float = 0.6  # of the steps of a keyframe, in that ratio
     cut_loss_floor: float = 0.002  # loss: clean images fit far better than they need to, and no frame is cut for it
     changed_fraction_max: float = 0.15  # of the Gaussians, that begin to change in one frame
     changed_frames_min: int = 4  # frames that a group has before `changed_fraction_max` may end it
