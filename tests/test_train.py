@@ -2,14 +2,17 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from synthetic import blob, turning
 from training import TINY, capture_of, psnr_of
 
+from gscodec.capture import View
 from gscodec.errors import CaptureError, UsageError
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.train.budget import keyframe_budget, with_frame_budget
 from gscodec.train.checkpoint import Checkpoint
 from gscodec.train.ray_jobs import train_segment
 from gscodec.train.settings import train_settings
@@ -31,6 +34,23 @@ def test_light_that_comes_on_ends_a_group_and_not_the_subject():
     np.testing.assert_array_equal(first.frame(0).sh0, first.frame(4).sh0)
     still = psnr_of(first.frame(0), capture, 0)
     assert min(psnr_of(g, capture, 5) for g in map(second.frame, range(len(second)))) > still - 2
+
+
+def test_larger_pictures_have_longer_keyframes_whose_fit_frames_need_not_reach():
+    """The same for a keyframe that a preset trains longer; small pictures change neither its fit nor the bound."""
+
+    def bound_and_steps(side, preset="medium"):
+        picture = View(np.zeros((side, side, 3), np.uint8), np.full((side, side), 255, np.uint8))
+        views, settings = SimpleNamespace(train_cameras=[0], view=lambda *_: picture), train_settings(preset)
+        frames = with_frame_budget(settings, views, 0)
+        return frames.group.drift_ratio, keyframe_budget(views, 0, settings).steps, frames.motion_steps
+
+    usual = int(np.sqrt(train_settings("medium").budget.pixels))
+    ratio, steps, motion_steps = bound_and_steps(usual)
+    large = bound_and_steps(2 * usual)
+    assert large == (pytest.approx(ratio * 2**0.6, rel=1e-2), pytest.approx(2 * steps, rel=1e-2), motion_steps / 2)
+    assert bound_and_steps(usual // 4)[0] == ratio
+    assert bound_and_steps(usual, "slow")[0] == pytest.approx(3.8, abs=0.01), "frames may lose as much as with medium"
 
 
 def test_a_frame_is_as_sharp_where_the_others_are_empty():
