@@ -7,6 +7,7 @@ how much of it training finds, and not how well Gaussians stand for the world.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -98,7 +99,8 @@ def animated_capture(splat: Path, work: Path, frames: int, rig: Rig) -> Capture:
     if not (done := folder / ".done").exists():
         animate_splat(splat, folder, frames, Motion(up=rig.up))
         done.touch()
-    return draw(open_sequence(folder), splat.stem, rig, work / f"{folder.name}-{rig.width}x{rig.height}")
+    pictures = work / f"{folder.name}-{hashlib.sha256(repr(rig).encode()).hexdigest()[:8]}"  # another rig's are others
+    return draw(open_sequence(folder), splat.stem, rig, pictures)
 
 
 def _write(file: Path, rgba: np.ndarray) -> None:

@@ -2,7 +2,7 @@
 
 As in its public code: a hash grid of 16 levels x 4 features with 2^15 entries and an MLP of 64 x 2 map the position of
 a Gaussian to its translation and rotation while the attributes are fixed; then all attributes are fine-tuned. The
-public code takes 800 and 2,000 steps; here as many as fit the time of our preset medium, in the same proportion. The
+public code takes 800 and 2,000 steps; here as many as fit 8 s a frame of lumberjack, in the same proportion. The
 residual-entropy term of the public code has almost no gradient and is left out; the rate is that of videogs.py.
 
 Learning rates are tuned for this number of steps on the bundled capture: psnr_fg after 3 frames was 22.0 dB with the

@@ -228,33 +228,34 @@ def _depth(
     camera, grey = cameras[i].cropped(left, top, right - left, bottom - top), greys[i][part]
     mean, deviation = _windows(grey, settings.window)
     best = _Best(grey.shape, settings.other_depth)
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     y, x = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
     rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.K).T
     slant = settings.slant_cosine_min * np.linalg.norm(rays, axis=2)
+
+    def correlation(j: int, plane: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """With neighbour `j` by way of a plane n . x = 1, [H, W]; -1 where it does not see the plane."""
+        ray_map, size = _ray_map(camera, cameras[j], plane), (settings.window, settings.window)
+        H, flags = _homography(camera, cameras[j], ray_map), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        seen = cv2.warpPerspective(greys[j], H, grey.shape[::-1], flags=flags, borderValue=-1)
+        inside = (seen >= 0) & faces & (rays @ ray_map[2] > 0)
+        if not inside.any():
+            return np.full(grey.shape, -1, np.float32)
+        mean_seen, deviation_seen = _windows(seen, settings.window)
+        score = cv2.blur(grey * seen, size) - mean * mean_seen
+        score /= deviation * np.maximum(deviation_seen, settings.contrast_min)
+        score[~inside] = -1
+        return score
+
     for direction in directions:
         best.start()
         along = rays @ direction
         for d in inverse:
-            inverse_depth = d * along
-            faces = (along > slant) & (inverse_depth * camera.near < 1)
+            faces = (along > slant) & (d * along * camera.near < 1)
             if np.count_nonzero(faces) < settings.window**2:
                 continue
-            scores = np.empty((len(near), *grey.shape), np.float32)
-            for score, j in zip(scores, near, strict=True):
-                ray_map = _ray_map(camera, cameras[j], d * direction)
-                H = _homography(camera, cameras[j], ray_map)
-                seen = cv2.warpPerspective(greys[j], H, grey.shape[::-1], flags=flags, borderValue=-1)
-                inside = (seen >= 0) & faces & (rays @ ray_map[2] > 0)
-                score[:] = -1
-                if not inside.any():
-                    continue
-                mean_seen, deviation_seen = _windows(seen, settings.window)
-                score[:] = cv2.blur(grey * seen, (settings.window, settings.window)) - mean * mean_seen
-                score /= deviation * np.maximum(deviation_seen, settings.contrast_min)
-                score[~inside] = -1
+            scores = np.stack([correlation(j, d * direction, faces) for j in near])
             score = np.sort(scores, 0)[-settings.scored_neighbours :].mean(0)
-            best.add(score, inverse_depth, (inverse[1] - inverse[0]) * along)
+            best.add(score, d * along, (inverse[1] - inverse[0]) * along)
     depth = best.depth()
     unsure = (best.score < settings.correlation_min) | (best.score - best.second < settings.unique_min)
     depth[unsure | (deviation < settings.contrast_min) | ~where[part]] = 0
