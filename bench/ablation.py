@@ -76,7 +76,7 @@ VARIANTS = {
     "no fine-tuning": Variant(run_with(finetune_steps=0)),
     "no cuts": Variant(lambda s: stage_with("group", drift_ratio=math.inf)(replace(s, cut_ratio=math.inf)), (FAST,)),
     "no search": Variant(stage_with("motion_search", ratio=math.inf), (FAST,)),
-    "first rounds not stiff": Variant(stage_with("tracking", first_round_rigidity=1.0), (FAST,)),
+    "first rounds not stiff": Variant(stage_with("tracking", stiff_rigidity=1.0), (FAST,)),
     "colours held in tracking": Variant(stage_with("tracking", rates=TRACKING.rates.but(sh0=0.0, shN=0.0))),
     "full-size pictures only": Variant(stage_with("tracking", small_scale=1.0)),
     "nothing held still": Variant(stage_with("change_detection", threshold=-1.0)),
@@ -84,7 +84,7 @@ VARIANTS = {
     "no births": Variant(stage_with("densification", max_share=0.0), (STAGE,)),
     "no matched features": Variant(stage_with("initialization", triangulate=False), (STAGE,)),
     "no plane sweep": Variant(stage_with("initialization", use_plane_sweep=False), (STAGE,)),
-    "no shell of far points": Variant(stage_with("plane_sweep", shell_points=0), (STAGE,)),
+    "no shell of far points": Variant(stage_with("far_shell", points=0), (STAGE,)),
     "no node graph": Variant(  # every Gaussian for itself, at the rate of a node
         stage_with(
             "tracking",

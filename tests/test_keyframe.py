@@ -20,10 +20,11 @@ from gscodec.model.gaussians import PARAMETERS
 from gscodec.render.cpu import CpuBackend
 from gscodec.render.image import render_image, render_rgba
 from gscodec.train.calibration import Extrinsics
+from gscodec.train.far_shell import far_shell
 from gscodec.train.initialization import initial_model
 from gscodec.train.keyframe import Statistics, add_opacity_decay, densify, move_at_random, prune, train_keyframe
 from gscodec.train.model import from_gaussians
-from gscodec.train.plane_sweep import shell, sweep, unproject
+from gscodec.train.plane_sweep import sweep, unproject
 from gscodec.train.sparse_points import triangulated
 from gscodec.train.train import train_groups
 from gscodec.train.views import Views, add_harmonics_prior
@@ -50,15 +51,21 @@ def test_hull_lies_on_the_subject(capture):
 
 
 def test_sweep_finds_a_textured_wall():
-    """A wall y = 0 of coloured splats, seen from an arc in front of it: the points lie on it, the shell far behind."""
+    """A wall y = 0 of coloured splats, seen from an arc in front of it: the points lie on it."""
     wall, cameras = splat_wall(), arc()
     views = [(c, render_image(wall, c, (0, 0, 0)), None) for c in cameras]
     points, colors = sweep(views, 1000, 0, TINY.plane_sweep)
     assert len(points) == len(colors) == 1000
     assert (np.abs(points[:, 1]) < 0.22).mean() > 0.9, "a plane and a half: they are 0.15 apart there"
-    behind, _ = shell(views, TINY.plane_sweep)
-    assert len(behind) > 5
-    assert (behind[:, 1] > 8).all()
+
+
+def test_far_shell_is_opaque_and_far():
+    """White pictures, and so a white shell: it fills every picture before black, from far behind the wall's place."""
+    views = [(c, np.full((c.height, c.width, 3), 255, np.uint8), None) for c in arc()]
+    shell = far_shell(views, TINY.far_shell).gaussians()
+    assert (shell.means[:, 1] > 8).all()
+    middles = [render_image(shell, c, (0, 0, 0))[8:-8, 8:-8] for c, _, _ in views]  # it ends where no camera looks
+    assert min(m.min() for m in middles) > 225
 
 
 def test_depth_of_a_sweep_lies_between_its_planes():
@@ -96,7 +103,7 @@ def test_initial_points_do_without_shell_or_sweep():
     cameras = [dataclasses.replace(c, split="train") for c in arc()]
     read = lambda camera, _: View(render_image(wall, cameras[camera], (0, 0, 0)), None)  # noqa: E731
     capture = Capture("wall", 25.0, cameras, 1, False, read)
-    no_shell = dataclasses.replace(TINY, plane_sweep=dataclasses.replace(TINY.plane_sweep, shell_points=0))
+    no_shell = dataclasses.replace(TINY, far_shell=dataclasses.replace(TINY.far_shell, points=0))
     nothing = dataclasses.replace(TINY.initialization, use_plane_sweep=False, triangulate=False)
     no_sweep = dataclasses.replace(TINY, initialization=nothing)
     with_shell, without, random = (initial_model(capture, 0, 300, s)[0] for s in (TINY, no_shell, no_sweep))
@@ -138,7 +145,7 @@ def test_a_keyframe_starts_from_depth_images():
         return View(render_image(wall, cameras[camera], (0, 0, 0)), None, depth)
 
     capture = Capture("wall", 25.0, cameras, 1, False, read, has_depth=True)
-    no_shell = dataclasses.replace(TINY, plane_sweep=dataclasses.replace(TINY.plane_sweep, shell_points=0))
+    no_shell = dataclasses.replace(TINY, far_shell=dataclasses.replace(TINY.far_shell, points=0))
     found = initial_model(capture, 0, 300, no_shell)[0].params["means"].numpy()
     assert len(found) == 300
     assert np.abs(found[:, 1]).max() < 0.3, "on the wall"

@@ -57,6 +57,15 @@ def test_tracking_finds_the_turn(capture):
     assert carried < 0.3 * still, "the nodes have found it, not the Gaussians each for itself"
 
 
+def test_a_far_background_does_not_make_what_moves_larger():
+    """Rates of the nodes are in radii of what moves: with the sky in it, a subject flies off."""
+    capture, subject = capture_of(turning(300, frames=2), masks=False), blob(300)
+    sky = dataclasses.replace(subject, means=20 * subject.means, log_scales=subject.log_scales + 3)
+    start = lambda g: Tracker.start(from_gaussians(g), Views(capture, TINY, CpuBackend()), TINY, 0.01, range(2))  # noqa: E731
+    alone = start(subject).radius
+    assert start(concatenate([subject, sky.take(np.arange(100))])).radius < 1.5 * alone
+
+
 def test_a_motion_out_of_reach_of_the_gradient_is_searched_for():
     turn, shift = np.array([0.0, 0.8, 0.1]), np.array([0.9, -0.3, 0.2])
     first = blob(300)

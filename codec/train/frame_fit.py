@@ -60,13 +60,14 @@ class FrameFit:
             self.tracker.pose, angular_velocity=turn, velocity=self._nodes["velocity"] + self._carriers * shift
         ).next()
 
-    def step(self, target: Target, decay: float, *, full: bool, first: bool) -> float:
+    def step(self, target: Target, decay: float, *, full: bool, stiff: bool, slow: bool) -> float:
         """One view; returns its image loss without the mask term.
 
         Args:
             decay: multiplies all learning rates.
             full: the view has its full size, and counts in the statistics.
-            first: a round without known velocity, see `TrackingSettings.first_round_rigidity`.
+            stiff: nodes hold together, and slow: the Gaussians' own attributes follow slowly, where the velocity is
+                not known (`TrackingSettings.stiff_rigidity`, `slow_rates`).
         """
         t, s, pose = self.tracker, self.tracker.settings.tracking, self._pose()
         params, rotations = t.carried(self.own, pose)
@@ -75,13 +76,13 @@ class FrameFit:
             self.statistics.add(result)
         grads = result.grads
         by_rotations = quat_product(grads["quats"], self.own.params["quats"], inverse_b=True)
-        rigidity = (s.first_round_rigidity if first else 1.0) * t.settings.rigidity
+        rigidity = (s.stiff_rigidity if stiff else 1.0) * t.settings.rigidity
         self._step_nodes(pose, (grads["means"], by_rotations), rigidity, decay)
         grads = {**grads, "quats": quat_product(rotations, grads["quats"], inverse_a=True)}  # before rotation
         free = grads
         if not self._all_move:
             free = {n: g * self._moving.view(-1, *[1] * (g.dim() - 1)) for n, g in grads.items()}
-        self.own.step(free, s.rates.scaled(t.radius, decay * (s.first_round_rates if first else 1.0)))
+        self.own.step(free, s.rates.scaled(t.radius, decay * (s.slow_rates if slow else 1.0)))
         return result.image_loss
 
     def _step_nodes(self, pose: Pose, by_carried: tuple, rigidity: float, decay: float) -> None:

@@ -11,8 +11,9 @@ from ..bitstream.quantization import subject_radius
 from ..capture import View
 from ..errors import CaptureError
 from .depth_points import depth_points
+from .far_shell import far_shell
 from .model import Model, from_points
-from .plane_sweep import shell, sweep
+from .plane_sweep import sweep
 from .settings import TrainSettings
 from .sparse_points import known_points, triangulated
 from .visual_hull import hull_points, random_points
@@ -69,8 +70,10 @@ def initial_model(
 
 def _on_surfaces(found: Cloud, views, masked: bool, settings: TrainSettings) -> tuple[Model, float]:
     """Gaussians at points on surfaces, and in a far shell where there are no masks; and the radius of the points."""
-    whole = found if masked else _joined(found, shell(views, settings.plane_sweep))
-    return from_points(*whole, opacity=settings.initialization.surface_opacity), subject_radius(found[0])
+    model = from_points(*found, opacity=settings.initialization.surface_opacity)
+    if not masked:
+        model.append(far_shell(views, settings.far_shell).params)
+    return model, subject_radius(found[0])
 
 
 def _joined(a: Cloud, b: Cloud) -> Cloud:

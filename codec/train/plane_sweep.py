@@ -10,18 +10,15 @@ Two views that look from directions far apart see a surface at such different sl
 never match. A view without near neighbours is compared with the nearest ones there are over planes of several
 directions (Gallup et al. 2007): level ones (floor, table) and upright ones. A depth is kept if no other one matches as
 well. Tiny pictures are left out, and those without much texture, since what is found would leave the rest bare.
-
-A shell of far points is added around the scene, for parts without texture and therefore without depth (sky, dark):
-stage has 26.7 dB with it, 25.7 without, 23.8 with random points.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from ..model.camera import fibonacci_directions, meeting_point
+from ..model.camera import meeting_point
 from .settings import PlaneSweepSettings
-from .visual_hull import colors_of, project
+from .visual_hull import project
 
 
 def sweep(
@@ -74,21 +71,6 @@ def sweep(
     points, colors = np.concatenate(points), np.concatenate(colors)
     chosen = np.random.default_rng(seed).permutation(len(points))[:count]
     return points[chosen], colors[chosen]
-
-
-def shell(views, settings: PlaneSweepSettings) -> tuple[np.ndarray, np.ndarray]:
-    """Far points, evenly in the directions that a view sees: positions [P, 3] and colours [P, 3] in 0..1."""
-    if not settings.shell_points:
-        return np.zeros((0, 3)), np.zeros((0, 3))
-    cameras = [c for c, _, _ in views]
-    centre = meeting_point(cameras)
-    radius = settings.far * np.median([np.linalg.norm(c.center - centre) for c in cameras])
-    points = centre + radius * fibonacci_directions(settings.shell_points)
-    seen = np.zeros(len(points), bool)
-    for c in cameras:
-        p, depth = project(c, points)
-        seen |= (depth > 0) & (p >= 0).all(1) & (p < [c.width, c.height]).all(1)
-    return points[seen], colors_of(points[seen], views)
 
 
 def _neighbours(cameras, i: int, settings: PlaneSweepSettings) -> list[int]:

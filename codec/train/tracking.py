@@ -63,6 +63,7 @@ class Tracker:
         masks: changed pixels of the last frame, as of `Changes.advance`.
         screen_gradient: [N], mean in the last frame.
         rig: says how the nodes move to the next frame; None: they go on as they did.
+        searched: the last frame was out of reach of the gradient, and a search has found it.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class Tracker:
         self.changes = changes
         self.moving = torch.zeros(len(own), dtype=torch.bool)
         self.rig: RigPrediction | None = None
+        self.searched = False
 
     @staticmethod
     def start(
@@ -91,7 +93,7 @@ class Tracker:
         if len(frames) > 1:
             changed = changes.behind(frames[1], changes.copy().advance(frames[1]), means.numpy(), visible)
             moving = changed if changed.any() else moving
-        radius = subject_radius(means[moving].numpy())
+        radius = _radius(means[moving].numpy(), s.radius_max)
         sizes = torch.ones(len(key))
         if not views.capture.has_alpha:  # there is a background
             sizes = key.params["log_scales"].sort(1).values[:, 1:].mean(1).exp()  # without the thin axis
@@ -127,15 +129,15 @@ class Tracker:
         """
         if self.rig is not None:
             self.pose = self.rig.step(self.pose, self.graph, frame)
-        self.moving = torch.from_numpy(self._moving(frame))
+        self.moving, self.searched = torch.from_numpy(self._moving(frame)), False
         self.screen_gradient = torch.zeros(len(self.own))
         if not self.alive.any():
             return self._missing(frame)
         if self.moving.any():
             self._relocalize(frame)
             found = search(self, frame)
-            self.pose = found or self.pose
-            self._fit(frame, on_step, found is not None)
+            self.pose, self.searched = found or self.pose, found is not None
+            self._fit(frame, on_step)
         else:
             still = {n: 0 * getattr(self.pose, n) for n in ("angular_velocity", "velocity")}
             self.pose = replace(self.pose, **still)
@@ -155,17 +157,20 @@ class Tracker:
         """`advance` where no Gaussian is left."""
         return np.inf if self._changed and self.views.show(frame) else None
 
-    def _fit(self, frame: int, on_step: OnStep, searched: bool) -> None:
+    def _fit(self, frame: int, on_step: OnStep) -> None:
         """Rounds of `motion_steps`, until the loss is near that of the frame before or falls no more. Stiff ones come
-        first if the velocity is that of a search (`searched`) or not known at all."""
+        first if the velocity is that of a search or not known at all. Behind a search the nodes have
+        another round before the Gaussians follow: colours that change at once take what should move."""
         fit = FrameFit(self, np.random.default_rng([self.settings.seed, frame, 1]))
         s = self.settings.tracking
         bound, loss = s.loss_ratio * self.loss + s.loss_floor, np.inf
         small = self._of_usual(s.small_scale)
-        stiff = [self._of_usual(s.searched_scale)] if searched else []
-        stiff += [small] if searched or not self.pose.velocity.any() else []
+        stiff = [self._of_usual(s.searched_scale)] if self.searched else []
+        stiff += [small] if self.searched or not self.pose.velocity.any() else []
         for scale in stiff:
             self._round(fit, frame, on_step, scale, stiff=True)
+        if self.searched:
+            self._round(fit, frame, on_step, 1.0, slow=True)
         for i in range(s.rounds_max):
             before, loss = loss, self._round(fit, frame, on_step, small if i == 0 else 1.0)
             if loss < bound or loss > s.progress_ratio * before:
@@ -178,15 +183,17 @@ class Tracker:
         """`scale` of images of the usual size, which makes larger ones as small, to halves."""
         return scale * 0.5 ** max(0, round(math.log2(self.views.largest_side / self.settings.tracking.usual_side)))
 
-    def _round(self, fit: FrameFit, frame: int, on_step: OnStep, scale: float, *, stiff: bool = False) -> float:
+    def _round(
+        self, fit: FrameFit, frame: int, on_step: OnStep, scale: float, *, stiff: bool = False, slow: bool = False
+    ) -> float:
         """`motion_steps` views at `scale` times their size in the first half, or, if `stiff`, in all steps; returns the
-        image loss at the end."""
+        image loss at the end. `stiff`, `slow`: as of `FrameFit.step`."""
         s, steps = self.settings.tracking, self.settings.motion_steps
         losses = []
         for step in range(steps):
             now = scale if stiff or step < steps / 2 else 1.0
             decay = s.rate_decay ** (step / steps)
-            losses.append(fit.step(self.views.draw(frame, now), decay, full=now == 1, first=stiff))
+            losses.append(fit.step(self.views.draw(frame, now), decay, full=now == 1, stiff=stiff, slow=stiff or slow))
             if on_step:
                 on_step(step, losses[-1])
         return float(np.mean(losses[-s.loss_window :]))
@@ -306,3 +313,10 @@ class Tracker:
         tracker.pose = Pose(*(torch.from_numpy(state[f"pose.{f.name}"]) for f in fields(Pose)))
         tracker.rig = rig and RigPrediction(rig, int(state["at_rest"]), tracker.graph)
         return tracker
+
+
+def _radius(means: np.ndarray, most: float) -> float:
+    """Radius of what moves (`means`, [N, 3]), world units: at most `most` times the median distance from its middle, so
+    that a far background which shows behind it does not count."""
+    away = float(np.median(np.linalg.norm(means - np.median(means, 0), axis=1)))
+    return min(subject_radius(means), most * away or np.inf)

@@ -215,7 +215,11 @@ class _Run:
             nominal, g = steps_for(quality, subject.radius), track.models[t].gaussians()
             subject.steps = measured_steps(g, quality, nominal, cameras, backend=self.views.backend)
         graph, steps = subject.tracker.graph, subject.steps
-        model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), self.settings)
+        faster = 1 + float(np.mean(track.searched))  # what moves fast changes its light and shape as fast
+        f = self.settings.finetune
+        f = replace(f, frequencies={n: round(faster * count) for n, count in f.frequencies.items()})
+        settings = replace(self.settings, finetune=f)
+        model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), settings)
         on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
         finetune(model, self.views, frames, self.settings, radius=subject.tracker.radius, on_step=on_step)
         return model
@@ -223,17 +227,20 @@ class _Run:
 
 @dataclass
 class _TrackedFrames:
-    """For each frame of a group the Gaussians, the pose of the nodes, and the moving Gaussians ([N] bool)."""
+    """For each frame of a group the Gaussians, the pose of the nodes, the moving Gaussians ([N] bool), and whether a
+    search has found them (`Tracker.searched`)."""
 
     models: list[Model] = field(default_factory=list)
     poses: list[Pose] = field(default_factory=list)
     moving: list[torch.Tensor] = field(default_factory=list)
+    searched: list[bool] = field(default_factory=list)
 
     def add(self, tracker: Tracker) -> None:
         """The last frame of `tracker`."""
         self.models.append(tracker.model)
         self.poses.append(tracker.pose)
         self.moving.append(tracker.moving)
+        self.searched.append(tracker.searched)
 
     def fullest(self) -> int:
         """The frame in which most Gaussians live; of several the one nearest to the middle."""

@@ -17,6 +17,7 @@ from .finetune import EntropyModelSettings, FinetuneSettings, RefinementSettings
 from .keyframe import (
     BudgetSettings,
     CameraCalibrationSettings,
+    FarShellSettings,
     InitializationSettings,
     KeyframeSettings,
     PlaneSweepSettings,
@@ -45,6 +46,7 @@ __all__ = [
     "DeformationGraphSettings",
     "DensificationSettings",
     "EntropyModelSettings",
+    "FarShellSettings",
     "FinetuneSettings",
     "GroupSettings",
     "InitializationSettings",
@@ -113,6 +115,7 @@ class TrainSettings:
     initialization: InitializationSettings = field(default_factory=InitializationSettings)
     visual_hull: VisualHullSettings = field(default_factory=VisualHullSettings)
     plane_sweep: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
+    far_shell: FarShellSettings = field(default_factory=FarShellSettings)
     calibration: CameraCalibrationSettings = field(default_factory=CameraCalibrationSettings)
     budget: BudgetSettings = field(default_factory=BudgetSettings)
     keyframe: KeyframeSettings = field(default_factory=KeyframeSettings)

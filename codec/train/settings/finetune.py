@@ -38,7 +38,7 @@ class FinetuneSettings:
     topology_at: float = 0.3  # share of the steps at which Gaussians are removed and added
     topology_views: int = 4  # times every camera must have been drawn before
     views: int = 2  # of a frame, in one step: what a step costs besides is shared
-    frames_min: int = 8  # a shorter group behind a keyframe has the steps of so many, about those of its keyframe
+    frames_min: int = 20  # a shorter group behind a keyframe has the steps of so many
     growth: float = 0.1  # share of the Gaussians that may be added then
     rate_every: int = 8  # steps: the rate term has every coefficient, an image few; its weight grows by as much
     canonical_rate_every: int = 24  # steps for which the gradient of the canonical bits, and their noise, are held

@@ -38,12 +38,12 @@ class VisualHullSettings:
 
 @dataclass(frozen=True)
 class PlaneSweepSettings:
-    """Plane sweep, and the shell of far points around it."""
+    """Plane sweep."""
 
     width: int = 256  # pixels of the images that are compared
     planes: int = 96  # evenly in 1/depth
     near: float = 0.2  # times the distance to where the optical axes meet: first plane
-    far: float = 4.0  # times that distance: last plane, and the shell
+    far: float = 4.0  # times that distance: last plane
     neighbours: int = 4  # cameras that a view is compared with
     scored_neighbours: int = 2  # best ones, whose mean is the score: the others may not see the surface
     axis_cosine_min: float = 0.5  # between optical axes of neighbours: 60 degrees
@@ -59,13 +59,23 @@ class PlaneSweepSettings:
     correlation_min: float = 0.6  # normalised; below it a depth is not believed
     depth_tolerance: float = 0.03  # relative difference of depth at which two views agree
     contrast_min: float = 2.0  # grey levels, standard deviation in a window: below it a window has no texture
-    shell_points: int = 500  # on the whole sphere; 0: no shell
 
     def of_lone_view(self) -> PlaneSweepSettings:
         """The settings for a view that has fewer near neighbours than are scored: one from any side decides."""
         lone = {"window": self.lone_window, "correlation_min": self.lone_correlation_min}
         lone["unique_min"] = self.lone_unique_min
         return replace(self, axis_cosine_min=-1.0, scored_neighbours=1, **lone)
+
+
+@dataclass(frozen=True)
+class FarShellSettings:
+    """Shell of far Gaussians around a scene without masks."""
+
+    points: int = 500  # on the whole sphere, of which those are left that a view sees; 0: no shell
+    distance: float = 4.0  # times the distance of the cameras to where their optical axes meet
+    opacity: float = 0.95
+    width: float = 1.5  # times that of a Gaussian at a point on a surface: they overlap without gaps
+    thickness: float = 0.1  # times the width
 
 
 @dataclass(frozen=True)

@@ -90,13 +90,14 @@ class TrackingSettings:
     searched_scale: float = 0.25  # of the images in the first of two stiff rounds behind a search
     # Without a known velocity, or with that of a search, first rounds: stiff nodes and slow attributes, or else
     # far-moved Gaussians take the colours of what they lie over.
-    first_round_rigidity: float = 8.0  # times `rigidity`
-    first_round_rates: float = 0.1  # times `rates`
+    stiff_rigidity: float = 8.0  # times `rigidity`
+    slow_rates: float = 0.1  # times `rates`
     mask_factor: float = 3.0  # times mask_lambda: the silhouette does not depend on light
     gradient_quantile: float = 0.995  # of the screen gradients in a keyframe: the reference for densification
     stored_factor: int = 2  # times gaussians_max: all Gaussians of a group, with those already removed
     separate_distance: float = 4.0  # spacings of new Gaussians; so far from all others they get their own nodes
     separate_min: int = 8  # new Gaussians that are worth nodes of their own
+    radius_max: float = 2.5  # times the median distance of what moves from its middle; a filled shape has about 2
     visible_weight: float = 0.05  # blending weight from which a camera sees a Gaussian
 
 
@@ -146,7 +147,7 @@ class GroupSettings:
 
     drift_ratio: float = 2.0  # image loss over the keyframe's from which frames start anew
     drift_steps: int = 2400  # of a keyframe for which that is meant: with more it fits its own pictures better
-    drift_exponent: float = 0.6  # of the steps of a keyframe, in that ratio
+    drift_exponent: float = 0.75  # of the steps of a keyframe, in that ratio
     cut_loss_floor: float = 0.002  # loss: clean images fit far better than they need to, and no frame is cut for it
     changed_fraction_max: float = 0.15  # of the Gaussians, that begin to change in one frame
     changed_frames_min: int = 4  # frames that a group has before `changed_fraction_max` may end it
