@@ -22,6 +22,8 @@ VECTORS = SPEC / "vectors"
 sys.path[:0] = [str(SPEC), str(VECTORS)]
 import make  # noqa: E402
 import reference_decoder as reference  # noqa: E402
+from reference_container import LEVELS  # noqa: E402
+from reference_evaluation import evaluate  # noqa: E402
 from reference_scene import scene_frame  # noqa: E402
 
 MANIFEST = json.loads((VECTORS / "manifest.json").read_text())
@@ -96,7 +98,7 @@ def compare(name, data, decoded, native, groups):
         assert sample.audio == (sound and (*sound[1:], data[sound[0] : fragment["offset"]]))
         frames = sample.frames
         for t in sorted({0, 1, frames // 2, frames - 1} & set(range(frames))):
-            expected, frame = reference.evaluate(group, t), ours.frame(t)
+            expected, frame = evaluate(group, t), ours.frame(t)
             shown, visible = expected.pop("shown"), ours.visible(t)
             assert np.array_equal(shown, np.ones_like(shown) if visible is None else visible)
             for key, values in expected.items():
@@ -139,7 +141,7 @@ def test_invalid(name):
 def test_reference_stops_at_the_cap_of_symbols(monkeypatch):
     payload = make.encode(make.make_group(250, 20, **make.MOTION))
     symbols = 13 * 250 + 4 * 250 + (3 + 6 * 6) * 12
-    monkeypatch.setitem(reference.LEVELS, 1, (65536, 64, 1024, symbols + 10, 2**24))
+    monkeypatch.setitem(LEVELS, 1, (65536, 64, 1024, symbols + 10, 2**24))
     with pytest.raises(reference.LimitError, match="symbols"):
         reference.decode_group(payload, 1)
 
@@ -159,7 +161,7 @@ def test_prefix(name):
             ours = stream.group(i)
             assert ours.layers == groups[i].counts
             assert native_hash(ours.quantized()) == reference.group_hash(groups[i])
-            expected = reference.evaluate(groups[i], 0)
+            expected = evaluate(groups[i], 0)
             expected.pop("shown")
             for key, values in expected.items():
                 assert_close(ours.frame(0)[key], values, f"{name}, {layers} layers, {key}")
