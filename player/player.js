@@ -1,4 +1,5 @@
-// <gsv-player src="URL"> plays a .gsv file: the clock, the resolution, and the messages to the viewer.
+// <gsv-player src="URL"> plays a .gsv file: opening, the clock, the image, and the actions of the viewer. resolution.js says
+// how fine the image is, messages.js what the viewer is told.
 //
 // Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the image fills the
 // element); quality="auto" or 0.1 to 1; layers="2" or "all", else as many as link and device sustain; renderer="cpu" or "gpu",
@@ -8,16 +9,14 @@
 // ended, error.
 
 import { Camera, viewFrom } from "./camera.js";
-import { MARKUP, clock, onDrag, onKeys, setIcon } from "./controls.js";
+import { MARKUP, onDrag, onKeys } from "./controls.js";
 import { Engine } from "./engine.js";
+import { Messages } from "./messages.js";
 import { ALL, AUTO } from "./native.js";
+import { Resolution } from "./resolution.js";
 
-const PIXELS_MAX = 4e6; // of a still image
-const PIXELS_START = 420_000; // of a moving one, before any measurement
-const PIXELS_MIN = 180_000; // fewer save little: the cost of the Gaussians stays
 const STILL = 250; // ms without camera motion until the image is sharp
 const TALL = 2; // metres, height of the scene in a headset
-const STALL = 300; // ms without an image until the busy sign appears
 
 export class GsvPlayer extends HTMLElement {
   static observedAttributes = ["src", "loop", "speed", "quality", "size", "layers", "renderer", "muted", "volume"];
@@ -30,10 +29,8 @@ export class GsvPlayer extends HTMLElement {
   #moved = 0; // time of the last camera motion
   #drawn = ""; // the last request
   #begun = false;
-  #scale = null; // of a moving image per side, measured
-  #adapted = 0;
-  #times = []; // of the images of the last second
-  #busySince = 0;
+  #messages = new Messages(this);
+  #resolution = new Resolution(this);
 
   constructor() {
     super();
@@ -118,7 +115,7 @@ export class GsvPlayer extends HTMLElement {
 
   get stats() {
     const e = this.engine;
-    return { ...e?.stats, fps: this.#times.length, received: e?.source?.received ?? 0 };
+    return { ...e?.stats, fps: this.#messages.drawn, received: e?.source?.received ?? 0 };
   }
 
   play() {
@@ -155,22 +152,23 @@ export class GsvPlayer extends HTMLElement {
     this.$(".notes").replaceChildren();
     this.$(".busy").hidden = false;
     Object.assign(this, { camera: null, header: null, paused: true, shown: null });
-    [this.#position, this.#scale, this.#drawn, this.#begun] = [0, null, "", false];
+    [this.#position, this.#drawn, this.#begun] = [0, "", false];
+    this.#resolution.reset();
     const engine = (this.engine = new Engine(this.$("canvas"), this.getAttribute("src")));
     engine.layers = this.#layers;
     engine.view = () => (engine.gpu?.head ? null : this.camera ? this.#view(true) : undefined);
     const { source } = engine;
     const on = (target, type, f) => target.addEventListener(type, (e) => this.engine === engine && f(e.detail));
-    on(engine, "damaged", (d) => this.#damaged(d));
-    on(engine, "nogpu", (why) => this.#note("gpu", `The GPU cannot be used (${why}): the CPU draws.`));
-    on(engine, "fatal", (message) => this.#fail("The player has stopped", `${message}.`));
+    on(engine, "damaged", (d) => this.#messages.damaged(d));
+    on(engine, "nogpu", (why) => this.#messages.note("gpu", `The GPU cannot be used (${why}): the CPU draws.`));
+    on(engine, "fatal", (message) => this.#messages.fail("The player has stopped", `${message}.`));
     on(engine, "bounds", () => this.#begin(engine));
     on(engine, "decoded", ({ header }) => ((this.header = header), this.#begin(engine)));
     on(engine, "picture", (detail) => this.#pictured(detail));
-    on(engine, "silent", (why) => this.#note("sound", `The sound cannot be played (${why}).`));
-    on(source, "retry", (why) => this.#note("link", `Connection lost (${why}). Trying again…`, true));
-    on(source, "connected", () => this.#note("link", null));
-    on(source, "error", (e) => this.#fail("The file cannot be read on", sentence(e.message)));
+    on(engine, "silent", (why) => this.#messages.note("sound", `The sound cannot be played (${why}).`));
+    on(source, "retry", (why) => this.#messages.note("link", `Connection lost (${why}). Trying again…`, true));
+    on(source, "connected", () => this.#messages.note("link", null));
+    on(source, "error", (e) => this.#messages.fail("The file cannot be read on", sentence(e.message)));
     on(source, "groups", () => this.#grown());
     try {
       this.#request = requestAnimationFrame(() => this.#tick());
@@ -179,12 +177,12 @@ export class GsvPlayer extends HTMLElement {
       if (source.config.audio) this.#hear(engine);
       if (source.missing) {
         const all = this.frameCount + source.missing;
-        this.#note("cut", `The file is cut short: ${this.frameCount} of ${all} frames are there.`, true);
+        this.#messages.note("cut", `The file is cut short: ${this.frameCount} of ${all} frames are there.`, true);
       }
       this.#grown();
-      if (!this.frameCount) this.#fail("Nothing to play", "The file has no whole group of frames.");
+      if (!this.frameCount) this.#messages.fail("Nothing to play", "The file has no whole group of frames.");
     } catch (e) {
-      if (this.engine === engine) this.#fail("This file cannot be played", sentence(e.message));
+      if (this.engine === engine) this.#messages.fail("This file cannot be played", sentence(e.message));
     }
   }
 
@@ -207,7 +205,7 @@ export class GsvPlayer extends HTMLElement {
     const { source } = this.engine;
     this.$(".seek input").max = Math.max(this.frameCount - 1, 0);
     const unfinished = source.settled ? "The file is unfinished: these are the frames it has." : "Live: the file is still being written.";
-    this.#note("live", source.complete ? null : unfinished);
+    this.#messages.note("live", source.complete ? null : unfinished);
   }
 
   // Begins when what the first frame shows is decoded, and looks at it when its size is known.
@@ -266,8 +264,8 @@ export class GsvPlayer extends HTMLElement {
     if (ready && !this.paused) this.#advance(passed);
     this.sound?.follow(this.#position, ready && !this.paused, this.#loops);
     if (ready && decoded() && engine.renderer.free) this.#draw(now);
-    this.#wait(now, ready && decoded());
-    this.#follow(now);
+    this.#messages.wait(now, ready && decoded());
+    this.#messages.follow(now);
   }
 
   #advance(passed) {
@@ -296,7 +294,7 @@ export class GsvPlayer extends HTMLElement {
     if (!engine.source.complete) return null;
     this.#position = this.$(".seek input").value = 0;
     const [first, why] = engine.failed.entries().next().value;
-    this.#fail("This file is damaged", `None of its groups can be decoded (group ${first}: ${why}).`);
+    this.#messages.fail("This file is damaged", `None of its groups can be decoded (group ${first}: ${why}).`);
     return null;
   }
 
@@ -310,15 +308,7 @@ export class GsvPlayer extends HTMLElement {
   #view(sharp) {
     const head = this.engine.gpu?.head;
     if (head) return viewFrom(head.map((v) => this.#near(v)));
-    const fixed = /^(\d+)x(\d+)$/.exec(this.getAttribute("size") ?? "");
-    if (fixed) return this.camera.view(Number(fixed[1]), Number(fixed[2]));
-    const stage = this.$(".stage");
-    const ratio = Math.min(devicePixelRatio || 1, 2);
-    const [w, h] = [stage.clientWidth * ratio, stage.clientHeight * ratio].map((v) => Math.max(v, 16));
-    const most = Math.min(1, Math.sqrt(PIXELS_MAX / (w * h)));
-    this.#scale ??= Math.min(1, Math.sqrt(PIXELS_START / (w * h)));
-    const scale = this.quality === "auto" ? (sharp ? most : Math.min(this.#scale, most)) : this.quality * most;
-    return this.camera.view(Math.round(w * scale), Math.round(h * scale));
+    return this.camera.view(...this.#resolution.size(sharp));
   }
 
   // Rounds to a hundredth of the scene: smaller motions of the head need no other Gaussians.
@@ -341,20 +331,19 @@ export class GsvPlayer extends HTMLElement {
     const { engine } = this;
     if (!this.shown) requestAnimationFrame(() => setTimeout(() => this.engine === engine && this.#render())); // after the first paint
     this.shown = detail;
-    this.#times.push(now);
-    this.#busySince = 0;
+    this.#messages.pictured(now);
     this.dispatchEvent(new CustomEvent("picture", { detail }));
-    if (!this.paused) this.#adapt(now);
+    if (!this.paused) this.#resolution.adapt(now);
   }
 
   // Switches to the renderer of the attribute.
   async #render() {
     const { engine } = this;
-    this.#note("gpu", null);
+    this.#messages.note("gpu", null);
     try {
       await engine.use(this.renderer);
     } catch (e) {
-      if (this.engine === engine) this.#note("gpu", `The GPU cannot be used (${e.message}): the CPU draws.`);
+      if (this.engine === engine) this.#messages.note("gpu", `The GPU cannot be used (${e.message}): the CPU draws.`);
     }
   }
 
@@ -370,124 +359,8 @@ export class GsvPlayer extends HTMLElement {
       await engine.gpu.enter(session, how, () => this.#step());
       session.addEventListener("end", () => (this.#drawn = "", this.#render()));
     } catch (e) {
-      this.#note("gpu", `${way === "ar" ? "Augmented" : "Virtual"} reality cannot be used here (${e.message}).`);
+      this.#messages.note("gpu", `${way === "ar" ? "Augmented" : "Virtual"} reality cannot be used here (${e.message}).`);
     }
-  }
-
-  // Adapts the resolution and the layers to the time of the slowest stage.
-  #adapt(now) {
-    if (now - this.#adapted < 500) return;
-    this.#adapted = now;
-    const { blend, project, decode } = this.engine.stats;
-    const each = Math.min(this.fps * this.speed, 60) / 1000;
-    const share = Math.max(blend, project) * each;
-    const { clientWidth, clientHeight } = this.$(".stage");
-    const least = Math.min(1, Math.sqrt(PIXELS_MIN / Math.max(clientWidth * clientHeight, 1)));
-    const coarser = this.quality === "auto" && !this.hasAttribute("size") && this.#scale > least;
-    if (share > 0.95) this.#scale = Math.max(least, this.#scale * 0.85);
-    else if (share < 0.5) this.#scale = Math.min(1, this.#scale * 1.08);
-    const load = Math.max(coarser ? 0 : share, (decode * this.fps * this.speed) / 1000);
-    this.engine.choice.look(load, this.header.layers, now);
-  }
-
-  // Messages
-
-  #wait(now, ready) {
-    if (ready) this.#busySince = 0;
-    else this.#busySince ||= now;
-    this.$(".busy").hidden = !this.#busySince || now - this.#busySince < STALL;
-  }
-
-  #follow(now) {
-    while (this.#times.length && this.#times[0] < now - 1000) this.#times.shift();
-    const bar = this.$(".seek input");
-    if (!bar.matches(":active")) bar.value = this.frame;
-    setIcon(this.$("[data-do=play]"), this.paused ? "play" : "pause");
-    if (now - (this.toldAt ?? 0) < 100) return;
-    this.toldAt = now;
-    const seconds = (n) => clock(n / this.fps);
-    this.$(".time").innerHTML = `${seconds(this.frame)} <small>/ ${seconds(this.frameCount)}</small>`;
-    bar.setAttribute("aria-valuetext", `frame ${this.frame} of ${this.frameCount}`);
-    this.#track();
-    this.#slow();
-    if (!this.$(".stats").hidden) this.$(".stats").textContent = this.#figures();
-  }
-
-  // Colours the time bar: fetched, not fetched, damaged.
-  #track() {
-    const { source, failed } = this.engine;
-    const at = (t) => `${((100 * t) / Math.max(this.frameCount, 1)).toFixed(2)}%`;
-    const parts = source.groups.map((g, i) => {
-      const color = failed.has(i) ? "#a4503f" : source.has(i) ? "#8a909c" : "#4a4d55";
-      return `${color} ${at(g.start_frame)} ${at(g.start_frame + g.frames)}`;
-    });
-    const track = parts.length ? `linear-gradient(90deg, ${parts.join()})` : "";
-    if (track !== this.track) this.$(".seek").style.setProperty("--track", track);
-    this.track = track;
-  }
-
-  #slow() {
-    const wanted = Math.min(this.fps * this.speed, 60);
-    const drawn = this.#times.length;
-    this.slow = this.paused || drawn > 0.8 * wanted || !this.$(".busy").hidden ? 0 : (this.slow ?? 0) + 1;
-    const text = `This device draws ${drawn} of ${Math.round(wanted)} frames a second.`;
-    this.#note("slow", this.slow > 20 ? text : null);
-    const { source, layers, choice, groups } = this.engine;
-    const shown = groups.get(this.engine.groupOf(this.frame));
-    const fewer = layers === AUTO && choice.reason && shown?.layers < shown?.header?.layers;
-    this.#note("layers", fewer ? `${shown.layers} of ${shown.header.layers} layers: ${choice.reason} no more just now.` : null);
-    const lower = source.quality && source.representation < source.representations - 1;
-    this.#note("quality", lower ? `Quality ${source.quality}: the link or this device carries no more just now.` : null);
-  }
-
-  #figures() {
-    const { source } = this.engine;
-    const [s, [width, height]] = [this.stats, this.shown?.view ?? [0, 0]];
-    const group = source.groups[this.engine.groupOf(this.frame)];
-    const rate = group ? (8e-6 * group.size * this.fps) / group.frames : 0;
-    return [
-      ["fps", `${s.fps} of ${this.fps.toFixed(1)}`],
-      ["frame", `${this.frame} of ${this.frameCount}`],
-      ["picture", `${width} x ${height}`],
-      ["drawn by", this.engine.renderer.name],
-      ["Gaussians", s.gaussians.toLocaleString("en")],
-      ["decode", `${s.decode.toFixed(1)} ms/frame`],
-      ["project", `${s.project.toFixed(1)} ms`],
-      ["blend", `${s.blend.toFixed(1)} ms`],
-      ["stream", `${rate.toFixed(2)} Mbit/s`],
-      ["link", s.link ? `${s.link.toFixed(1)} Mbit/s` : "–"],
-      ...(source.quality ? [["quality", source.quality]] : []),
-      ["received", `${(s.received / 1e6).toFixed(2)} MB`],
-    ].map(([name, value]) => `${name.padEnd(10)}${value}`).join("\n");
-  }
-
-  // A line in the corner; null removes it.
-  #note(id, text, warn = false) {
-    const notes = this.$(".notes");
-    let note = notes.querySelector(`[data-id="${id}"]`);
-    if (!text) return note?.remove();
-    if (!note) {
-      note = document.createElement("div");
-      note.dataset.id = id;
-      notes.append(note);
-    }
-    note.className = warn ? "note warn" : "note";
-    if (note.textContent !== text) note.textContent = text;
-  }
-
-  #damaged({ group, frames, message }) {
-    this.#note("damage", `Frames ${frames} are damaged and left out (group ${group}: ${message}).`, true);
-  }
-
-  #fail(title, message) {
-    if (!this.$(".error").hidden) return;
-    this.pause();
-    this.$(".busy").hidden = true;
-    this.$(".notes").replaceChildren();
-    this.$(".error h2").textContent = title;
-    this.$(".error p").textContent = message;
-    this.$(".error").hidden = false;
-    this.dispatchEvent(new CustomEvent("error", { detail: `${title}: ${message}` }));
   }
 
   // Actions

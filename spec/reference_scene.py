@@ -7,7 +7,8 @@ f at many directions.
 from fractions import Fraction
 
 import numpy as np
-from reference_decoder import decode, evaluate, quaternion_product, rotate
+from reference_decoder import decode
+from reference_evaluation import evaluate, quaternion_product, rotate
 
 
 def sh_basis(d):

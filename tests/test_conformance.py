@@ -1,6 +1,7 @@
 """Conformance: the native decoder and the reference decoder against the vectors and against each other.
 
-The case list of spec/vectors/make.py drives these tests and writes the files; the manifest holds what must come out.
+The case lists spec/vectors/valid_cases.py and invalid_cases.py drive these tests and, by make.py, write the files; the
+manifest holds what must come out.
 """
 
 import hashlib
@@ -20,9 +21,14 @@ from gscodec.decode.scene import read_scene
 SPEC = Path(__file__).resolve().parents[1] / "spec"
 VECTORS = SPEC / "vectors"
 sys.path[:0] = [str(SPEC), str(VECTORS)]
-import make  # noqa: E402
 import reference_decoder as reference  # noqa: E402
+from groups import encode, make_group  # noqa: E402
+from invalid_cases import INVALID as INVALID_CASES  # noqa: E402
+from reference_container import LEVELS  # noqa: E402
+from reference_evaluation import evaluate  # noqa: E402
 from reference_scene import scene_frame  # noqa: E402
+from valid_cases import MOTION  # noqa: E402
+from valid_cases import VALID as VALID_CASES  # noqa: E402
 
 MANIFEST = json.loads((VECTORS / "manifest.json").read_text())
 VALID = {Path(entry["file"]).stem: entry for entry in MANIFEST["valid"]}
@@ -65,9 +71,9 @@ def assert_close(got, expected, name):
 
 
 def test_manifest_lists_the_cases():
-    assert list(VALID) == list(make.VALID)
+    assert list(VALID) == list(VALID_CASES)
     reasons = {name: (entry["error"], entry["reason"]) for name, entry in INVALID.items()}
-    assert reasons == {name: case[:2] for name, case in make.INVALID.items()}
+    assert reasons == {name: case[:2] for name, case in INVALID_CASES.items()}
     files = {path.relative_to(VECTORS).as_posix() for path in VECTORS.glob("*valid/*")}
     assert files == {entry["file"] for entry in MANIFEST["valid"] + MANIFEST["invalid"]}
 
@@ -96,7 +102,7 @@ def compare(name, data, decoded, native, groups):
         assert sample.audio == (sound and (*sound[1:], data[sound[0] : fragment["offset"]]))
         frames = sample.frames
         for t in sorted({0, 1, frames // 2, frames - 1} & set(range(frames))):
-            expected, frame = reference.evaluate(group, t), ours.frame(t)
+            expected, frame = evaluate(group, t), ours.frame(t)
             shown, visible = expected.pop("shown"), ours.visible(t)
             assert np.array_equal(shown, np.ones_like(shown) if visible is None else visible)
             for key, values in expected.items():
@@ -119,13 +125,13 @@ def test_scene(name):
 @pytest.mark.parametrize("name", VALID)
 def test_encoder_still_makes_these_integers(name):
     """The encoder may write other bytes than it did when the vectors were made, but they must mean the same."""
-    groups = [native_hash(group.quantized()) for _, group in native_groups(make.VALID[name][1]())]
+    groups = [native_hash(group.quantized()) for _, group in native_groups(VALID_CASES[name][1]())]
     assert groups == [facts["sha256"] for facts in VALID[name]["groups"]]
 
 
 @pytest.mark.parametrize("name", INVALID)
 def test_invalid(name):
-    error, message, _ = make.INVALID[name]
+    error, message, _ = INVALID_CASES[name]
     data = (VECTORS / INVALID[name]["file"]).read_bytes()
     assert message
     with pytest.raises(getattr(reference, error)) as theirs:
@@ -137,9 +143,9 @@ def test_invalid(name):
 
 
 def test_reference_stops_at_the_cap_of_symbols(monkeypatch):
-    payload = make.encode(make.make_group(250, 20, **make.MOTION))
+    payload = encode(make_group(250, 20, **MOTION))
     symbols = 13 * 250 + 4 * 250 + (3 + 6 * 6) * 12
-    monkeypatch.setitem(reference.LEVELS, 1, (65536, 64, 1024, symbols + 10, 2**24))
+    monkeypatch.setitem(LEVELS, 1, (65536, 64, 1024, symbols + 10, 2**24))
     with pytest.raises(reference.LimitError, match="symbols"):
         reference.decode_group(payload, 1)
 
@@ -159,7 +165,7 @@ def test_prefix(name):
             ours = stream.group(i)
             assert ours.layers == groups[i].counts
             assert native_hash(ours.quantized()) == reference.group_hash(groups[i])
-            expected = reference.evaluate(groups[i], 0)
+            expected = evaluate(groups[i], 0)
             expected.pop("shown")
             for key, values in expected.items():
                 assert_close(ours.frame(0)[key], values, f"{name}, {layers} layers, {key}")

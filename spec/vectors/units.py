@@ -12,9 +12,8 @@ from files import CAMERA, groups_file, make_file, poke, split_boxes, u32
 from groups import encode, layered, make_group, predicted, rigged
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import reference_decoder as reference
 from reference_container import Reader
-from reference_units import read_varint
+from reference_units import read_header_bytes, read_units, read_varint
 
 
 def predicted_file(first, *others, edit=lambda units: None, sync=False, **options):
@@ -35,11 +34,11 @@ def base_group():
 
 def split_units(payload):
     """Dicts of unit_type, layer, index, payload; that of the header has no directory, `join_units` makes it."""
-    header, _ = reference.read_header_bytes(payload)
+    header, _ = read_header_bytes(payload)
     at = directory_at(header)
     count = struct.unpack_from(">H", header, at)[0]
     first = unit_dict(0, payload=header[:at] + header[at + 2 + 12 * count :])
-    return [first, *(vars(unit) for unit in reference.read_units(payload))]
+    return [first, *(vars(unit) for unit in read_units(payload))]
 
 
 def directory_at(header):

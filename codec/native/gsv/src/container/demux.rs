@@ -5,7 +5,10 @@
 
 use super::config::Config;
 use super::entry::{Entry, name};
-use super::isobmff::{self, Track};
+use super::index;
+use super::isobmff;
+use super::moof;
+use super::moov::{self, Track};
 use crate::error::{Error, Result};
 
 /// Largest body of a header box.
@@ -277,7 +280,7 @@ impl Demuxer {
             b"ftyp" => isobmff::ftyp(body),
             b"moov" if self.track.is_some() => Err(Error::bitstream(0, "", "one moov box")),
             b"moov" => {
-                self.track = Some(isobmff::moov(body, self.number)?);
+                self.track = Some(moov::read(body, self.number)?);
                 Ok(())
             }
             b"sidx" => {
@@ -286,7 +289,7 @@ impl Demuxer {
             }
             b"ssix" if !self.indexed => Ok(()),
             b"ssix" => {
-                let told = isobmff::ssix(body).filter(|l| l.len() == self.index.len());
+                let told = index::ssix(body).filter(|l| l.len() == self.index.len());
                 self.layers = told.unwrap_or_default();
                 Ok(())
             }
@@ -297,7 +300,7 @@ impl Demuxer {
     /// Stores the groups of sidx (spec 2.5), if it is that of the track.
     fn announced(&mut self, sidx: &[u8]) -> bool {
         let Some(track) = &self.track else { return false };
-        let Some((first, references)) = isobmff::sidx(sidx, track.id) else {
+        let Some((first, references)) = index::sidx(sidx, track.id) else {
             return false;
         };
         let frame = u64::from(track.config.frame_duration);
@@ -326,7 +329,7 @@ impl Demuxer {
         if self.pending.is_some() {
             return Err(Error::bitstream(0, "", "the mdat box of the moof before"));
         }
-        self.pending = isobmff::moof(body, track, start)?;
+        self.pending = moof::read(body, track, start)?;
         Ok(())
     }
 }

@@ -7,6 +7,8 @@ use super::audio::{AudioRun, AudioTrack};
 use super::demux::Demuxer;
 use super::entry::Entry;
 use super::isobmff;
+use super::moof;
+use super::moov;
 use crate::error::{Error, Result};
 
 /// Most groups taken from the index; it bounds the number of walks.
@@ -116,8 +118,8 @@ pub fn read_audio(data: &[u8]) -> Result<(AudioTrack, Vec<AudioRun>)> {
     for b in isobmff::boxes(data)? {
         let at = |e: Error| e.at(b.offset, "audio file");
         match (&b.kind, &track) {
-            (b"moov", None) => track = isobmff::audio_track(b.body).map_err(at)?,
-            (b"moof", Some(t)) => runs.extend(isobmff::audio_moof(b.body, t, b.offset as u64 - 8).map_err(at)?),
+            (b"moov", None) => track = moov::audio_track(b.body).map_err(at)?,
+            (b"moof", Some(t)) => runs.extend(moof::read_audio(b.body, t, b.offset as u64 - 8).map_err(at)?),
             _ => {}
         }
     }
