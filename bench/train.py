@@ -130,6 +130,8 @@ class Run:
         case: name in CASES.
         recipe: name in RECIPES.
         frames: "A:B" or "A:B:STEP", None: all.
+        quality: of the stream; None: the one that is found.
+        also: qualities at which the same training is coded, too (recipe gscodec).
     """
 
     case: str
@@ -137,6 +139,7 @@ class Run:
     preset: str
     frames: str | None
     quality: float | None
+    also: tuple[float, ...] = ()
 
 
 def run(runs: Iterable[Run], data: Path, out: Path) -> Iterator[dict]:
@@ -161,9 +164,9 @@ def measure(run: Run, data: Path) -> Iterator[dict]:
     capture = CASES[run.case].open(data)
     chosen = range(capture.frame_count)[slice(*(int(x) if x else None for x in (run.frames or ":").split(":")))]
     settings = train_settings(run.preset, run.quality)
-    encoding = EncodeSettings(run.quality, loss=coding_loss(run.preset, capture))
+    encodings = [EncodeSettings(q, loss=coding_loss(run.preset, capture)) for q in (run.quality, *run.also)]
     recipe = {"gscodec": _ours, "alone": _alone, "full": _full, "v3": _v3}[run.recipe]
-    for name, seconds, size, models, *more in recipe(capture, chosen, settings, encoding):
+    for name, seconds, size, models, *more in recipe(capture, chosen, settings, encodings):
         result = evaluate(part(capture, chosen), models, vmaf=CASES[run.case].vmaf)
         yield {
             "capture": run.case,
@@ -180,30 +183,32 @@ def measure(run: Run, data: Path) -> Iterator[dict]:
         }
 
 
-def _ours(capture: Capture, frames: range, settings, encoding) -> Iterator[tuple]:
+def _ours(capture: Capture, frames: range, settings, encodings) -> Iterator[tuple]:
     if frames.step != 1:
         raise UsageError("gscodec follows what moves: it needs every frame, expected a range without a step")
     own = part(capture, frames)
     groups, trained = sequence(own, settings)
     yield "model", trained, None, shown(groups)
-    size, decoded, seconds, report = coded(own, groups, settings, encoding)
-    share, bits = still_share(groups[0], report.quality, training_cameras(own, len(groups[0]) // 2))
-    first, later = report.group_rates()
-    found = {
-        "still_gaussians": round(share, 3),
-        "still_bits": round(bits, 4),
-        "coded_quality": round(report.quality, 2),
-        "kb_per_frame_of_first_group": round(first, 3),
-        "kb_per_frame_of_later_groups": later and round(later, 3),
-        "groups": report.group_list,
-    }
-    yield "gscodec", trained + seconds, size, decoded, found
+    for encoding in encodings:
+        size, decoded, seconds, report = coded(own, groups, settings, encoding)
+        share, bits = still_share(groups[0], report.quality, training_cameras(own, len(groups[0]) // 2))
+        first, later = report.group_rates()
+        found = {
+            "quality": encoding.quality,
+            "still_gaussians": round(share, 3),
+            "still_bits": round(bits, 4),
+            "coded_quality": round(report.quality, 2),
+            "kb_per_frame_of_first_group": round(first, 3),
+            "kb_per_frame_of_later_groups": later and round(later, 3),
+            "groups": report.group_list,
+        }
+        yield "gscodec", trained + seconds, size, decoded, found
 
 
-def _alone(capture: Capture, frames: range, settings, encoding) -> Iterator[tuple]:
+def _alone(capture: Capture, frames: range, settings, encodings) -> Iterator[tuple]:
     alone, seconds = every_frame_alone(capture, frames, settings)
     yield "alone", seconds, None, shown(alone)
-    size, decoded, more, _ = coded(part(capture, frames), alone, settings, encoding)
+    size, decoded, more, _ = coded(part(capture, frames), alone, settings, encodings[0])
     yield "alone-coded", seconds + more, size, decoded
 
 

@@ -30,18 +30,23 @@ def train_chart(result: dict):
         entries = [e for e in shown if e["capture"] == capture]
         for axes, (key, label) in zip(row, PANELS.items(), strict=True):
             axes.set(xlabel=label, ylabel="PSNR of the subject, dB", xscale="log")
-            _panel(axes, [e for e in entries if e[key]], key)
+            timed = key == "seconds_per_frame"  # other qualities of a training take the same time
+            _panel(axes, [e for e in entries if e[key] and not (timed and e["quality"])], key)
         row[0].set_title(capture, loc="left", weight="bold")
     text = f"test cameras; {stamp(result['entries'])}"
     figure.text(0.995, 0.995, text, ha="right", va="top", fontsize=7, color="#888888")
     return figure
 
 
+def _name(entry: dict) -> str:
+    return entry["preset"] if entry["quality"] is None else f"{entry['preset']}, quality {entry['quality']:g}"
+
+
 def _panel(axes, entries: Sequence[dict], key: str) -> None:
     from matplotlib.ticker import LogLocator
 
     for recipe, (name, color) in LOOK.items():
-        points = sorted((e[key], e["psnr_fg"], e["preset"]) for e in entries if e["recipe"] == recipe)
+        points = sorted((e[key], e["psnr_fg"], _name(e)) for e in entries if e["recipe"] == recipe)
         if not points:
             continue
         x, y, presets = zip(*points, strict=True)

@@ -101,6 +101,7 @@ def train(
     preset: Preset = PRESET,
     frames: Annotated[str | None, typer.Option(metavar="A:B:STEP", help="Only these frames.")] = None,
     quality: Quality = None,
+    also: Annotated[str | None, typer.Option(help="Comma-separated qualities at which ours is coded, too.")] = None,
     data: Captures = None,
     out: Results = Path("bench/results/train.json"),
     as_json: Json = False,
@@ -113,7 +114,8 @@ def train(
     folder = _needed("train", data)
     captures = _names("--capture", capture, CASES) or CASES
     recipes = _names("--recipe", recipe, RECIPES) or RECIPES
-    runs = [Run(c, r, preset, frames, quality) for c in captures for r in recipes]
+    others = tuple(map(float, also.split(","))) if also else ()
+    runs = [Run(c, r, preset, frames, quality, others) for c in captures for r in recipes]
 
     def line(e: dict) -> str:
         size = "-" if e["kb_per_frame"] is None else f"{e['kb_per_frame']:.2f} kB/frame"
