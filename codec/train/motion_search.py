@@ -52,8 +52,9 @@ def _starts(turn: float) -> np.ndarray:
 
 
 class _Bodies:
-    """The moving Gaussians of a tracker a frame after `pose` at its velocity, as `parts` rigid bodies, and small views
-    of `frame`. A motion [parts, 6] has for each a rotation vector about its center and a translation in radii."""
+    """The moving Gaussians of a tracker a frame after `pose` at its velocity, without a far background behind them, as
+    `parts` rigid bodies, and small views of `frame`. A motion [parts, 6] has for each a rotation vector about its
+    center and a translation in radii."""
 
     def __init__(self, tracker: Tracker, pose: Pose, frame: int, parts: int):
         self.tracker, self.settings, self._pose, self._frame = tracker, tracker.settings.motion_search, pose, frame
@@ -62,13 +63,20 @@ class _Bodies:
         chosen = sorted(farthest_points(places, min(self.settings.views, len(places))))
         self._cameras = [views.train_cameras[i] for i in chosen]
         self._scale = min(1.0, self.settings.side / views.largest_side)
-        self._moving = tracker.moving
         self._params = tracker.carried(tracker.own, pose.next())[0]
-        means = self._params["means"][self._moving]
+        means = self._params["means"]
+        self._middle = means[tracker.moving].median(0).values
+        self._reach = self.settings.reach * float((means[tracker.moving] - self._middle).norm(dim=1).median())
+        self._moving = tracker.moving & self._near(means)
+        means = means[self._moving]
         self._seeds = means[torch.from_numpy(farthest_points(means.numpy(), parts)).long()]
         self._part = self._nearest(self._params["means"])
         count = torch.bincount(self._part[self._moving], minlength=parts).clamp(min=1)[:, None]
         self._centers = torch.zeros(parts, 3).index_add(0, self._part[self._moving], means) / count
+
+    def _near(self, points: torch.Tensor) -> torch.Tensor:
+        """[P] bool, which of `points` [P, 3] are not of a far background."""
+        return (points - self._middle).norm(dim=1) <= self._reach
 
     def _nearest(self, points: torch.Tensor) -> torch.Tensor:
         """Part of each of `points` [P, 3]."""
@@ -139,7 +147,7 @@ class _Bodies:
         there = self._pose.next()
         nodes, turn = self._turned(motion, there.nodes, self._nearest(there.nodes))
         whole = quat_multiply(turn, rotvec_to_quat(self._pose.angular_velocity))
-        carriers = self.tracker.graph.carriers(self.tracker.moving)[:, None]
+        carriers = (self.tracker.graph.carriers(self._moving) & self._near(there.nodes))[:, None]
         return replace(
             self._pose,
             angular_velocity=torch.where(carriers, quat_to_rotvec(whole), self._pose.angular_velocity),

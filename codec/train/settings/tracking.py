@@ -113,6 +113,7 @@ class MotionSearchSettings:
     rate: float = 0.05  # radians, radii
     rate_decay: float = 0.1  # rate at the last step, times that at the first
     parts: int = 8  # rigid bodies of the second search
+    reach: float = 4.0  # times the median distance of what moves from its middle: farther is background
     gain: float = 0.9  # a motion is taken if its loss is this share of the best one so far
 
 
