@@ -73,14 +73,16 @@ def test_training_has_a_chart_of_what_is_there(tmp_path):
     runs = (("model", "fast", 2, None), ("gscodec", "fast", 2.1, 7.0), ("gscodec", "medium", 7, 8.0))
     made = [
         {"capture": "a", "recipe": r, "preset": p, "seconds_per_frame": s, "kb_per_frame": kb, "psnr_fg": 26.0 + s}
-        | {"frames": [0, 30, 1]}
+        | {"frames": [0, 30, 1], "quality": None}
         for r, p, s, kb in runs
     ]
+    made.append(made[-1] | {"quality": 40.0, "kb_per_frame": 4.0})
     made.append(made[-1] | {"preset": "of a few frames", "frames": [4, 10, 1]})
     write_result(tmp_path / "train.json", {"entries": made})
     assert [p.name for p in draw_charts(tmp_path, tmp_path / "charts")] == ["train.svg", "train.png"]
     svg = (tmp_path / "charts" / "train.svg").read_text()
     assert "medium" in svg
+    assert svg.count("medium, quality 40") == 1, "beside size; it took the same time"
     assert "V3" not in svg
     assert "few" not in svg, "for flicker alone"
 
