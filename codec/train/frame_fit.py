@@ -48,7 +48,7 @@ class FrameFit:
             nodes, seed = tracker.graph.nodes, tracker.settings.seed
             self._field = MotionField(nodes, tracker.radius, 1, f, seed, backend, s.node_adam)
         self.own = Model(tracker.own.params)
-        self.own.start_optimizer(backend, tracker.settings.adam)
+        self.own.start_optimizer(backend, tracker.settings.adam, tracker.views.scale_max)
         self.statistics = Statistics(len(self.own), tracker.settings.keyframe.mse_min)
 
     def _pose(self) -> Pose:

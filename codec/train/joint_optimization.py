@@ -36,7 +36,7 @@ class _Finetuner:
         f, backend = settings.finetune, views.backend
         self.coefficients = TrajectoryAdam(backend, f.coefficient_adam)
         self.scales, self.nodes = Adam(backend, f.coefficient_adam), Adam(backend, f.coefficient_adam)
-        group.key.start_optimizer(backend, settings.adam)
+        group.key.start_optimizer(backend, settings.adam, views.scale_max)
         if settings.motion_field.finetune:
             m, adam = settings.motion_field, f.coefficient_adam
             group.field = MotionField(group.graph.nodes, radius, group.frames, m, settings.seed, backend, adam)

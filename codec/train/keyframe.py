@@ -130,7 +130,7 @@ class _Run:
         self.dropout = few if views.capture.has_alpha else 0.0
         self.statistics = Statistics(len(model), k.mse_min)
         self._started: _View | None = None
-        model.start_optimizer(views.backend, settings.adam)
+        model.start_optimizer(views.backend, settings.adam, views.scale_max)
         views.reset_calibration(frame, model.params["means"].numpy().mean(0, dtype=np.float64), radius)
 
     def step(self, step: int) -> None:

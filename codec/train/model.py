@@ -22,6 +22,7 @@ class Model:
     def __init__(self, params: dict[str, torch.Tensor]):
         self.params = {n: params[n].detach().clone().float().contiguous() for n in NAMES}
         self._adam: Adam | None = None
+        self._log_scale_max = math.inf
 
     def __len__(self) -> int:
         return len(self.params["means"])
@@ -31,13 +32,15 @@ class Model:
         """Degree of the spherical harmonics."""
         return math.isqrt(self.params["shN"].shape[1] + 1) - 1
 
-    def start_optimizer(self, backend: Backend, settings: AdamSettings) -> None:
-        """A new Adam for a new stage or frame, with zero moments."""
-        self._adam = Adam(backend, settings)
+    def start_optimizer(self, backend: Backend, settings: AdamSettings, scale_max: float = math.inf) -> None:
+        """A new Adam for a new stage or frame, with zero moments; no Gaussian grows beyond `scale_max`, world units."""
+        self._adam, self._log_scale_max = Adam(backend, settings), math.log(scale_max)
 
     def step(self, grads: dict[str, torch.Tensor], rates: dict[str, float]) -> None:
         """One step of the optimiser on the attributes in `rates`."""
         self._adam.step(self.params, grads, rates)
+        if math.isfinite(self._log_scale_max):
+            self.params["log_scales"].clamp_(max=self._log_scale_max)
 
     def select(self, index: torch.Tensor) -> None:
         """Keeps the Gaussians at `index` ([M] int or [N] bool)."""

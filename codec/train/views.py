@@ -6,6 +6,7 @@ mask term needs only a margin of it.
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ import torch
 from ..capture import View, cropped
 from ..capture.epipolar import epipolar_error
 from ..errors import CaptureError
-from ..model.camera import Calibration, Camera
+from ..model.camera import Calibration, Camera, meeting_point
 from ..model.gaussians import Gaussians
 from ..render.backend import Backend, Crop, PendingLoss, RenderLoss
 from ..render.sensitivity import params_of
@@ -73,6 +74,7 @@ class Views:
         self._seed, self._cache_bytes = settings.seed, settings.cache_bytes
         self._poses_learn = settings.calibration.refine_poses
         self._pose_error_min = settings.calibration.pose_error_min
+        self._scale_max = settings.far_shell.scale_max
         self._cache: OrderedDict[tuple, View | Target] = OrderedDict()
         self._bytes = 0
         self._order: dict[int, list[int]] = {}
@@ -82,6 +84,15 @@ class Views:
     def largest_side(self) -> int:
         """Of the pictures, pixels."""
         return max(max(self.capture.cameras[i].width, self.capture.cameras[i].height) for i in self.train_cameras)
+
+    @property
+    def scale_max(self) -> float:
+        """Largest scale of a Gaussian, world units (`FarShellSettings`); infinite where there are masks."""
+        if self.capture.has_alpha:
+            return math.inf
+        cameras = [self.capture.cameras[i] for i in self.train_cameras]
+        centre = meeting_point(cameras)
+        return self._scale_max * float(np.median([np.linalg.norm(c.center - centre) for c in cameras]))
 
     def view(self, camera: int, frame: int) -> View:
         """Image of camera `camera` at `frame` as the capture gives it."""

@@ -76,6 +76,7 @@ class FarShellSettings:
     opacity: float = 0.95
     width: float = 1.5  # times that of a Gaussian at a point on a surface: they overlap without gaps
     thickness: float = 0.1  # times the width
+    scale_max: float = 0.75  # of any Gaussian, times that distance: what covers the far would grow up to the cameras
 
 
 @dataclass(frozen=True)
