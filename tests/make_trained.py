@@ -18,7 +18,7 @@ from trained import CASES, DATA, EXAMPLE, FRAMES, GOP, capture, load_groups, mea
 from gscodec.train.settings import train_settings
 from gscodec.train.train import train_groups
 
-SEEDS = 10
+SEEDS = 20
 RECORDED = DATA / "recorded.json"
 WITH_SEED = """
 import sys
