@@ -114,7 +114,10 @@ def train(
     folder = _needed("train", data)
     captures = _names("--capture", capture, CASES) or CASES
     recipes = _names("--recipe", recipe, RECIPES) or RECIPES
-    others = tuple(map(float, also.split(","))) if also else ()
+    try:
+        others = tuple(map(float, also.split(","))) if also else ()
+    except ValueError:
+        raise UsageError(f"--also {also}: expected qualities of 0 to 100, such as 46,52") from None
     runs = [Run(c, r, preset, frames, quality, others) for c in captures for r in recipes]
 
     def line(e: dict) -> str:

@@ -114,6 +114,12 @@ def meeting_point(cameras: Sequence[Camera]) -> np.ndarray:
     return np.linalg.solve(A, b)
 
 
+def working_distance(cameras: Sequence[Camera]) -> float:
+    """Median distance of the cameras from where their optical axes meet, world units."""
+    centre = meeting_point(cameras)
+    return float(np.median([np.linalg.norm(c.center - centre) for c in cameras]))
+
+
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from ..model.camera import fibonacci_directions, meeting_point
+from ..model.camera import fibonacci_directions, meeting_point, working_distance
 from .model import Model, from_points
 from .settings import FarShellSettings
 from .visual_hull import colors_of, project
@@ -22,8 +22,8 @@ def far_shell(views, settings: FarShellSettings) -> Model:
         views: (camera, rgb u8 [H, W, 3], alpha or None) of each training camera.
     """
     cameras = [c for c, _, _ in views]
-    centre, directions = meeting_point(cameras), fibonacci_directions(settings.points)
-    points = centre + settings.distance * np.median([np.linalg.norm(c.center - centre) for c in cameras]) * directions
+    directions = fibonacci_directions(settings.points)
+    points = meeting_point(cameras) + settings.distance * working_distance(cameras) * directions
     seen = np.zeros(len(points), bool)
     for c in cameras:
         p, depth = project(c, points)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..model.camera import meeting_point
+from ..model.camera import working_distance
 from .settings import PlaneSweepSettings
 from .visual_hull import project
 
@@ -45,8 +45,7 @@ def sweep(
         mask = np.ones((1, 1), np.uint8) if masks is None else masks[i].astype(np.uint8)
         where.append(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0)
     greys = [cv2.cvtColor(p, cv2.COLOR_RGB2GRAY).astype(np.float32) for p in images]
-    centre = meeting_point(cameras)
-    distance = np.median([np.linalg.norm(c.center - centre) for c in cameras])
+    distance = working_distance(cameras)
     inverse = np.linspace(1 / (settings.far * distance), 1 / (settings.near * distance), settings.planes)
     near, depths = [], []
     for i, camera in enumerate(cameras):

@@ -159,8 +159,8 @@ class Tracker:
 
     def _fit(self, frame: int, on_step: OnStep) -> None:
         """Rounds of `motion_steps`, until the loss is near that of the frame before or falls no more. Stiff ones come
-        first if the velocity is that of a search or not known at all. Behind a search the nodes have
-        another round before the Gaussians follow: colours that change at once take what should move."""
+        first if the velocity is that of a search or not known at all. Behind a search the nodes have another round
+        before the Gaussians follow: colours that change at once take what should move."""
         fit = FrameFit(self, np.random.default_rng([self.settings.seed, frame, 1]))
         s = self.settings.tracking
         bound, loss = s.loss_ratio * self.loss + s.loss_floor, np.inf

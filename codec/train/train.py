@@ -221,7 +221,7 @@ class _Run:
         settings = replace(self.settings, finetune=f)
         model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), settings)
         on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
-        finetune(model, self.views, frames, self.settings, radius=subject.tracker.radius, on_step=on_step)
+        finetune(model, self.views, frames, settings, radius=subject.tracker.radius, on_step=on_step)
         return model
 
 

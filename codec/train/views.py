@@ -17,7 +17,7 @@ import torch
 from ..capture import View, cropped
 from ..capture.epipolar import epipolar_error
 from ..errors import CaptureError
-from ..model.camera import Calibration, Camera, meeting_point
+from ..model.camera import Calibration, Camera, working_distance
 from ..model.gaussians import Gaussians
 from ..render.backend import Backend, Crop, PendingLoss, RenderLoss
 from ..render.sensitivity import params_of
@@ -90,9 +90,7 @@ class Views:
         """Largest scale of a Gaussian, world units (`FarShellSettings`); infinite where there are masks."""
         if self.capture.has_alpha:
             return math.inf
-        cameras = [self.capture.cameras[i] for i in self.train_cameras]
-        centre = meeting_point(cameras)
-        return self._scale_max * float(np.median([np.linalg.norm(c.center - centre) for c in cameras]))
+        return self._scale_max * working_distance([self.capture.cameras[i] for i in self.train_cameras])
 
     def view(self, camera: int, frame: int) -> View:
         """Image of camera `camera` at `frame` as the capture gives it."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..model.camera import meeting_point
+from ..model.camera import meeting_point, working_distance
 from .settings import VisualHullSettings
 
 OPAQUE = 128  # of 255, alpha from which a pixel belongs to the subject
@@ -100,9 +100,7 @@ def random_points(cameras, views, count: int, seed: int, settings: VisualHullSet
     Depths along random pixels of random cameras are uniform in 1/depth; points that fewer than
     two cameras see are dropped.
     """
-    rng = np.random.default_rng(seed)
-    centre = meeting_point(cameras)
-    distance = np.median([np.linalg.norm(c.center - centre) for c in cameras])
+    rng, distance = np.random.default_rng(seed), working_distance(cameras)
     near, far = 1 / (settings.random_depth_min * distance), 1 / (settings.random_depth_max * distance)
     picked = []
     for c in cameras:
