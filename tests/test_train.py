@@ -24,16 +24,17 @@ def capture():
     return capture_of(turning(300, frames=5))
 
 
-def test_light_that_comes_on_ends_a_group_and_not_the_subject():
+def test_light_that_comes_on_starts_anew():
     dark = blob(200)
     lit = dataclasses.replace(dark, sh0=dark.sh0 + 0.6)
-    capture = capture_of(GaussianSequence(25.0, [DenseGroup([g]) for g in (dark,) * 5 + (lit,) * 2]))
-    first, second = train_groups(capture, dataclasses.replace(TINY, gop=8, finetune_steps=30))
-    assert (len(first), len(second)) == (5, 2)
-    assert second.parents is not None
+    of_frames = lambda *frames: capture_of(GaussianSequence(25.0, [DenseGroup([g]) for g in frames]))  # noqa: E731
+    settings = dataclasses.replace(TINY, gop=8, finetune_steps=30)
+    capture = of_frames(*(dark,) * 5, lit, lit)
+    first, second = train_groups(capture, settings)
+    assert (len(first), first.ended, len(second)) == (5, "change", 2)
     np.testing.assert_array_equal(first.frame(0).sh0, first.frame(4).sh0)
-    still = psnr_of(first.frame(0), capture, 0)
-    assert min(psnr_of(g, capture, 5) for g in map(second.frame, range(len(second)))) > still - 2.5
+    (alone,) = train_groups(of_frames(lit, lit), settings)
+    assert psnr_of(second.frame(1), capture, 6) > psnr_of(alone.frame(1), capture, 6) - 1.0
 
 
 def test_larger_pictures_have_longer_keyframes_whose_fit_frames_need_not_reach():

@@ -18,6 +18,7 @@ QUALITY_DEFAULT = 50.0
 QUALITY_HALVES = 12.0  # so many points of quality halve every step (6 dB)
 PSNR_DEFAULT = 41.0  # against the input, at QUALITY_DEFAULT
 MODEL = 2.4  # measured error over what independent small errors would add up to
+RADIUS_MAX = 2.5  # times the median distance from the middle; a filled shape has about 2
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,10 @@ def trajectory_step(step: float, frames: int) -> float:
 
 
 def subject_radius(means: np.ndarray) -> float:
-    """Radius of the sphere around the 1-99 % box of `means` ([N, 3]), world units; 1 for a single point."""
+    """Radius of the sphere around the 1-99 % box of `means` ([N, 3]), world units, but at most `RADIUS_MAX` times their
+    median distance from the middle, so that a far background does not count; 1 for a single point."""
     if len(means) == 0:
         return 1.0
-    low, high = np.percentile(means, [1, 99], axis=0)
-    return float(np.linalg.norm(high - low) / 2) or 1.0
+    low, middle, high = np.percentile(means, [1, 50, 99], axis=0)
+    away = float(np.median(np.linalg.norm(means - middle, axis=1)))
+    return min(float(np.linalg.norm(high - low) / 2), RADIUS_MAX * away or np.inf) or 1.0

@@ -93,7 +93,7 @@ class Tracker:
         if len(frames) > 1:
             changed = changes.behind(frames[1], changes.copy().advance(frames[1]), means.numpy(), visible)
             moving = changed if changed.any() else moving
-        radius = _radius(means[moving].numpy(), s.radius_max)
+        radius = subject_radius(means[moving].numpy())
         sizes = torch.ones(len(key))
         if not views.capture.has_alpha:  # there is a background
             sizes = key.params["log_scales"].sort(1).values[:, 1:].mean(1).exp()  # without the thin axis
@@ -313,10 +313,3 @@ class Tracker:
         tracker.pose = Pose(*(torch.from_numpy(state[f"pose.{f.name}"]) for f in fields(Pose)))
         tracker.rig = rig and RigPrediction(rig, int(state["at_rest"]), tracker.graph)
         return tracker
-
-
-def _radius(means: np.ndarray, most: float) -> float:
-    """Radius of what moves (`means`, [N, 3]), world units: at most `most` times the median distance from its middle, so
-    that a far background which shows behind it does not count."""
-    away = float(np.median(np.linalg.norm(means - np.median(means, 0), axis=1)))
-    return min(subject_radius(means), most * away or np.inf)

@@ -64,11 +64,11 @@ def train_groups(
 ) -> Iterator[ParametricGroup]:
     """Trains `capture` from `first_frame` on and yields each group when it is done.
 
-    A group continues the Gaussians of the one before (`parents`). It ends before a frame whose image loss is
-    `cut_ratio` times that of the frame before, or `drift_ratio` times that of the keyframe, and the next group starts
-    with a keyframe. It also ends before a frame in which a large fraction of the Gaussians begins to change; then the
-    next group continues. Frames without a subject, until a camera sees something, are a group without Gaussians. Every
-    segment of `random_access` frames starts with a keyframe: a segment depends on no frames but its own.
+    A group continues the Gaussians of the one before (`parents`). It ends early before a frame whose image loss is
+    `cut_ratio` times that of the frame before, or `drift_ratio` times that of the keyframe, and before one in which a
+    large fraction of the Gaussians begins to change; then the next group starts with a keyframe. Frames without a
+    subject, until a camera sees something, are a group without Gaussians. Every segment of `random_access` frames
+    starts with a keyframe: a segment depends on no frames but its own.
 
     Args:
         first_frame: where an earlier run stopped, the first frame of a group.
@@ -155,7 +155,7 @@ class _Run:
             track.add(self.subject.tracker)
             ended = self._track(frames[1:], track)
         subject, done = self.subject, frames[: len(track.models)]
-        if ended in ("cut", "drift"):
+        if ended:
             self.subject = None
         if len(done) == 1 and parents is None:
             subject.canonical = track.models[0]
@@ -187,10 +187,10 @@ class _Run:
 
     def _track(self, frames: range, track: _TrackedFrames) -> str:
         """Tracks `frames` up to the end of the group and adds them to `track`; returns why that came early
-        (`ParametricGroup.ended`). After a cut or a drift the next group needs a keyframe.
+        (`ParametricGroup.ended`); then the next group needs a keyframe.
 
         The group ends where a large fraction of resting Gaussians changes at once: with few temporal frequencies, a
-        light that is switched on would show in all frames of the group.
+        light that is switched on would show in all frames of the group, and what was frozen without it shows it badly.
         """
         subject, g = self.subject, self.settings.group
         for frame in frames:
@@ -215,10 +215,10 @@ class _Run:
             nominal, g = steps_for(quality, subject.radius), track.models[t].gaussians()
             subject.steps = measured_steps(g, quality, nominal, cameras, backend=self.views.backend)
         graph, steps = subject.tracker.graph, subject.steps
+        settings, f = self.settings, self.settings.finetune
         faster = 1 + float(np.mean(track.searched))  # what moves fast changes its light and shape as fast
-        f = self.settings.finetune
         f = replace(f, frequencies={n: round(faster * count) for n, count in f.frequencies.items()})
-        settings = replace(self.settings, finetune=f)
+        settings = replace(settings, finetune=f, finetune_steps=round(faster * settings.finetune_steps))
         model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), settings)
         on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
         finetune(model, self.views, frames, settings, radius=subject.tracker.radius, on_step=on_step)

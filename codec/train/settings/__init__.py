@@ -144,6 +144,8 @@ class TrainSettings:
         field = self.motion_field.tracking and room.field_in_tracking
         return replace(
             self,
+            motion_steps=round(room.motion_steps * self.motion_steps),
+            finetune_steps=round(room.finetune_steps * self.finetune_steps),
             rigidity=room.rigidity * self.rigidity,
             harmonics_views=room.harmonics_views,
             cut_ratio=room.cut_ratio * self.cut_ratio,

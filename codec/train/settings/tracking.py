@@ -57,6 +57,8 @@ class RoomSettings:
     """What differs in a capture without masks: something moves beside, or before, much that stands still."""
 
     nodes: float = 2.5  # times those of a subject: much of what seems to move is what lies behind it
+    motion_steps: float = 0.5  # times those of a subject: fine-tuning finds more in the same time
+    finetune_steps: float = 4 / 3  # times those of a subject
     rigidity: float = 1 / 3  # times that of a subject
     cut_ratio: float = 5 / 3  # times that of a subject, since few views of a room fit its keyframe far too well
     drift_ratio: float = 2.6  # times that of a subject, for the same reason
@@ -97,7 +99,6 @@ class TrackingSettings:
     stored_factor: int = 2  # times gaussians_max: all Gaussians of a group, with those already removed
     separate_distance: float = 4.0  # spacings of new Gaussians; so far from all others they get their own nodes
     separate_min: int = 8  # new Gaussians that are worth nodes of their own
-    radius_max: float = 2.5  # times the median distance of what moves from its middle; a filled shape has about 2
     visible_weight: float = 0.05  # blending weight from which a camera sees a Gaussian
 
 
