@@ -23,7 +23,7 @@ def test_a_sound_capture_is_told_from_one_that_is_not(tmp_path):
     assert facts["colour_ratio"] < 1.02
     assert facts["missing"] == [
         "no masks: whole pictures are trained (gscodec masks makes some)",
-        "no sparse points: training starts from a plane sweep",
+        "no sparse points: training starts from matched features and a plane sweep",
         "3 training cameras: what lies between their views is hardly constrained",
     ]
     write_wall(tmp_path, tilts=(0.006, -0.006, 0.006, -0.006))

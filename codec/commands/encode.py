@@ -133,7 +133,7 @@ def _print_stream(out: Path | str, result: EncodeReport) -> None:
             stdout.print(f"the group from frame {group['frame']} ends before frame {end}: {ENDED[group['ended']]}")
     if result.chosen_quality:
         stdout.print(
-            f"quality {result.quality:.1f}, at which coding costs at most {result.loss} dB against very fine steps"
+            f"quality {result.quality:.1f}, at which coding costs about {result.loss} dB against very fine steps"
         )
 
 

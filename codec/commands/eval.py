@@ -43,7 +43,7 @@ def evaluate(
 def evaluate_stream(
     stream_path: Path, source: Path, *, split: str, frames: str | None, bar: Bar, tracks: list[str] | None = None
 ) -> dict:
-    """Measures a .gsv file against the capture or the splats that were encoded (keys: README, "Measures").
+    """Measures a .gsv file against the capture or the splats that were encoded (keys: docs/figures.md, "Measures").
 
     A stream with layers also has `prefixes`, the same measures of its first layer, its first two layers and so on.
     """

@@ -36,7 +36,7 @@ class EncodeReport:
     bytes: int = 0
     gaussians: int = 0  # most in one group
     quality: float | None = None  # of the last group
-    chosen_quality: bool = False  # nobody named it: coding costs at most `loss` decibels
+    chosen_quality: bool = False  # nobody named it: coding costs about `loss` decibels
     loss: float = 0.0
     interrupted: bool = False
     seconds: dict = field(default_factory=dict)
@@ -51,7 +51,7 @@ class EncodeReport:
         return rate(first) if first else None, rate(later) if later else None
 
     def to_json(self) -> dict:
-        """The report with the derived rates of DESIGN's measures."""
+        """The report with the rates that follow from it."""
         frames = max(self.frames, 1)
         return {
             **self.__dict__,

@@ -174,7 +174,7 @@ class EncodeSettings:
             where their parents are known and it is cheaper. 0 or 1: every group is independent.
         layers: layers of importance in each group, each with its own steps; any first few decode alone. None: what is
             smallest.
-        refine: views by which each group is refined; 0: none is. None: as many as usually pay (README).
+        refine: views by which each group is refined; 0: none is. None: as many as usually pay (docs/encoding.md).
         doubt: a predicted group of more than this share of its reference's bytes is coded both ways.
         plan, companding, scale_exponents, rdo, rounding, rate_control: hyperparameters of the stages.
     """

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import CaptureError
 from ..model.gaussians import SH_C0, Gaussians
-from ..ply_table import read_table, write_table
+from ..ply_table import write_table
 from .ply import join_rest, sh_count, split_rest, stack
 from .smallest_three import join_smallest_three, split_smallest_three
 
@@ -44,17 +44,12 @@ def sigmoid(x: np.ndarray) -> np.ndarray:
     return 1 / (1 + np.exp(-np.clip(x.astype(np.float64), -80, 80)))
 
 
-def read_compressed_ply(path: Path) -> Gaussians:
-    """Reads a .compressed.ply.
+def gaussians_of_compressed(table: dict[str, np.ndarray], path: Path) -> Gaussians:
+    """The Gaussians of an element table in this layout.
 
     Raises:
         CaptureError: a property is missing or the elements do not fit together.
     """
-    return gaussians_of_compressed(read_table(path), path)
-
-
-def gaussians_of_compressed(table: dict[str, np.ndarray], path: Path) -> Gaussians:
-    """The Gaussians of an element table in this layout."""
     rows, chunks = table["vertex"], table["chunk"]
     names = [*WORDS, *RANGES["position"], *RANGES["scale"]]
     missing = [n for n in names if n not in (*rows.dtype.names, *chunks.dtype.names)]

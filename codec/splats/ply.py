@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import CaptureError
 from ..model.gaussians import SH_COUNTS, Gaussians
-from ..ply_table import read_table, write_table
+from ..ply_table import write_table
 
 FIELDS = {
     "means": ("x", "y", "z"),
@@ -51,17 +51,12 @@ def join_rest(shN: np.ndarray) -> np.ndarray:
     return shN.swapaxes(1, 2).reshape(len(shN), 3 * shN.shape[1])
 
 
-def read_ply(path: Path) -> Gaussians:
-    """Reads a 3DGS .ply, ascii or binary.
+def gaussians_of(table: dict[str, np.ndarray], path: Path) -> Gaussians:
+    """The Gaussians of an element table in the 3DGS layout.
 
     Raises:
-        CaptureError: not a PLY, no Gaussian splats, truncated, or a value is not finite.
+        CaptureError: no Gaussian splats, or a value is not finite.
     """
-    return gaussians_of(read_table(path), path)
-
-
-def gaussians_of(table: dict[str, np.ndarray], path: Path) -> Gaussians:
-    """The Gaussians of an element table in the 3DGS layout."""
     rows = table.get("vertex")
     names = rows.dtype.names or () if rows is not None else ()
     missing = [n for wanted in FIELDS.values() for n in wanted if n not in names]

@@ -16,7 +16,7 @@ from .visual_hull import colors_of, project
 
 
 def far_shell(views, settings: FarShellSettings) -> Model:
-    """Gaussians evenly in the directions that a view sees, each with the mean colour of the views.
+    """Gaussians evenly in the directions that a view sees, each with the median colour of the views.
 
     Args:
         views: (camera, rgb u8 [H, W, 3], alpha or None) of each training camera.

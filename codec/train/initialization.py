@@ -30,7 +30,8 @@ def initial_model(
 ) -> tuple[Model, float]:
     """Gaussians on the surfaces that are known, and the radius of what they show: the capture's own points, and besides
     what its depth images show, or else the visual hull of the masks; without either matched features and a plane sweep.
-    Without masks there is a far shell, too, which the radius does not count. They are random where too little is found.
+    Around points of a plane sweep, or without masks, there is a far shell, too, which the radius does not count. They
+    are random, without a shell, where too little is found.
 
     Args:
         count: of points, about.

@@ -23,7 +23,7 @@ class Subject:
     Attributes:
         tracker: holds them as they are in the last frame.
         loss: image loss of their keyframe.
-        radius: of all Gaussians in the keyframe, world units.
+        radius: of the points that the keyframe started from, without the far shell, world units.
         canonical: Gaussians that all groups since the keyframe refer to; None before the first is fine-tuned.
         parents: [N] index of each Gaussian in the group before.
         steps: quantization steps of all groups since the keyframe; None before the first is fine-tuned.

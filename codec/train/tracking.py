@@ -3,7 +3,7 @@
 Optimised together against the views: the rigid motions of the nodes, which carry all Gaussians, and the Gaussians' own
 attributes (frame_fit.py). Colours must be free while nodes move: shading changes on a rotating surface, and with fixed
 colours the motion follows the shading instead of the surface (lumberjack after 6 frames: 22.5 dB, with free colours
-26.1). The first half of the steps sees small images, in which large motion is near and a step is cheap.
+26.1). The first half of the first round sees small images, in which large motion is near and a step is cheap.
 
 Gaussians behind pixels that do not change (change_detection.py) stay as they are, to the bit, and so do their nodes.
 New Gaussians (densification.py) have nodes of their own, unless they lie beside others. What moves too fast for the

@@ -57,7 +57,7 @@ class RoomSettings:
     """What differs in a capture without masks: something moves beside, or before, much that stands still."""
 
     nodes: float = 2.5  # times those of a subject: much of what seems to move is what lies behind it
-    motion_steps: float = 0.5  # times those of a subject: fine-tuning finds more in the same time
+    motion_steps: float = 0.5  # times those of a subject: fine-tuning finds more in nearly the same time
     finetune_steps: float = 4 / 3  # times those of a subject
     rigidity: float = 1 / 3  # times that of a subject
     cut_ratio: float = 5 / 3  # times that of a subject, since few views of a room fit its keyframe far too well
