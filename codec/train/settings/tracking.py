@@ -151,5 +151,5 @@ class GroupSettings:
     drift_steps: int = 2400  # of a keyframe for which that is meant: with more it fits its own pictures better
     drift_exponent: float = 0.75  # of the steps of a keyframe, in that ratio
     cut_loss_floor: float = 0.002  # loss: clean images fit far better than they need to, and no frame is cut for it
-    changed_fraction_max: float = 0.15  # of the Gaussians, that begin to change in one frame
+    changed_fraction_max: float = 0.1  # of the Gaussians, that begin to change in one frame
     changed_frames_min: int = 4  # frames that a group has before `changed_fraction_max` may end it
