@@ -65,9 +65,9 @@ def train_groups(
     """Trains `capture` from `first_frame` on and yields each group when it is done.
 
     A group continues the Gaussians of the one before (`parents`). It ends early before a frame whose image loss is
-    `cut_ratio` times that of the frame before, or `drift_ratio` times that of the keyframe, and before one in which a
-    large fraction of the Gaussians begins to change; then the next group starts with a keyframe. Frames without a
-    subject, until a camera sees something, are a group without Gaussians. Every segment of `random_access` frames
+    `cut_ratio` times that of the tracked frame before, or `drift_ratio` times that of the keyframe, and before one in
+    which a large fraction of the Gaussians begins to change; then the next group starts with a keyframe. Frames without
+    a subject, until a camera sees something, are a group without Gaussians. Every segment of `random_access` frames
     starts with a keyframe: a segment depends on no frames but its own.
 
     Args:
@@ -198,9 +198,11 @@ class _Run:
             if long_enough and subject.tracker.changed_fraction(frame, track.moved()) > g.changed_fraction_max:
                 return "change"
             near, far = self.settings.cut_ratio * subject.tracker.loss, g.drift_ratio * subject.loss
+            if subject.canonical is None and len(track.models) == 1:  # no tracked frame comes near a keyframe's own fit
+                near = far
             loss = subject.tracker.advance(frame, self._report(f"track {frame}"))
             if loss is not None and loss > min(near, far) + g.cut_loss_floor:
-                return "cut" if near < far else "drift"
+                return "cut" if near <= far else "drift"
             if loss is not None:
                 subject.tracker.densify(frame, self._report(f"densify {frame}"))
             track.add(subject.tracker)
