@@ -35,10 +35,12 @@ def _rows() -> Iterator[tuple[str, ...]]:
     for what, (file, command) in FILES.items():
         yield what, file, f"`{command}`", _commits([json.loads((RESULTS / file).read_text())]), "-"
     for e in _entries("train.json"):
-        what = f"{e['capture']}, {e['preset']}, {e['recipe']}"
+        quality = "" if e["quality"] is None else f"{e['quality']:g}"
+        what = f"{e['capture']}, {e['preset']}, {e['recipe']}" + (quality and f", quality {quality}")
         recipe = e["recipe"].removesuffix("-coded").replace("model", "gscodec")
-        command = f"`gscodec bench train --capture {e['capture']} --preset {e['preset']} --recipe {recipe}`"
-        yield what, "train.json", command, _commits([e]), f"{e['measured'].get('busy_beside', '-')}"
+        command = f"gscodec bench train --capture {e['capture']} --preset {e['preset']} --recipe {recipe}"
+        command += quality and f" --also {quality}"
+        yield what, "train.json", f"`{command}`", _commits([e]), f"{e['measured'].get('busy_beside', '-')}"
     for file, what, command in (
         ("rd.json", "other codecs", "gscodec bench rd"),
         ("ablation.json", "losses and tools", "gscodec bench ablation"),

@@ -127,7 +127,7 @@ def test_nothing_imports_the_command_line():
 
 
 def test_training_takes_only_facts_from_the_bitstream():
-    allowed = {"bitstream.color", "bitstream.quantization", "bitstream.temporal_transform"}
+    allowed = {"bitstream.color", "bitstream.quantization"}
     for module in modules():
         if part_of(module) == "train":
             taken = {n for n in inside(module) if part_of(n) == "bitstream"}

@@ -33,6 +33,7 @@ def test_light_that_comes_on_starts_anew():
     first, second = train_groups(capture, settings)
     assert (len(first), first.ended, len(second)) == (5, "change", 2)
     np.testing.assert_array_equal(first.frame(0).sh0, first.frame(4).sh0)
+    assert second.parents is None
     (alone,) = train_groups(of_frames(lit, lit), settings)
     assert psnr_of(second.frame(1), capture, 6) > psnr_of(alone.frame(1), capture, 6) - 1.0
 

@@ -159,13 +159,8 @@ def _missing(capture: Capture, path: Path, facts: dict) -> list[str]:
         out.append(f"no masks: whole pictures are trained (gscodec masks makes some){more}")
     elif unmasked:
         out.append(f"no masks of {', '.join(unmasked)}: their whole pictures are trained")
-    start = (
-        "depth images"
-        if facts["depth"]
-        else "the visual hull"
-        if facts["masks"]
-        else "matched features and a plane sweep"
-    )
+    start = "the visual hull" if facts["masks"] else "matched features and a plane sweep"
+    start = "depth images" if facts["depth"] else start
     if facts["points"] is None:
         out.append(f"no sparse points: training starts from {start}")
     if 0 < facts["depth"] < len(facts["cameras"]):
