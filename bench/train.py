@@ -9,7 +9,7 @@ gscodec       the same decoded from the stream, with still_gaussians and still_b
 alone         a keyframe for every frame with the keyframe budget of the preset: the reference for tracking
 alone-coded   the same decoded from our stream, every frame a group of its own
 full          a keyframe for every frame with all the steps and Gaussians that help (FULL): what the pictures allow
-v3            V3's recipe, on lumberjack in some 60 % of the time of our preset medium (baselines/v3.py)
+v3            V3's recipe, on lumberjack in the time of our preset medium (baselines/v3.py)
 v3-coded      the same through V3's packing (baselines/videogs.py)
 """
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from gscodec.encode.encode import EncodeReport
 
 RECIPES = ("gscodec", "alone", "full", "v3")
-FULL = {"keyframe_steps": 12_000, "gaussians_max": 156_250}  # of which a keyframe may have 125,000
+FULL = {"keyframe_steps": 12_000, "gaussians_max": 156_250}  # of any picture; a keyframe may have 125,000 of them
 FULL_PRICES = {"gradient_min": 1e-4, "contribution_min": 1.0}
 V3_PACKING = {"qp": 25, "raw": True}  # its default qp, and the better of its two scripts
 V3_GOP = 20  # frames in a group of V3
@@ -213,7 +213,8 @@ def _alone(capture: Capture, frames: range, settings, encodings) -> Iterator[tup
 
 
 def _full(capture: Capture, frames: range, settings, _) -> Iterator[tuple]:
-    settings = replace(settings, **FULL, keyframe=replace(settings.keyframe, **FULL_PRICES))
+    keyframe, budget = replace(settings.keyframe, **FULL_PRICES), replace(settings.budget, steps_most=1.0)
+    settings = replace(settings, **FULL, keyframe=keyframe, budget=budget)
     alone, seconds = every_frame_alone(capture, frames, settings)
     yield "full", seconds, None, shown(alone)
 
