@@ -72,6 +72,7 @@ VARIANTS = {
         tuple(FRAMES),
         equal_time=True,
     ),
+    "harmonics stay in the world": Variant(run_with(turned_harmonics=False), tuple(FRAMES)),
     "no rate term": Variant(run_with(rate_lambda=0.0)),
     "no fine-tuning": Variant(run_with(finetune_steps=0)),
     "no cuts": Variant(lambda s: stage_with("group", drift_ratio=math.inf)(replace(s, cut_ratio=math.inf)), (FAST,)),

@@ -150,7 +150,6 @@ class Config:
     color_space: int
     background: list
     sh_degree: int
-    sh_frame: int
     cameras: list
     timescale: int = 0
     track_id: int = 0
@@ -346,9 +345,9 @@ def read_gsvc(r):
     require(color_space == 0, f"gsvC: color_space is {color_space}, expected 0")
     background = [r.f32("background") for _ in range(3)]
     require(all(0 <= b <= 1 for b in background), f"gsvC: background is {background}, expected 0 to 1")
-    sh_degree, sh_frame = r.u8(), r.u8()
+    sh_degree, reserved = r.u8(), r.u8()
     require(sh_degree <= 3, f"gsvC: sh_degree is {sh_degree}, expected 0 to 3")
-    require(sh_frame <= 1, f"gsvC: sh_frame is {sh_frame}, expected 0 or 1")
+    require(reserved <= 1, f"gsvC: reserved is {reserved}, expected 0 or 1")
     cameras = []
     for _ in range(r.u16()):
         name = r.take(r.u8())
@@ -365,9 +364,7 @@ def read_gsvc(r):
     if r.position < r.end:
         for camera in cameras:
             camera["near"] = r.f32("near", positive=True)
-    return Config(
-        level, frame_duration, metres_per_unit, up_axis, color_space, background, sh_degree, sh_frame, cameras
-    )
+    return Config(level, frame_duration, metres_per_unit, up_axis, color_space, background, sh_degree, cameras)
 
 
 def read_trafs(data, moof, track_id, defaults):

@@ -49,6 +49,33 @@ def rotate(q, v):
     return v + 2 * np.cross(u, np.cross(u, v) + q[..., :1] * v)
 
 
+def sh_basis(d):
+    """Clause 14: Y_1 .. Y_15 of unit directions [..., 3] -> [..., 15]."""
+    x, y, z = np.moveaxis(d, -1, 0)
+    terms = (
+        -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
+        1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * z * z - x * x - y * y),
+        -1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y),
+        -0.5900435899266435 * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -0.4570457994644658 * x * (4 * z * z - x * x - y * y), 1.445305721320277 * z * (x * x - y * y),
+        -0.5900435899266435 * x * (x * x - 3 * y * y),
+    )  # fmt: skip
+    return np.stack(terms, -1)
+
+
+def turned_harmonics(shN, q):
+    """Clause 13.4: coefficients [N, K, 3] of the functions that unit quaternions [N, 4] have turned, by their values in
+    many directions."""
+    directions = np.random.default_rng(0).standard_normal((100, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    count = shN.shape[1]
+    back = rotate((q * [1, -1, -1, -1])[:, None], directions)
+    values = np.einsum("nmk,nkc->nmc", sh_basis(back)[..., :count], shN)
+    return np.einsum("km,nmc->nkc", np.linalg.pinv(sh_basis(directions)[:, :count]), values)
+
+
 def rotation(r):
     """Rotation vectors [..., 3] -> wxyz [..., 4]."""
     angle = np.linalg.norm(r, axis=-1, keepdims=True)
@@ -197,6 +224,8 @@ def evaluate(group, t):
     }
     if h.sh_degree:
         frame["shN"] = rgb((rest(SHN) + delta(SHN)).reshape(count, -1, 3))
+        if h.turned_harmonics:
+            frame["shN"] = turned_harmonics(frame["shN"], q)
     if group.lifetimes is not None:
         frame["shown"] = (group.lifetimes[:, 0] <= t) & (t < group.lifetimes[:, 1])
     return frame

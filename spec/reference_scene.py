@@ -8,23 +8,7 @@ from fractions import Fraction
 
 import numpy as np
 from reference_decoder import decode
-from reference_evaluation import evaluate, quaternion_product, rotate
-
-
-def sh_basis(d):
-    """Clause 14: Y_1 .. Y_15 of unit directions [M, 3] -> [M, 15]."""
-    x, y, z = d.T
-    terms = (
-        -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
-        1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * z * z - x * x - y * y),
-        -1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y),
-        -0.5900435899266435 * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
-        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
-        -0.4570457994644658 * x * (4 * z * z - x * x - y * y), 1.445305721320277 * z * (x * x - y * y),
-        -0.5900435899266435 * x * (x * x - 3 * y * y),
-    )  # fmt: skip
-    return np.stack(terms, -1)
+from reference_evaluation import evaluate, quaternion_product, rotate, turned_harmonics
 
 
 def pose(placement, u):
@@ -50,18 +34,12 @@ def pose(placement, u):
 
 def place(frame, rotation, translation, scale):
     """The attributes of a frame (clause 13) with the transform."""
-    rng = np.random.default_rng(0)
-    directions = rng.standard_normal((100, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    count = frame["shN"].shape[1]
-    back = rotate(rotation * [1, -1, -1, -1], directions)
-    values = np.einsum("mk,nkc->nmc", sh_basis(back)[:, :count], frame["shN"])
-    turned = np.einsum("km,nmc->nkc", np.linalg.pinv(sh_basis(directions)[:, :count]), values)
+    everywhere = np.broadcast_to(rotation, frame["quats"].shape)
     return frame | {
         "means": scale * rotate(rotation, frame["means"]) + translation,
-        "quats": quaternion_product(np.broadcast_to(rotation, frame["quats"].shape), frame["quats"]),
+        "quats": quaternion_product(everywhere, frame["quats"]),
         "log_scales": frame["log_scales"] + np.log(scale),
-        "shN": turned,
+        "shN": turned_harmonics(frame["shN"], everywhere),
     }
 
 

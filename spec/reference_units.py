@@ -186,13 +186,14 @@ class Header:
     joint_count: int = 0
     joint_rotation_step: float = 0.0
     joint_translation_step: float = 0.0
+    turned_harmonics: bool = False
 
 
 def read_opening(r):
     """Clause 4: frames, flags, reference (0: independent) and the directory."""
     frames, flags = r.u16(), r.u8()
     require(frames >= 1, "group_header: frames is 0, expected frames >= 1")
-    allowed = 0x31 if flags & 1 else 0x3A
+    allowed = 0x31 if flags & 1 else 0x7A
     require(not flags & ~allowed, f"group_header: flags are {flags:#x}, expected reserved flags to be 0")
     reference = r.u16() if flags & 1 else 0
     require(reference or not flags & 1, "group_header: reference is 0, expected a reference >= 1")
@@ -350,6 +351,7 @@ def read_group_header(payload, reference=None):
         require(header.joint_count, "group_header: joint_count is 0, expected at least one joint")
         header.joint_rotation_step = r.f32("rotation_step of joints", positive=True)
         header.joint_translation_step = r.f32("translation_step of joints", positive=True)
+    header.turned_harmonics = reference.turned_harmonics if back else bool(flags & 64)
     read_tiles(r, layers, side_log2, reference if back else None)
     require(r.position == r.end, f"group_header: {r.end - r.position} bytes left over")
     return header

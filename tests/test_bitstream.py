@@ -27,7 +27,6 @@ CONFIG = {
     "color_space": "srgb",
     "background": [0.0, 0.5, 1.0],
     "sh_degree": 0,
-    "sh_frame": "world",
     "cameras": [{**CAMERA, "width": 640, "height": 480}],
 }
 
@@ -359,7 +358,7 @@ def test_file_round_trip():
     assert found["complete"]
     config = found["config"]
     assert config["fps"] == (30000, 1001)
-    for key in ("level", "up", "color_space", "background", "sh_degree", "sh_frame"):
+    for key in ("level", "up", "color_space", "background", "sh_degree"):
         assert config[key] == CONFIG[key]
     np.testing.assert_array_equal(config["cameras"][0]["K"], CONFIG["cameras"][0]["K"])
     np.testing.assert_array_equal(config["cameras"][0]["viewmat"], np.eye(4))

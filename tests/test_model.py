@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+import torch
 from synthetic import blob
 
 from gscodec import _native
@@ -14,6 +15,7 @@ from gscodec.model import rotations
 from gscodec.model.attributes import ATTRIBUTES, COMPANDED
 from gscodec.model.gaussians import Gaussians
 from gscodec.model.parametric_group import NodeMotion, ParametricGroup
+from gscodec.render.reference import sh_basis
 
 # ---- Attributes -----------------------------------------------------------------------------------------------------
 
@@ -367,3 +369,22 @@ def test_rotation_vectors_have_a_gradient_at_zero():
     v = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     rotations.rotvec_to_quat(v)[1:].sum().backward()
     np.testing.assert_allclose(v.grad.numpy(), 0.5, atol=1e-6)
+
+
+def test_harmonics_turn_with_the_nodes():
+    """What a Gaussian shows in a direction is what it shows at rest in the direction turned back; spec 13.4."""
+    group = random_group()
+    turned, directions = replace(group, turned_harmonics=True), unit(np.random.default_rng(1).normal(size=(20, 3)))
+    basis = lambda d: sh_basis(torch.from_numpy(d.reshape(-1, 3)), 3).numpy().reshape(*d.shape[:-1], 3)  # noqa: E731
+    for t in (0, 4):
+        back = expected_carry(group)[1][t] * [1, -1, -1, -1]
+        seen = np.stack([rotations.rotate(np.broadcast_to(q, (20, 4)), directions) for q in back])  # [N, 20, 3]
+        expected = np.einsum("ndk,nkc->ndc", basis(seen), group.frame(t).shN)
+        found = np.einsum("dk,nkc->ndc", basis(directions), turned.frame(t).shN)
+        np.testing.assert_allclose(found, expected, atol=1e-4)
+        assert np.abs(turned.frame(t).shN - group.frame(t).shN).max() > 0.1
+        np.testing.assert_array_equal(turned.frame(t).sh0, group.frame(t).sh0)
+    still = replace(turned, nodes=None)
+    np.testing.assert_array_equal(still.frame(4).shN, group.frame(4).shN)
+    assert turned.harmonics_turns().shape == (7, 150, 4)
+    assert still.harmonics_turns() is None

@@ -21,7 +21,7 @@ from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.model.gaussians import Gaussians
 from gscodec.render.cpu import CpuBackend
 from gscodec.render.optimizer import Adam
-from gscodec.render.sensitivity import arrays_of
+from gscodec.render.sensitivity import arrays_of, params_of
 from gscodec.render.workspace import Workspace
 from gscodec.train.refinement import PictureRefinement
 
@@ -159,3 +159,35 @@ def test_a_cleaner_capture_gets_a_finer_quality():
         chosen.append(choose_quality(coder, group, coder.measure(group, 0), 0))
     clean, noisy = chosen
     assert 30 < noisy < clean - 3 < 87
+
+
+def test_a_group_whose_harmonics_turn_comes_nearer_to_its_pictures():
+    """The quantizer shows what a decoder does, and moves harmonics where they are coded: at rest."""
+    still, wrong = blob(400, sh_count=8), np.random.default_rng(1).normal(0, 0.2, (400, 8, 3)).astype(np.float32)
+    group = next(fit_groups([DenseGroup([moved(still, [0, 0.5 * t, 0], [0, 0, 0]) for t in range(4)])]))
+    truth = replace(group, canonical=replace(group.canonical, shN=still.shN), trajectories={}, turned_harmonics=True)
+    off = replace(truth.canonical, shN=still.shN + wrong)
+    group, shown = (
+        replace(truth, canonical=off, calibration=Calibration.plain(16, 4)),
+        [truth.frame(t) for t in range(4)],
+    )
+    cameras = [
+        replace(c, K=c.K / 8 + np.diag([0, 0, 7 / 8]), width=64, height=64, split="train") for c in codec_cameras(shown)
+    ]
+    coder = GroupCoder(EncodeSettings(keep_all=True, layers=1))
+    rounding = AdaptiveRounding(coder.quantized(group, coder.measure(group, 0), 50), coder.settings, only=("shN",))
+    capture = pictures_of(shown, cameras, np.ones((16, 3), np.float32))
+
+    def error():
+        images = CpuBackend()
+        pictures = PictureRefinement(capture).pictures(group, 0, 64, seed=1)
+        return np.mean(
+            [np.mean((images.render(params_of(rounding.frame(t)), c, b)[0] - p) ** 2) for t, c, b, p in pictures]
+        )
+
+    before = error()
+    rounding.follow(PictureRefinement(capture).pictures(group, 0, 200), 200, 0.1)
+    assert error() < 0.8 * before
+    decoded = _native.DecodedGroup.reconstruct(rounding.quantized().integers, None)
+    for t in (0, 3):
+        np.testing.assert_allclose(rounding.frame(t).shN, decoded.frame(t)["shN"], atol=1e-4)

@@ -107,6 +107,7 @@ class QuantizedGroup:
         tile_side_log2: a tile has up to 4^tile_side_log2 Gaussians (clause 7.2); predicted: as in the reference.
         reference: how many groups back the group is that this one is predicted from; 0: independent.
         parents: [N] i32, index of each Gaussian in that group, -1 for a birth; None where `reference` is 0.
+        turned_harmonics: the higher bands of SH turn with the nodes (clause 13.4); predicted: as in the reference.
     """
 
     frames: int
@@ -125,6 +126,7 @@ class QuantizedGroup:
     tile_side_log2: int = 6
     reference: int = 0
     parents: np.ndarray | None = None
+    turned_harmonics: bool = False
 
     def __len__(self) -> int:
         return len(self.positions)

@@ -99,7 +99,7 @@ def _write_plane(path: Path, plane: np.ndarray) -> int:
 def _facts(q: QuantizedGroup) -> dict:
     """All of a group but its planes, JSON-able; f32 are exact as floats."""
     plain = ("frames", "origin", "grid_step", "grid_bits", "layers", "shifts", "corrections", "scale_exponents")
-    facts = {name: _plain(getattr(q, name)) for name in (*plain, "tile_side_log2", "reference")}
+    facts = {name: _plain(getattr(q, name)) for name in (*plain, "tile_side_log2", "reference", "turned_harmonics")}
     facts["channels"] = {
         n: _plain({"steps": c.steps, "offsets": c.offsets, "companding": c.companding}) for n, c in q.channels.items()
     }

@@ -25,6 +25,7 @@ def parametric_group(decoded) -> ParametricGroup:
         None if q.nodes is None else _nodes(q, *decoded.blend()),
         {n: _coefficients(n, t) for n, t in q.trajectories.items()},
         None if q.lifetimes is None else q.lifetimes.astype(np.int32),
+        turned_harmonics=q.turned_harmonics,
     )
 
 

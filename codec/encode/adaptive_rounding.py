@@ -22,6 +22,7 @@ from .. import _native
 from ..bitstream.channels import channel_values
 from ..bitstream.color import correlate
 from ..model.gaussians import Gaussians, living
+from ..model.rotations import turned_harmonics
 from ..render.cpu import CpuBackend
 from ..render.optimizer import Adam
 from ..render.sensitivity import derivatives
@@ -94,6 +95,8 @@ class AdaptiveRounding:
                 self._settle_sizes()
             off = lambda image, picture=picture: np.ascontiguousarray(image - picture)  # noqa: E731
             derivative = derivatives(backend, self.frame(t), camera, off, names, background)
+            if "shN" in derivative:
+                derivative["shN"] = self._turned(derivative["shN"], t, back=True)
             by_integers = lambda v, d=derivative, t=t: v.by_integers(d[v.attribute], t)  # noqa: E731
             grads = self._pool.map(by_integers, self._variables)
             latents = {id(v): v.latents.values for v in self._variables}
@@ -113,6 +116,8 @@ class AdaptiveRounding:
             return moved
 
         moved = dict(zip(values, self._pool.map(now, values), strict=True))
+        if "shN" in moved:
+            moved["shN"] = self._turned(moved["shN"], t)
         return self._shown(_with_values(before, moved), t)
 
     def quantized(self) -> Quantized:
@@ -139,10 +144,31 @@ class AdaptiveRounding:
     @cached_property
     def _before(self) -> list[tuple[Gaussians, dict[str, np.ndarray]]]:
         """Each frame as decoded with the integers that variables start from, as Gaussians and as coded values."""
+        decoded, out = self._decoded(), []
+        for t in range(self.frames):
+            g = Gaussians(**decoded.frame(t))
+            values = {n: v for n, v in channel_values(g).items() if n in MOVING_OVER_TIME}
+            if "shN" in values:
+                values["shN"] = self._turned(values["shN"], t, back=True)
+            out.append((g, values))
+        return out
+
+    def _decoded(self):
+        """The group as decoded with the integers that variables start from."""
         reference = self._reference.decoded if self._reference else None
-        decoded = _native.DecodedGroup.reconstruct(self._quantized.integers, reference)
-        frames = [Gaussians(**decoded.frame(t)) for t in range(self.frames)]
-        return [(g, {n: v for n, v in channel_values(g).items() if n in MOVING_OVER_TIME}) for g in frames]
+        return _native.DecodedGroup.reconstruct(self._quantized.integers, reference)
+
+    @cached_property
+    def _turns(self) -> np.ndarray | None:
+        """[T, N, 4] by which harmonics are turned in each frame; None: they are not."""
+        q = self._quantized.integers
+        return self._decoded().carried()[1] if q.turned_harmonics and q.nodes is not None else None
+
+    def _turned(self, values: np.ndarray, t: int, back: bool = False) -> np.ndarray:
+        """Harmonics [N, 3 K] as they are coded, turned as in frame `t`, or back."""
+        if self._turns is None:
+            return values
+        return turned_harmonics(values.reshape(len(values), -1, 3), self._turns[t], back=back).reshape(values.shape)
 
     def _shown(self, g: Gaussians, t: int) -> Gaussians:
         """The same with an opacity that shows nothing, where frame `t` is outside of a lifetime."""

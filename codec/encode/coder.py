@@ -243,7 +243,7 @@ def _lineage(group: ParametricGroup, state: CoderState | None) -> np.ndarray | N
     Raises:
         CaptureError: two Gaussians have the same parent, or one that is not there.
     """
-    if group.parents is None or state is None:
+    if group.parents is None or state is None or group.turned_harmonics != state.integers.turned_harmonics:
         return None
     before = state.lineage
     parents = checked_parents(group.parents, len(group.canonical), len(before))

@@ -83,7 +83,6 @@ def stream_config(
         "color_space": "srgb",
         "background": [float(b) for b in background],
         "sh_degree": sh_degree,
-        "sh_frame": "world",
         "cameras": [
             {
                 "name": c.name,

@@ -119,6 +119,7 @@ def _group(folder: Path, i: int, g: dict) -> QuantizedGroup:
         tile_side_log2=g["tile_side_log2"],
         reference=g["reference"],
         parents=plane("parents").astype(np.int32) if g["reference"] else None,
+        turned_harmonics=g.get("turned_harmonics", False),  # maps of earlier versions say nothing of it
     )
 
 

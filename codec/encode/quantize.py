@@ -86,6 +86,7 @@ def quantize(form: CodedForm, plan: Plan, settings: RdoSettings, reference: Refe
         lifetimes=None if form.lifetimes is None else form.lifetimes.astype(np.uint16),
         reference=reference.back if reference else 0,
         parents=form.lineage.astype(np.int32) if reference else None,
+        turned_harmonics=form.group.turned_harmonics,
     )
     still = with_rotations(Quantized(integers, form, plan, layers, {}), settings, reference)
     return _with_motion(still, settings, reference) if form.frames > 1 or reference else still

@@ -24,7 +24,7 @@ from ..model.rig import Rig
 from .reposing import reposed
 from .writer import layer_ends
 
-SAME = ("fps", "sh_frame", "color_space", "up", "metres_per_unit")  # of tracks that are joined
+SAME = ("fps", "color_space", "up", "metres_per_unit")  # of tracks that are joined
 
 
 @dataclass(frozen=True)

@@ -82,6 +82,7 @@ class ParametricGroup:
         ended: why it is shorter than it may be: "cut" (the next frame cannot be tracked), "drift" (nor well enough,
             since the keyframe is too far), "change" (much that rests begins to change), "empty" (nothing is seen before
             the next frame); an empty string: it is not.
+        turned_harmonics: shN turns with the nodes; otherwise it stays in the world.
     """
 
     frame_count: int
@@ -93,6 +94,7 @@ class ParametricGroup:
     calibration: Calibration | None = None
     rate_optimized: bool = False
     ended: str = ""
+    turned_harmonics: bool = False
 
     def __len__(self) -> int:
         return self.frame_count
@@ -119,6 +121,11 @@ class ParametricGroup:
         """What the nodes alone do: means [T, N, 3] f32 and rotations [T, N, 4] f32 wxyz that carry the Gaussians."""
         return self._evaluator.carried()
 
+    def harmonics_turns(self) -> np.ndarray | None:
+        """Rotations [T, N, 4] f32 wxyz by which shN is turned in each frame; None: it stays as it is."""
+        turns = self.turned_harmonics and self.nodes is not None and self.canonical.sh_degree > 0
+        return self.carried()[1] if turns else None
+
     def moved(self) -> tuple[np.ndarray, np.ndarray]:
         """Means [T, N, 3] f32 and quaternions [T, N, 4] f32 wxyz of all frames."""
         return self._evaluator.moved()
@@ -136,6 +143,7 @@ class ParametricGroup:
             self.calibration,
             self.rate_optimized,
             self.ended,
+            self.turned_harmonics,
         )
 
     @cached_property
@@ -149,4 +157,4 @@ class ParametricGroup:
             nodes = (f32(self.nodes.positions), f32(coefficients), *weights)
         arrays = tuple(f32(getattr(g, f.name)) for f in fields(g))
         trajectories = [(n, f32(c)) for n, c in self.trajectories.items()]
-        return _native.ParametricEvaluator(self.frame_count, arrays, nodes, trajectories)
+        return _native.ParametricEvaluator(self.frame_count, arrays, nodes, trajectories, self.turned_harmonics)

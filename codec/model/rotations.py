@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from .. import _native
+
 
 def _namespace(a):
     """numpy, or torch for a tensor, which is then loaded already."""
@@ -88,3 +90,9 @@ def matrix_to_quat(R: np.ndarray) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]]
+
+
+def turned_harmonics(shN: np.ndarray, rotations: np.ndarray, *, back: bool = False) -> np.ndarray:
+    """Bands 1 to 3 of spherical harmonics [N, K, 3] f32, turned by unit quaternions [N, 4] f32, or by their inverse
+    (spec 13.4)."""
+    return _native.turned_harmonics(np.ascontiguousarray(shN, np.float32), rotations, back)

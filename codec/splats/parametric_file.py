@@ -18,7 +18,7 @@ OPTIONAL = ("lifetimes", "parents")
 
 def to_arrays(group: ParametricGroup) -> dict[str, np.ndarray]:
     """Everything in a group as named arrays."""
-    arrays = {n: np.array(getattr(group, n)) for n in ("frame_count", "rate_optimized", "ended")}
+    arrays = {n: np.array(getattr(group, n)) for n in ("frame_count", "rate_optimized", "ended", "turned_harmonics")}
     parts = {"canonical": group.canonical, "nodes": group.nodes, "calibration": group.calibration}
     parts["rig"] = group.nodes and group.nodes.rig
     for part, value in parts.items():
@@ -53,4 +53,5 @@ def from_arrays(arrays: Mapping[str, np.ndarray]) -> ParametricGroup:
         calibration,
         bool(arrays["rate_optimized"]),
         str(arrays["ended"]),
+        bool(arrays.get("turned_harmonics", False)),  # earlier versions had none
     )

@@ -10,6 +10,7 @@ import numpy as np
 from ..errors import CaptureError
 from ..model.gaussians import Gaussians, living
 from ..model.parametric_group import ParametricGroup
+from ..model.rotations import turned_harmonics
 from ..model.temporal_transform import dct_basis
 
 APART = 0.01  # of the size of a group; a Gaussian that lies farther from its place is another one
@@ -27,7 +28,7 @@ def with_colors(
     Raises:
         CaptureError: the Gaussians are not those of the group, or have harmonics that it has no room for.
     """
-    sh0, shN = [], []
+    sh0, shN, turns = [], [], group.harmonics_turns()
     for t, (read, name) in enumerate(zip(frames, names, strict=True)):
         own, g = group.frame(t), read()
         shown = _shown(group, t)
@@ -36,7 +37,8 @@ def with_colors(
             raise CaptureError(f"{name}: {len(g)} Gaussians, expected the {len(own)} of the stream in their order")
         _check_places(g.means, own.means[at], name)
         sh0.append(_filled(own.sh0, g.sh0, at))
-        shN.append(_filled(own.shN, _harmonics(g.shN, own.shN.shape[1], name), at))
+        harmonics = _filled(own.shN, _harmonics(g.shN, own.shN.shape[1], name), at)
+        shN.append(harmonics if turns is None else turned_harmonics(harmonics, turns[t], back=True))
     return _with(group, {"sh0": np.stack(sh0), "shN": np.stack(shN)})
 
 

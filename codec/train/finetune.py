@@ -21,7 +21,7 @@ from ..model.temporal_transform import dct_basis
 from ..render.backend import Backend
 from .deformation_graph import NodeGraph, Pose
 from .entropy_model import CanonicalRate
-from .model import NAMES, REMOVED_LOGIT, Model, quat_product
+from .model import NAMES, REMOVED_LOGIT, Model, harmonics_turned, quat_product
 from .motion_field import MotionField
 from .settings import TrainSettings
 
@@ -91,6 +91,7 @@ class GroupModel:
         settings: TrainSettings,
     ):
         self.settings, self._entropy, self._steps = settings.finetune, settings.entropy_model, steps
+        self._turned = settings.turned_harmonics
         self.graph, self._tracked_poses = graph.copy(), _at_rest_until_added(poses)
         self.origin = torch.arange(len(graph.means))
         self.turns = [torch.zeros_like(p.nodes) for p in self._tracked_poses]
@@ -149,9 +150,11 @@ class GroupModel:
 
     def _canonical(self, key: Model | None, tracked: list[Model]) -> Model:
         """Canonical Gaussians: `key`, then the new ones as the mean of their tracked frames, in the keyframe's pose."""
+        rotations = [self.graph.carry(self.graph.means, pose)[1] for pose in self._tracked_poses]
+        if self._turned:
+            tracked = [_turned_back(m, q) for m, q in zip(tracked, rotations, strict=True)]
         params = {n: self._hold_outside_lifetime([m.params[n] for m in tracked]).mean(0) for n in NAMES}
         params["means"] = self.graph.means
-        rotations = [self.graph.carry(self.graph.means, pose)[1] for pose in self._tracked_poses]
         back = [quat_product(q, m.params["quats"], inverse_a=True) for q, m in zip(rotations, tracked, strict=True)]
         back = self._hold_outside_lifetime(back)
         back = back * torch.where((back * back[-1]).sum(2, keepdim=True) < 0, -1.0, 1.0)
@@ -228,6 +231,8 @@ class GroupModel:
             "logit_opacities": torch.where(shown, opacities, REMOVED_LOGIT),
             "sh0": p["sh0"] + delta["sh0"],
         }
+        if self._turned:
+            params["shN"] = harmonics_turned(p["shN"], rotations)
         return Frame(params, pose, turn, means, p["means"], rotations, residual, inner, p["quats"], shown)
 
     def gradients(self, frame: Frame, grads: dict[str, torch.Tensor]) -> tuple[dict, dict, torch.Tensor]:
@@ -246,6 +251,8 @@ class GroupModel:
             "quats": quat_product(frame.rotations, by_inner, inverse_a=True),
             "logit_opacities": opacities,
         }
+        if self._turned:
+            canonical["shN"] = harmonics_turned(grads["shN"], frame.rotations, back=True)
         return residuals, canonical, quat_product(by_inner, frame.quats, inverse_b=True)
 
     def group(self, parents: np.ndarray | None) -> ParametricGroup:
@@ -262,6 +269,7 @@ class GroupModel:
             lifetimes if cut else None,
             parents,
             rate_optimized=True,
+            turned_harmonics=self._turned,
         )
 
     def nodes(self) -> NodeMotion:
@@ -274,6 +282,11 @@ class GroupModel:
         translations = [pose.nodes - self.graph.nodes for pose in poses]
         arrays = (self.graph.nodes, torch.stack(rotations), torch.stack(translations))
         return NodeMotion(*(a.numpy().astype(np.float32) for a in arrays), self.graph.neighbors, self.graph.weights)
+
+
+def _turned_back(model: Model, rotations: torch.Tensor) -> Model:
+    """The model with harmonics as they were before `rotations` [N, 4]."""
+    return Model({**model.params, "shN": harmonics_turned(model.params["shN"], rotations, back=True)})
 
 
 def _padded(model: Model, last: Model) -> Model:

@@ -9,6 +9,7 @@ import torch
 
 from .. import _native
 from ..model.gaussians import PARAMETERS, SH_C0, Gaussians
+from ..model.rotations import turned_harmonics
 from ..render.backend import Backend
 from ..render.optimizer import Adam, AdamSettings
 
@@ -79,6 +80,11 @@ class Model:
 def quat_product(a: torch.Tensor, b: torch.Tensor, *, inverse_a: bool = False, inverse_b: bool = False) -> torch.Tensor:
     """Products [N, 4] of unit quaternions [N, 4] f32, of `a` or `b` their inverse; native and without a gradient."""
     return torch.from_numpy(_native.quat_product(a.numpy(), b.numpy(), (inverse_a, inverse_b)))
+
+
+def harmonics_turned(shN: torch.Tensor, rotations: torch.Tensor, *, back: bool = False) -> torch.Tensor:
+    """`shN` [N, K, 3], turned by unit quaternions [N, 4], or by their inverse; native and without a gradient."""
+    return torch.from_numpy(turned_harmonics(shN.numpy(), rotations.numpy(), back=back))
 
 
 def from_points(points: np.ndarray, colors: np.ndarray, *, opacity: float) -> Model:

@@ -15,6 +15,7 @@ import numpy as np
 from ..bitstream.color import TO_RGB, correlate, decorrelate
 from ..model.gaussians import SH_C0, Gaussians, living
 from ..model.parametric_group import ParametricGroup
+from ..model.rotations import turned_harmonics
 from ..model.temporal_transform import dct_basis
 from ..render.cpu import CpuBackend
 from ..render.optimizer import Adam, AdamSettings
@@ -46,7 +47,7 @@ class _Fit:
 
     def __init__(self, group: ParametricGroup, settings: RecolorSettings):
         self._group, self._settings, self._backend = group, settings, CpuBackend()
-        self._frames = [_shown(group, t) for t in range(len(group))]
+        self._frames, self._turns = [_shown(group, t) for t in range(len(group))], group.harmonics_turns()
         self._basis = dct_basis(len(group)).astype(np.float32)  # [T, T]
         n, g = len(group.canonical), group.canonical
         self.values = {"sh0": decorrelate(g.sh0.astype(np.float32))}
@@ -76,6 +77,8 @@ class _Fit:
             at = self._basis[1 : c.shape[1], t]
             now[name] = v + np.einsum("k,nkc->nc", at, c[:, 1:]) if len(at) else v
         shN = correlate(now["shN"].reshape(g.shN.shape)) if "shN" in now else g.shN
+        if "shN" in now and self._turns is not None:
+            shN = turned_harmonics(shN, self._turns[t])
         return replace(g, sh0=correlate(now["sh0"]), shN=shN)
 
     def map_colors(self, pictures: Iterable[Picture]) -> None:
@@ -104,6 +107,9 @@ class _Fit:
         t, camera, background, target = picture
         off = lambda image: np.ascontiguousarray(image - target)  # noqa: E731
         derivative = derivatives(self._backend, self.frame(t), camera, off, self.values, background)
+        if "shN" in derivative and self._turns is not None:
+            triples = derivative["shN"].reshape(len(self.values["shN"]), -1, 3)
+            derivative["shN"] = turned_harmonics(triples, self._turns[t], back=True).reshape(len(triples), -1)
         params, grads, rates = {}, {}, {}
         for name, v in self.values.items():
             rate = left * self._settings.rates[name]

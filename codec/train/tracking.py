@@ -32,7 +32,7 @@ from .deformation_graph import NodeGraph, Pose
 from .densification import error_masks, spawn
 from .frame_fit import FrameFit
 from .keyframe import Statistics
-from .model import NAMES, REMOVED_LOGIT, Model, quat_product
+from .model import NAMES, REMOVED_LOGIT, Model, harmonics_turned, quat_product
 from .motion_search import search
 from .relocalization import relocalize
 from .rig_prediction import RigPrediction
@@ -107,8 +107,11 @@ class Tracker:
     def carried(self, own: Model, pose: Pose) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """Attributes of `own` carried to `pose`, and the rotation of each Gaussian by the nodes, [N, 4]."""
         means, rotations = self.graph.carry(self.graph.means, pose)
-        quats = quat_product(rotations, own.params["quats"])
-        return {**own.params, "means": means + own.params["means"], "quats": quats}, rotations
+        carried = {**own.params, "means": means + own.params["means"]}
+        carried["quats"] = quat_product(rotations, own.params["quats"])
+        if self.settings.turned_harmonics:
+            carried["shN"] = harmonics_turned(own.params["shN"], rotations)
+        return carried, rotations
 
     @property
     def model(self) -> Model:
@@ -228,8 +231,7 @@ class Tracker:
         new = group.origin < 0
         self.moving = torch.where(new, True, self.moving[group.origin])
         self.graph, self.pose = group.graph.copy(), frame.pose
-        quats = quat_product(frame.rotations, frame.params["quats"], inverse_a=True)
-        self.own = Model({**frame.params, "means": frame.params["means"] - frame.means, "quats": quats})
+        self.own = self._own(frame.params, frame.means, frame.rotations)
 
     def densify(self, frame: int, on_step: OnStep = None) -> None:
         """Adds the Gaussians that `frame` needs besides, after `advance`."""
@@ -246,9 +248,16 @@ class Tracker:
         params = spawned.params
         self.graph.extend(self._rest_positions(params["means"]))
         means, rotations = (x[len(self.own) :] for x in self.graph.carry(self.graph.means, self.pose))
-        quats = quat_product(rotations, params["quats"], inverse_a=True)
-        self.own.append({**params, "means": params["means"] - means, "quats": quats})
+        self.own.append(self._own(params, means, rotations).params)
         self.moving = torch.cat([self.moving, torch.ones(len(spawned), dtype=torch.bool)])
+
+    def _own(self, params: dict[str, torch.Tensor], means: torch.Tensor, rotations: torch.Tensor) -> Model:
+        """Inverse of `carried`: the own attributes of Gaussians that the nodes carry to `means` by `rotations`."""
+        own = {**params, "means": params["means"] - means}
+        own["quats"] = quat_product(rotations, params["quats"], inverse_a=True)
+        if self.settings.turned_harmonics:
+            own["shN"] = harmonics_turned(params["shN"], rotations, back=True)
+        return Model(own)
 
     def _rest_positions(self, means: torch.Tensor) -> torch.Tensor:
         """Where new Gaussians at `means` [K, 3] rest: beside the nearest Gaussian, whose nodes carry them, too.

@@ -160,7 +160,8 @@ class _Run:
         if len(done) == 1 and parents is None:
             subject.canonical = track.models[0]
             subject.parents = np.arange(len(subject.canonical))
-            return ParametricGroup(1, subject.canonical.gaussians(), rate_optimized=False, ended=ended)
+            turned = self.settings.turned_harmonics
+            return ParametricGroup(1, subject.canonical.gaussians(), ended=ended, turned_harmonics=turned)
         model = self._finetuned(subject, done, track)
         subject.tracker.adopt(model)
         known = len(model.key) if parents is None else len(parents)
@@ -198,7 +199,7 @@ class _Run:
             if long_enough and subject.tracker.changed_fraction(frame, track.moved()) > g.changed_fraction_max:
                 return "change"
             near, far = self.settings.cut_ratio * subject.tracker.loss, g.drift_ratio * subject.loss
-            if subject.canonical is None and len(track.models) == 1:  # no tracked frame comes near a keyframe's own fit
+            if subject.tracker.loss == subject.loss:  # a keyframe's own fit, which no tracked frame comes near
                 near = far
             loss = subject.tracker.advance(frame, self._report(f"track {frame}"))
             if loss is not None and loss > min(near, far) + g.cut_loss_floor:

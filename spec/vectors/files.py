@@ -20,7 +20,6 @@ CONFIG = {
     "color_space": "srgb",
     "background": [0.0, 0.0, 0.0],
     "sh_degree": 0,
-    "sh_frame": "world",
     "cameras": [],
 }
 

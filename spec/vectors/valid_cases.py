@@ -88,8 +88,8 @@ VALID = {  # name: (what it is about, bytes)
     "few_nodes": ("fewer nodes than neighbours", lambda: groups_file(make_group(40, 6, nodes=3, neighbors=8))),
     "sh_degree_1": ("sh_degree 1", lambda: groups_file(make_group(80, 2, sh_degree=1), sh_degree=1)),
     "sh_degree_2": (
-        "sh_degree 2, SH turn",
-        lambda: groups_file(make_group(80, 2, sh_degree=2, nodes=4), sh_degree=2, sh_frame="body"),
+        "sh_degree 2, harmonics that turn with the nodes",
+        lambda: groups_file(replace(make_group(80, 2, sh_degree=2, nodes=4), turned_harmonics=True), sh_degree=2),
     ),
     "sh_degree_3": (
         "sh_degree 3 with trajectories of shN",

@@ -85,6 +85,7 @@ class TrainSettings:
         harmonics_lambda: weight of half the square of the harmonics, mean over the Gaussians: they cost bits.
         harmonics_views: training cameras up to which it has that weight; with more, which say more of them themselves,
             it falls with their square.
+        turned_harmonics: harmonics turn with the nodes; otherwise they stay in the world.
         cut_ratio: a frame whose image loss exceeds that of the frame before by this factor starts anew.
         rigidity: weight of the as-rigid-as-possible term.
         rate_lambda: share by which the image loss may rise where bits fall by one share.
@@ -105,6 +106,7 @@ class TrainSettings:
     depth_lambda: float = 0.1
     harmonics_lambda: float = 0.15
     harmonics_views: float = 10.0
+    turned_harmonics: bool = True
     cut_ratio: float = 1.5
     rigidity: float = 0.3
     rate_lambda: float = 0.4

@@ -44,6 +44,7 @@ pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(rigid_blend::blend_rigid, m)?)?;
     m.add_function(wrap_pyfunction!(rigid_blend::node_gradients, m)?)?;
     m.add_function(wrap_pyfunction!(rigid_blend::quat_product, m)?)?;
+    m.add_function(wrap_pyfunction!(rigid_blend::turned_harmonics, m)?)?;
     m.add_function(wrap_pyfunction!(rig::rig_motion, m)?)?;
     m.add_function(wrap_pyfunction!(reposing::repose, m)?)?;
     m.add_function(wrap_pyfunction!(attributes, m)?)?;

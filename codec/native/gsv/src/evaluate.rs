@@ -118,6 +118,7 @@ impl Evaluator {
             node_steps: [h.nodes.rotation_step, h.nodes.translation_step],
             rig: self.rig(),
             motions: &self.motions,
+            turned: h.turned,
         }
     }
 

@@ -86,6 +86,8 @@ pub struct Header {
     pub grid_step: f32,
     pub grid_bits: u8,
     pub sh_degree: u8,
+    /// Harmonics turn with the nodes (spec 13.4); otherwise they stay in the world.
+    pub turned: bool,
     pub layers: Vec<LayerHeader>,
     /// A tile has up to 2^tile_side_log2 x 2^tile_side_log2 cells of the map.
     pub tile_side_log2: u8,

@@ -21,6 +21,7 @@ pub mod error;
 pub mod evaluate;
 pub mod fields;
 pub mod group;
+pub mod harmonics;
 pub mod header;
 mod lanes;
 pub mod levels;

@@ -6,6 +6,7 @@
 use crate::attributes::Attribute;
 use crate::blend::Blend;
 use crate::dequantize::{IDENTITY, Quat, multiply};
+use crate::harmonics;
 use crate::parallel::join;
 use crate::rig::CHANNELS;
 use crate::rigid_blend::{RigidBlend, from_rotation_vector, pose};
@@ -169,6 +170,8 @@ pub struct Parametric<'a, V> {
     pub node_steps: [f32; 2],
     pub rig: Option<RigMotion<'a>>,
     pub motions: &'a [AttributeMotion<V>],
+    /// Harmonics turn with the nodes.
+    pub turned: bool,
 }
 
 impl<V: Coefficient> Parametric<'_, V> {
@@ -188,7 +191,7 @@ impl<V: Coefficient> Parametric<'_, V> {
         ];
         let (means, quats) = (&mut *out.means, &mut *out.quats);
         join(
-            || self.move_at(basis, means, quats),
+            || self.carry_at(basis, means, quats),
             || {
                 still.into_par_iter().for_each(|(attribute, rest, values)| {
                     values.iter_mut().zip(rest).for_each(|(v, r)| *v = *r);
@@ -198,21 +201,31 @@ impl<V: Coefficient> Parametric<'_, V> {
                 });
             },
         );
+        if self.turned && self.blend.per > 0 {
+            let by_nodes = |(q, own): (&Quat, &Quat)| multiply(*q, [own[0], -own[1], -own[2], -own[3]]);
+            let turns: Vec<Quat> = out.quats.iter().zip(self.rotations).map(by_nodes).collect();
+            harmonics::turn(out.sh_n, &turns);
+        }
+        self.add_residuals(basis, out.means, out.quats);
     }
 
     /// Means and quaternions alone, of frame `t`.
     pub fn moved_into(&self, t: u16, means: &mut [[f32; 3]], quats: &mut [Quat]) {
         let basis = &basis(self.frames, t.min(self.frames.saturating_sub(1)))[..];
-        self.move_at(basis, means, quats);
+        self.carry_at(basis, means, quats);
+        self.add_residuals(basis, means, quats);
     }
 
     fn motion(&self, attribute: Attribute) -> Option<&AttributeMotion<V>> {
         self.motions.iter().find(|m| m.attribute == attribute)
     }
 
-    fn move_at(&self, basis: &[f32], means: &mut [[f32; 3]], quats: &mut [Quat]) {
+    fn carry_at(&self, basis: &[f32], means: &mut [[f32; 3]], quats: &mut [Quat]) {
         let own = |i: usize| self.rotations.get(i).copied().unwrap_or(IDENTITY);
         self.carry(basis, (means, quats), |i, q| multiply(q, own(i)));
+    }
+
+    fn add_residuals(&self, basis: &[f32], means: &mut [[f32; 3]], quats: &mut [Quat]) {
         join(
             || self.motion(Attribute::Quats).map(|m| m.rotate(basis, quats)),
             || {

@@ -32,7 +32,6 @@ fn config() -> Config {
         color_space: 0,
         background: [0.0, 0.5, 1.0],
         sh_degree: 3,
-        sh_frame: 1,
         cameras: vec![camera.clone(), camera],
         audio: None,
         ..Config::default()

@@ -3,7 +3,7 @@
 use super::placement::{placement_from, placement_into};
 use super::values::{bytes_of, invalid, item, optional, raise, value};
 use gsv::container::audio::AudioTrack;
-use gsv::container::config::{COLOR_SPACES, Camera, Config, NEAR, SH_FRAMES, UP_AXES, rate};
+use gsv::container::config::{COLOR_SPACES, Camera, Config, NEAR, UP_AXES, rate};
 use gsv::container::demux::Demuxer;
 use gsv::container::whole;
 use gsv::container::write::{self, Reference, Sound};
@@ -36,7 +36,6 @@ fn config_from(py: Python, d: &Bound<PyDict>) -> PyResult<Config> {
         color_space: choice("color_space", &COLOR_SPACES)?,
         background: value(d, "background")?,
         sh_degree: value(d, "sh_degree")?,
-        sh_frame: choice("sh_frame", &SH_FRAMES)?,
         cameras: Vec::new(),
         audio: optional(d, "audio")?.map(|a| audio_from(&a.extract()?)).transpose()?,
         track: optional(d, "track")?.map_or(Ok(0), |v| v.extract())?,
@@ -103,7 +102,6 @@ fn config_into<'py>(py: Python<'py>, c: &Config) -> PyResult<Bound<'py, PyDict>>
     d.set_item("color_space", name(&COLOR_SPACES, c.color_space))?;
     d.set_item("background", c.background.to_vec())?;
     d.set_item("sh_degree", c.sh_degree)?;
-    d.set_item("sh_frame", name(&SH_FRAMES, c.sh_frame))?;
     let cameras = PyList::empty(py);
     for c in &c.cameras {
         let [fx, skew, cx, fy, cy] = c.k.map(f64::from);

@@ -21,6 +21,7 @@ pub fn group_from(d: &Bound<PyAny>, reference: Option<&Group>) -> PyResult<Group
         grid_step: value(d, "grid_step")?,
         grid_bits: value(d, "grid_bits")?,
         sh_degree: sh_degree(&channels)?,
+        turned: value(d, "turned_harmonics")?,
         tile_side_log2: value(d, "tile_side_log2")?,
         ..Header::default()
     };
@@ -41,7 +42,7 @@ pub fn group_from(d: &Bound<PyAny>, reference: Option<&Group>) -> PyResult<Group
     header.lifetimes = group.lifetimes.is_some();
     if header.reference > 0 && !reference.is_some_and(|r| same_parameters(&r.header, &header)) {
         return invalid(
-            "a predicted group: expected its reference, with the same grid, steps, offsets, companding and exponents"
+            "a predicted group: expected its reference, with the same grid, steps, offsets, companding, exponents and turned_harmonics"
                 .into(),
         );
     }
@@ -93,7 +94,7 @@ fn same_parameters(reference: &Header, own: &Header) -> bool {
     let (r, h) = (reference, own);
     (r.origin, r.grid_step, r.grid_bits, r.tile_side_log2) == (h.origin, h.grid_step, h.grid_bits, h.tile_side_log2)
         && (&r.scales, &r.scale_exponents) == (&h.scales, &h.scale_exponents)
-        && (&r.shifts, &r.companding) == (&h.shifts, &h.companding)
+        && (&r.shifts, &r.companding, r.turned) == (&h.shifts, &h.companding, h.turned)
 }
 
 /// Fields `layers`, `corrections`, and of a predicted group `reference` and `parents`.

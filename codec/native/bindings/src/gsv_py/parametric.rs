@@ -39,11 +39,12 @@ pub struct ParametricEvaluator {
     nodes: Vec<[f32; 3]>,
     node_motion: Trajectories<f32>,
     motions: Vec<AttributeMotion<f32>>,
+    turned: bool,
 }
 
 #[pymethods]
 impl ParametricEvaluator {
-    /// `canonical`: means, quats, log_scales, logit_opacities, sh0, shN. `trajectories`: (attribute, [K, C, N]) pairs.
+    /// `canonical`: means, quats, log_scales, logit_opacities, sh0, shN. `trajectories`: (attribute, [K, C, N]) pairs. `turned`: harmonics turn with the nodes.
     #[new]
     fn new(
         py: Python,
@@ -51,6 +52,7 @@ impl ParametricEvaluator {
         canonical: Arrays,
         nodes: Option<Nodes>,
         trajectories: Vec<(String, PyReadonlyArray3<f32>)>,
+        turned: bool,
     ) -> PyResult<Self> {
         let n = canonical.0.shape()[0];
         let k = canonical.5.shape()[1];
@@ -102,6 +104,7 @@ impl ParametricEvaluator {
             nodes: places,
             node_motion,
             motions,
+            turned,
         })
     }
 
@@ -141,6 +144,7 @@ impl ParametricEvaluator {
             node_steps: [1.0; 2],
             rig: None,
             motions: &self.motions,
+            turned: self.turned,
         }
     }
 }

@@ -60,6 +60,7 @@ pub fn quantized<'py>(py: Python<'py>, e: &Evaluator) -> PyResult<Bound<'py, PyA
         matrix(py, &h.scale_exponents.map(|l| l.map(i32::from)))?,
     )?;
     d.set_item("tile_side_log2", h.tile_side_log2)?;
+    d.set_item("turned_harmonics", h.turned)?;
     let layers = g.layers.iter().map(|l| l.count).collect::<Vec<_>>();
     d.set_item("layers", PyTuple::new(py, layers)?)?;
     d.set_item("corrections", matrix(py, &g.corrections)?)?;

@@ -5,7 +5,7 @@ use gsv::blend::Blend;
 use gsv::dequantize::multiply;
 use gsv::pose_gradient::{self, Edges, Moved};
 use gsv::rigid_blend::{self, RigidBlend};
-use numpy::{IntoPyArray, PyArrayMethods, PyReadonlyArray2, PyUntypedArrayMethods};
+use numpy::{IntoPyArray, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
 type Floats<'py> = PyReadonlyArray2<'py, f32>;
@@ -154,4 +154,28 @@ pub fn quat_product<'py>(
         .into_pyarray(py)
         .reshape([count, 4])?
         .into_any())
+}
+
+/// Harmonics [N, K, 3], turned by the unit quaternions [N, 4] (wxyz), or with `back` by their inverse; a new array.
+#[pyfunction]
+pub fn turned_harmonics<'py>(
+    py: Python<'py>,
+    harmonics: PyReadonlyArray3<'py, f32>,
+    rotations: Floats<'py>,
+    back: bool,
+) -> PyResult<Bound<'py, PyAny>> {
+    let &[n, k, _] = harmonics.shape() else {
+        return invalid("harmonics: expected shape [N, K, 3]".into());
+    };
+    let rotations: &[[f32; 4]] = rows(&rotations, "rotations", "N", Some(n))?;
+    let mut sh = harmonics.as_slice()?.to_vec();
+    py.detach(|| {
+        let sign = if back { -1.0 } else { 1.0 };
+        let turns: Vec<[f32; 4]> = rotations
+            .iter()
+            .map(|[w, x, y, z]| [*w, sign * x, sign * y, sign * z])
+            .collect();
+        gsv::harmonics::turn(&mut sh, &turns);
+    });
+    Ok(sh.into_pyarray(py).reshape([n, k, 3])?.into_any())
 }

@@ -1,7 +1,7 @@
 //! Answers to the host as JSON.
 
 use gsv::container::audio::{AudioRun, AudioTrack};
-use gsv::container::config::{COLOR_SPACES, Camera, Config, SH_FRAMES, UP_AXES};
+use gsv::container::config::{COLOR_SPACES, Camera, Config, UP_AXES};
 use gsv::container::demux::Demuxer;
 use gsv::container::entry::Entry;
 use gsv::header::Header;
@@ -83,7 +83,7 @@ fn config(c: &Config) -> String {
     );
     let name = |names: &[&str], i: u8| string(names.get(usize::from(i)).copied().unwrap_or_default());
     format!(
-        r#"{{"fps":[{},{}],"level":{},"metres_per_unit":{},"up":{},"color_space":{},"background":{},"sh_degree":{},"sh_frame":{},"cameras":{},"audio":{},"placement":{placement}}}"#,
+        r#"{{"fps":[{},{}],"level":{},"metres_per_unit":{},"up":{},"color_space":{},"background":{},"sh_degree":{},"cameras":{},"audio":{},"placement":{placement}}}"#,
         c.timescale,
         c.frame_duration,
         c.level,
@@ -92,7 +92,6 @@ fn config(c: &Config) -> String {
         name(&COLOR_SPACES, c.color_space),
         list(c.background.iter(), f32::to_string),
         c.sh_degree,
-        name(&SH_FRAMES, c.sh_frame),
         list(c.cameras.iter(), camera),
         c.audio.as_ref().map_or("null".into(), audio),
     )

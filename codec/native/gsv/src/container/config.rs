@@ -12,8 +12,6 @@ pub const UP_AXES: [&str; 6] = ["x", "y", "z", "-x", "-y", "-z"];
 pub const COLOR_SPACES: [&str; 1] = ["srgb"];
 /// Near plane of a camera of a file that names none, world units.
 pub const NEAR: f32 = 0.01;
-/// Names of `sh_frame` values.
-pub const SH_FRAMES: [&str; 2] = ["world", "body"];
 
 /// A reference camera: OpenCV axes, pixel centres at half-integers.
 #[derive(Debug, Clone, PartialEq)]
@@ -53,7 +51,6 @@ pub struct Config {
     pub color_space: u8,
     pub background: [f32; 3],
     pub sh_degree: u8,
-    pub sh_frame: u8,
     pub cameras: Vec<Camera>,
     /// Not in gsvC: a track of its own (spec 2.7).
     pub audio: Option<AudioTrack>,
@@ -101,7 +98,7 @@ impl Config {
             })?;
         }
         choice(f, &mut self.sh_degree, 4, "sh_degree")?;
-        choice(f, &mut self.sh_frame, SH_FRAMES.len(), "sh_frame")?;
+        choice(f, &mut 0, 2, "reserved")?; // sh_frame in drafts 1 to 11, which no decoder followed
         let mut count = self.cameras.len() as u16;
         f.must(usize::from(count) == self.cameras.len(), || {
             "at most 65535 cameras".into()

@@ -13,6 +13,7 @@ const FLAG_COMPANDING: u8 = 2;
 const FLAG_LAYER_SHIFTS: u8 = 8;
 const FLAG_LIFETIMES: u8 = 16;
 const FLAG_RIG: u8 = 32;
+const FLAG_TURNED: u8 = 64;
 
 impl Header {
     /// Parses the payload of unit 0. `reference`: the header of the group that a predicted one refers to.
@@ -89,15 +90,19 @@ impl Header {
         if self.reference == 0 && self.companding.is_some() {
             flags |= FLAG_COMPANDING;
         }
+        if self.reference == 0 && self.turned {
+            flags |= FLAG_TURNED;
+        }
         f.u8(&mut flags)?;
         let known = match flags & FLAG_PREDICTED {
-            0 => FLAG_LIFETIMES | FLAG_RIG | FLAG_LAYER_SHIFTS | FLAG_COMPANDING,
+            0 => FLAG_LIFETIMES | FLAG_RIG | FLAG_LAYER_SHIFTS | FLAG_COMPANDING | FLAG_TURNED,
             _ => FLAG_LIFETIMES | FLAG_RIG | FLAG_PREDICTED,
         };
         f.must(flags & !known == 0, || {
             format!("reserved flags to be 0, found {flags:#04x}")
         })?;
         self.lifetimes = flags & FLAG_LIFETIMES != 0;
+        self.turned = flags & FLAG_TURNED != 0;
         if flags & FLAG_RIG != 0 {
             self.rig.joints = self.rig.joints.max(1); // their number follows
         }
