@@ -10,7 +10,8 @@ torch = pytest.importorskip("torch")
 from gscodec.errors import LimitError, UsageError  # noqa: E402
 from gscodec.model.camera import Camera, look_at  # noqa: E402
 from gscodec.model.gaussians import PARAMETERS, Gaussians  # noqa: E402
-from gscodec.render.backend import STATISTICS, Crop  # noqa: E402
+from gscodec.model.rotations import turned_harmonics  # noqa: E402
+from gscodec.render.backend import STATISTICS, TURNS, Crop  # noqa: E402
 from gscodec.render.cpu import CpuBackend  # noqa: E402
 from gscodec.render.image import render_image, render_rgba  # noqa: E402
 from gscodec.render.reference import image_loss_reference, rasterize_reference  # noqa: E402
@@ -264,6 +265,25 @@ def test_8_bit_image_is_the_float_image_rounded():
     image, _ = Workspace().forward(params, cam, BACKGROUND)
     want = np.floor(np.clip(image, 0, 1) * 255 + 0.5)
     np.testing.assert_array_equal(render_image(g, cam, BACKGROUND), want)
+
+
+def test_turned_harmonics_are_seen_as_if_their_coefficients_were_turned():
+    """Picture and gradients; those of the coefficients as they were before they were turned."""
+    cam, params = camera(), {n: p.detach().float().numpy() for n, p in zip(PARAMETERS, scene(), strict=True)}
+    turns = np.random.default_rng(0).normal(size=(len(params["means"]), 4)).astype(np.float32)
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    turned = {**params, "shN": turned_harmonics(params["shN"], turns)}
+    pixels = lambda image, alpha: (np.sin(9 * image), np.cos(7 * alpha))  # noqa: E731
+    found, expected = (
+        CpuBackend().backpropagate(p, cam, BACKGROUND, pixels) for p in ({**params, TURNS: turns}, turned)
+    )
+    images = [CpuBackend().render(p, cam, BACKGROUND)[0] for p in ({**params, TURNS: turns}, turned, params)]
+    np.testing.assert_allclose(images[0], images[1], atol=1e-5)
+    assert np.abs(images[0] - images[2]).max() > 0.01
+    expected["shN"] = turned_harmonics(expected["shN"], turns, back=True)
+    for name in PARAMETERS:
+        size = np.abs(expected[name]).max()
+        np.testing.assert_allclose(found[name], expected[name], atol=1e-4 * size, err_msg=name)
 
 
 def test_statistics():

@@ -198,24 +198,14 @@ def encode_input(
     from .reuse_geometry import encode_reusing
     from .sources import capture_source, say_lengths, splat_source
 
-    if options.gop < 1:
-        raise UsageError(f"--gop {options.gop} is out of range, expected at least 1 frame in a group")
-    out = Path(out)
-    if out.suffix != ".gsv":
-        raise UsageError(f"{out}: the output must be named *.gsv")
-    kind = detect_input(source)
-    if kind == "splats" and options.cluster:
-        raise UsageError(f"--ray {options.cluster}: {source} holds splats, which need no training; leave --ray away")
-    if kind == "splats" and tracks:
-        raise UsageError(f"--tracks {tracks}: {source} holds splats, expected a capture; gscodec mux joins streams")
+    out, kind = Path(out), detect_input(source)
+    _check(source, out, kind, options, tracks, reuse_geometry)
     sound = read_audio(audio) if audio else None
     out.parent.mkdir(parents=True, exist_ok=True)
 
     def made_by(opened: Source) -> dict:
         return {"program": program(), "input": inputs(source), "settings": asdict(opened.settings) | opened.made_of}
 
-    if tracks and reuse_geometry:
-        raise UsageError("--tracks and --reuse-geometry exclude each other: recolour the tracks one by one")
     if reuse_geometry:
         return encode_reusing(source, kind, reuse_geometry, out, settings, options, bar, sound)
     if tracks:
@@ -239,3 +229,19 @@ def encode_input(
     if not report.interrupted or not report.groups:  # without a group there is nothing to go on from
         opened.finish()
     return report
+
+
+def _check(
+    source: Path, out: Path, kind: str, options: TrainOptions, tracks: str | None, reuse_geometry: Path | None
+) -> None:
+    """Raises a UsageError where the options of `encode_input` contradict each other, or what `source` holds."""
+    if options.gop < 1:
+        raise UsageError(f"--gop {options.gop} is out of range, expected at least 1 frame in a group")
+    if out.suffix != ".gsv":
+        raise UsageError(f"{out}: the output must be named *.gsv")
+    if kind == "splats" and options.cluster:
+        raise UsageError(f"--ray {options.cluster}: {source} holds splats, which need no training; leave --ray away")
+    if kind == "splats" and tracks:
+        raise UsageError(f"--tracks {tracks}: {source} holds splats, expected a capture; gscodec mux joins streams")
+    if tracks and reuse_geometry:
+        raise UsageError("--tracks and --reuse-geometry exclude each other: recolour the tracks one by one")

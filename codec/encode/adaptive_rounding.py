@@ -94,9 +94,8 @@ class AdaptiveRounding:
             if step == settled:
                 self._settle_sizes()
             off = lambda image, picture=picture: np.ascontiguousarray(image - picture)  # noqa: E731
-            derivative = derivatives(backend, self.frame(t), camera, off, names, background)
-            if "shN" in derivative:
-                derivative["shN"] = self._turned(derivative["shN"], t, back=True)
+            turns = None if self._turns is None else self._turns[t]
+            derivative = derivatives(backend, self._at_rest(t), camera, off, names, background, turns)
             by_integers = lambda v, d=derivative, t=t: v.by_integers(d[v.attribute], t)  # noqa: E731
             grads = self._pool.map(by_integers, self._variables)
             latents = {id(v): v.latents.values for v in self._variables}
@@ -106,6 +105,11 @@ class AdaptiveRounding:
 
     def frame(self, t: int) -> Gaussians:
         """Frame `t` as decoded with the integers as they are now."""
+        g = self._at_rest(t)
+        return g if self._turns is None else replace(g, shN=turned_harmonics(g.shN, self._turns[t]))
+
+    def _at_rest(self, t: int) -> Gaussians:
+        """`frame`, with harmonics that are not turned."""
         before, values = self._before[t]
 
         def now(attribute: str) -> np.ndarray:
@@ -116,8 +120,6 @@ class AdaptiveRounding:
             return moved
 
         moved = dict(zip(values, self._pool.map(now, values), strict=True))
-        if "shN" in moved:
-            moved["shN"] = self._turned(moved["shN"], t)
         return self._shown(_with_values(before, moved), t)
 
     def quantized(self) -> Quantized:
@@ -143,14 +145,14 @@ class AdaptiveRounding:
 
     @cached_property
     def _before(self) -> list[tuple[Gaussians, dict[str, np.ndarray]]]:
-        """Each frame as decoded with the integers that variables start from, as Gaussians and as coded values."""
+        """Each frame as decoded with the integers that variables start from, as Gaussians and as coded values;
+        harmonics as at rest."""
         decoded, out = self._decoded(), []
         for t in range(self.frames):
             g = Gaussians(**decoded.frame(t))
-            values = {n: v for n, v in channel_values(g).items() if n in MOVING_OVER_TIME}
-            if "shN" in values:
-                values["shN"] = self._turned(values["shN"], t, back=True)
-            out.append((g, values))
+            if self._turns is not None:
+                g = replace(g, shN=turned_harmonics(g.shN, self._turns[t], back=True))
+            out.append((g, {n: v for n, v in channel_values(g).items() if n in MOVING_OVER_TIME}))
         return out
 
     def _decoded(self):
@@ -162,13 +164,8 @@ class AdaptiveRounding:
     def _turns(self) -> np.ndarray | None:
         """[T, N, 4] by which harmonics are turned in each frame; None: they are not."""
         q = self._quantized.integers
-        return self._decoded().carried()[1] if q.turned_harmonics and q.nodes is not None else None
-
-    def _turned(self, values: np.ndarray, t: int, back: bool = False) -> np.ndarray:
-        """Harmonics [N, 3 K] as they are coded, turned as in frame `t`, or back."""
-        if self._turns is None:
-            return values
-        return turned_harmonics(values.reshape(len(values), -1, 3), self._turns[t], back=back).reshape(values.shape)
+        turns = q.turned_harmonics and q.nodes is not None and "shN" in q.channels
+        return self._decoded().carried()[1] if turns else None
 
     def _shown(self, g: Gaussians, t: int) -> Gaussians:
         """The same with an opacity that shows nothing, where frame `t` is outside of a lifetime."""

@@ -16,7 +16,8 @@ from ..model.camera import Camera
 STATISTICS = ("grad2d", "max_weight", "sum_weight")
 
 Region = tuple[int, int, int, int]  # x, y, width, height in pixels
-Params = Mapping[str, np.ndarray]  # PARAMETERS -> numpy arrays or torch CPU tensors, f32, contiguous
+TURNS = "turns"  # rotations [N, 4] wxyz by which shN is turned
+Params = Mapping[str, np.ndarray]  # PARAMETERS -> numpy arrays or torch CPU tensors, f32, contiguous; or TURNS, too
 PixelGradient = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 PendingLoss = Callable[[], "RenderLoss"]
 

@@ -14,7 +14,7 @@ from .. import _native
 from ..errors import UsageError
 from ..model.camera import Camera
 from ..model.gaussians import PARAMETERS
-from .backend import STATISTICS, Crop, Params, PendingLoss, PixelGradient, Region, RenderLoss
+from .backend import STATISTICS, TURNS, Crop, Params, PendingLoss, PixelGradient, Region, RenderLoss
 from .workspace import Workspace, call, host_array, rgb, view
 
 
@@ -75,7 +75,7 @@ class CpuBackend:
     def _photometric_loss(
         self, params: Params, arrays: tuple[np.ndarray, ...], crops: Sequence[Crop], lambdas: tuple[float, ...]
     ) -> RenderLoss:
-        """`photometric_loss` of the six `arrays`; `params`: what the gradients look like. `lambdas`: of SSIM, mask and
+        """`photometric_loss` of the `arrays`; `params`: what the gradients look like. `lambdas`: of SSIM, mask and
         depth."""
         if not crops:
             raise UsageError("a batch has at least one crop, got none")
@@ -144,8 +144,9 @@ class CpuBackend:
 
 
 def _arrays(params: Params) -> tuple[np.ndarray, ...]:
-    """The six arrays in the order of PARAMETERS."""
-    return tuple(np.ascontiguousarray(host_array(params[name]), np.float32) for name in PARAMETERS)
+    """The arrays in the order of PARAMETERS, and behind them TURNS if they are there."""
+    names = (*PARAMETERS, TURNS) if TURNS in params else PARAMETERS
+    return tuple(np.ascontiguousarray(host_array(params[name]), np.float32) for name in names)
 
 
 def _native_crop(crop: Crop) -> tuple:

@@ -21,7 +21,7 @@ from ..bitstream.quantization import Steps, error_for, subject_radius
 from ..model.attributes import BY_NAME
 from ..model.camera import Camera, cameras_around
 from ..model.gaussians import PARAMETERS, Gaussians
-from .backend import Backend
+from .backend import TURNS, Backend
 from .cpu import CpuBackend
 
 VIEWS, SIZE = 24, 512
@@ -104,9 +104,10 @@ def measure(
     return Importance(total, total.pop("scene_rotations"), removal)
 
 
-def params_of(g: Gaussians) -> dict[str, np.ndarray]:
-    """The arrays of `g` by name, as a backend takes them."""
-    return {name: np.ascontiguousarray(getattr(g, name), np.float32) for name in PARAMETERS}
+def params_of(g: Gaussians, turns: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """The arrays of `g` by name, as a backend takes them; `turns`: rotations [N, 4] that turn its harmonics."""
+    params = {name: np.ascontiguousarray(getattr(g, name), np.float32) for name in PARAMETERS}
+    return params if turns is None else {**params, TURNS: turns}
 
 
 def arrays_of(g: Gaussians) -> tuple[np.ndarray, ...]:
@@ -121,6 +122,7 @@ def derivatives(
     by_picture: Callable[[np.ndarray], np.ndarray],
     names: Iterable[str] = (*BY_NAME, "scene_rotations"),
     background: tuple[float, ...] = GREY,
+    turns: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
     """Derivatives by the coded channels, attribute -> [N, C].
 
@@ -128,9 +130,10 @@ def derivatives(
         by_picture: image of `camera` over `background` -> derivative by its pixels, [H, W, 3] f32 both.
         names: attributes; quats by rotations about the Gaussian's own axes, "scene_rotations" about those of the scene.
             shN is left out where there is none.
+        turns: rotations [N, 4] by which the harmonics of `g` are turned; None: they are not.
     """
     by_pixels = lambda image, alpha: (by_picture(image), np.zeros_like(alpha))  # noqa: E731
-    grads = backend.backpropagate(params_of(g), camera, background, by_pixels)
+    grads = backend.backpropagate(params_of(g, turns), camera, background, by_pixels)
     return {n: _by_channels(g, grads, n) for n in names if n != "shN" or g.sh_degree}
 
 

@@ -52,7 +52,7 @@ class Workspace:
         return dict(self.native.timings())
 
     def forward(self, params, camera: Camera, background, region: Region | None = None, training: bool = False):
-        """Renders `params`, the six arrays in the order of PARAMETERS.
+        """Renders `params`, the six arrays in the order of PARAMETERS, and TURNS behind them or not.
 
         Returns:
             image [H, W, 3] f32 and alpha [H, W] f32 of the region, new arrays.
@@ -73,12 +73,12 @@ class Workspace:
         return flat.reshape(camera.height, camera.width, 3)
 
     def gradients(self, params) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-        """Arrays in the shapes of `params`, and three statistics [N]; every second call gives the same ones while the
-        shapes stay, so that those of the step before can still be read."""
+        """Arrays in the shapes of `params`, without TURNS, and three statistics [N]; every second call gives the same
+        ones while the shapes stay, so that those of the step before can still be read."""
         self._grads = self._grads[::-1]
         grads = self._grads[0]
         n = len(params[0])
-        shapes = {name: p.shape for name, p in zip(PARAMETERS, params, strict=True)}
+        shapes = {name: p.shape for name, p in zip(PARAMETERS, params[: len(PARAMETERS)], strict=True)}
         shapes |= {name: (n,) for name in STATISTICS}
         for name, shape in shapes.items():
             if name not in grads or grads[name].shape != shape:

@@ -18,7 +18,7 @@ from ..bitstream.quantization import Steps, trajectory_step
 from ..model.parametric_group import NodeMotion, ParametricGroup
 from ..model.rotations import quat_conjugate, quat_to_rotvec, rotate
 from ..model.temporal_transform import dct_basis
-from ..render.backend import Backend
+from ..render.backend import TURNS, Backend
 from .deformation_graph import NodeGraph, Pose
 from .entropy_model import CanonicalRate
 from .model import NAMES, REMOVED_LOGIT, Model, harmonics_turned, quat_product
@@ -31,7 +31,7 @@ class Frame:
     """One frame of a group, and what its backward pass needs.
 
     Attributes:
-        params: attributes as they are rendered.
+        params: attributes as they are rendered; harmonics as at rest, with TURNS.
         pose: of the nodes; turn: [M, 3] rotation vectors behind the tracked one.
         means, rotations: [N, 3] and [N, 4], where the nodes carry the Gaussians. rest: [N, 3], canonical means.
         residual: [N, 4], the residual rotation, unit. inner: [N, 4], rotation before it. quats: [N, 4], canonical.
@@ -232,7 +232,7 @@ class GroupModel:
             "sh0": p["sh0"] + delta["sh0"],
         }
         if self._turned:
-            params["shN"] = harmonics_turned(p["shN"], rotations)
+            params[TURNS] = rotations
         return Frame(params, pose, turn, means, p["means"], rotations, residual, inner, p["quats"], shown)
 
     def gradients(self, frame: Frame, grads: dict[str, torch.Tensor]) -> tuple[dict, dict, torch.Tensor]:
@@ -251,8 +251,6 @@ class GroupModel:
             "quats": quat_product(frame.rotations, by_inner, inverse_a=True),
             "logit_opacities": opacities,
         }
-        if self._turned:
-            canonical["shN"] = harmonics_turned(grads["shN"], frame.rotations, back=True)
         return residuals, canonical, quat_product(by_inner, frame.quats, inverse_b=True)
 
     def group(self, parents: np.ndarray | None) -> ParametricGroup:

@@ -16,7 +16,7 @@ import torch
 from ..render.optimizer import Adam
 from .deformation_graph import Pose
 from .keyframe import Statistics
-from .model import Model, harmonics_turned, quat_product
+from .model import Model, quat_product
 from .motion_field import MotionField
 from .views import Target, photometric_loss
 
@@ -79,8 +79,6 @@ class FrameFit:
         rigidity = (s.stiff_rigidity if stiff else 1.0) * t.settings.rigidity
         self._step_nodes(pose, (grads["means"], by_rotations), rigidity, decay)
         grads = {**grads, "quats": quat_product(rotations, grads["quats"], inverse_a=True)}  # before rotation
-        if t.settings.turned_harmonics:
-            grads["shN"] = harmonics_turned(grads["shN"], rotations, back=True)
         free = grads
         if not self._all_move:
             free = {n: g * self._moving.view(-1, *[1] * (g.dim() - 1)) for n, g in grads.items()}

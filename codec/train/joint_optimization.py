@@ -207,8 +207,7 @@ def finetune(
         radius: of the moving Gaussians, world units.
         on_step: called with (step, loss) for each view of a step.
     """
-    least = 0 if group.known else settings.finetune.frames_min
-    steps = -(-settings.finetune_steps * max(len(frames), least) // settings.finetune.views)
+    steps = -(-views_to_draw(group, settings) // settings.finetune.views)
     run = _Finetuner(group, views, frames, settings, radius)
     order: list[int] = []
     larger = settings.finetune.views**0.5  # rates, since the gradient of several views has less noise
@@ -221,6 +220,12 @@ def finetune(
             on_step(step, loss)
     run.finish()
     views.exposure.go_on(frames[-1])
+
+
+def views_to_draw(group: GroupModel, settings: TrainSettings) -> int:
+    """Views for the fine-tuning of a group; a short one behind a keyframe has those of `frames_min` frames."""
+    least = 0 if group.known else settings.finetune.frames_min
+    return settings.finetune_steps * max(group.frames, least)
 
 
 def _round_of_frames(frames: int) -> list[int]:

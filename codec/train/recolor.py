@@ -71,14 +71,17 @@ class _Fit:
 
     def frame(self, t: int) -> Gaussians:
         """Frame `t` with the colours as they are."""
+        g = self._at_rest(t)
+        return g if self._turns is None else replace(g, shN=turned_harmonics(g.shN, self._turns[t]))
+
+    def _at_rest(self, t: int) -> Gaussians:
+        """`frame`, with harmonics that are not turned."""
         g, now = self._frames[t], {}
         for name, v in self.values.items():
             c = self.over_time[name]
             at = self._basis[1 : c.shape[1], t]
             now[name] = v + np.einsum("k,nkc->nc", at, c[:, 1:]) if len(at) else v
         shN = correlate(now["shN"].reshape(g.shN.shape)) if "shN" in now else g.shN
-        if "shN" in now and self._turns is not None:
-            shN = turned_harmonics(shN, self._turns[t])
         return replace(g, sh0=correlate(now["sh0"]), shN=shN)
 
     def map_colors(self, pictures: Iterable[Picture]) -> None:
@@ -106,10 +109,8 @@ class _Fit:
         """One step of Adam; `left`: share of the steps that are to come, by which rates fall."""
         t, camera, background, target = picture
         off = lambda image: np.ascontiguousarray(image - target)  # noqa: E731
-        derivative = derivatives(self._backend, self.frame(t), camera, off, self.values, background)
-        if "shN" in derivative and self._turns is not None:
-            triples = derivative["shN"].reshape(len(self.values["shN"]), -1, 3)
-            derivative["shN"] = turned_harmonics(triples, self._turns[t], back=True).reshape(len(triples), -1)
+        turns = None if self._turns is None else self._turns[t]
+        derivative = derivatives(self._backend, self._at_rest(t), camera, off, self.values, background, turns)
         params, grads, rates = {}, {}, {}
         for name, v in self.values.items():
             rate = left * self._settings.rates[name]

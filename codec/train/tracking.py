@@ -27,6 +27,7 @@ import torch
 from ..bitstream.quantization import subject_radius
 from ..model.rig import Rig
 from ..model.rotations import quat_conjugate, rotate, rotvec_to_quat
+from ..render.backend import TURNS
 from .change_detection import Changes
 from .deformation_graph import NodeGraph, Pose
 from .densification import error_masks, spawn
@@ -105,18 +106,26 @@ class Tracker:
         return tracker
 
     def carried(self, own: Model, pose: Pose) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-        """Attributes of `own` carried to `pose`, and the rotation of each Gaussian by the nodes, [N, 4]."""
+        """Attributes of `own` carried to `pose`, as they are rendered, and the rotation of each Gaussian by the nodes,
+        [N, 4]."""
         means, rotations = self.graph.carry(self.graph.means, pose)
         carried = {**own.params, "means": means + own.params["means"]}
         carried["quats"] = quat_product(rotations, own.params["quats"])
         if self.settings.turned_harmonics:
-            carried["shN"] = harmonics_turned(own.params["shN"], rotations)
+            carried[TURNS] = rotations
         return carried, rotations
+
+    def _model(self, pose: Pose) -> Model:
+        """The Gaussians in `pose`."""
+        params, rotations = self.carried(self.own, pose)
+        if TURNS in params:
+            params["shN"] = harmonics_turned(params["shN"], rotations)
+        return Model(params)
 
     @property
     def model(self) -> Model:
         """The Gaussians in the last frame."""
-        return Model(self.carried(self.own, self.pose)[0])
+        return self._model(self.pose)
 
     @property
     def alive(self) -> torch.Tensor:
@@ -206,7 +215,7 @@ class Tracker:
         batch, next_pose = self.graph.batch_of(), self.pose.next()
         for k in np.setdiff1d(batch[(self.moving & self.alive).numpy()], [0]):
             some = torch.from_numpy(batch == k) & self.alive
-            model = Model(self.carried(self.own, next_pose)[0])
+            model = self._model(next_pose)
             shift = relocalize(model, some, frame, self.changes, self.masks, self.settings)
             if shift is None:
                 self._remove(some)
@@ -248,15 +257,17 @@ class Tracker:
         params = spawned.params
         self.graph.extend(self._rest_positions(params["means"]))
         means, rotations = (x[len(self.own) :] for x in self.graph.carry(self.graph.means, self.pose))
-        self.own.append(self._own(params, means, rotations).params)
+        own = self._own(params, means, rotations)
+        if self.settings.turned_harmonics:
+            own.params["shN"] = harmonics_turned(own.params["shN"], rotations, back=True)
+        self.own.append(own.params)
         self.moving = torch.cat([self.moving, torch.ones(len(spawned), dtype=torch.bool)])
 
     def _own(self, params: dict[str, torch.Tensor], means: torch.Tensor, rotations: torch.Tensor) -> Model:
-        """Inverse of `carried`: the own attributes of Gaussians that the nodes carry to `means` by `rotations`."""
+        """Inverse of `carried`: the own attributes of Gaussians that the nodes carry to `means` by `rotations`, with
+        harmonics as they are there."""
         own = {**params, "means": params["means"] - means}
         own["quats"] = quat_product(rotations, params["quats"], inverse_a=True)
-        if self.settings.turned_harmonics:
-            own["shN"] = harmonics_turned(params["shN"], rotations, back=True)
         return Model(own)
 
     def _rest_positions(self, means: torch.Tensor) -> torch.Tensor:

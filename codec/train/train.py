@@ -26,7 +26,7 @@ from .checkpoint import Checkpoint
 from .deformation_graph import Pose
 from .finetune import GroupModel
 from .initialization import initial_model
-from .joint_optimization import finetune
+from .joint_optimization import finetune, views_to_draw
 from .keyframe import train_keyframe
 from .model import Model
 from .settings import TrainSettings
@@ -223,6 +223,7 @@ class _Run:
         f = replace(f, frequencies={n: round(faster * count) for n, count in f.frequencies.items()})
         settings = replace(settings, finetune=f, finetune_steps=round(faster * settings.finetune_steps))
         model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), settings)
+        self.progress.total += views_to_draw(model, settings) - self.settings.finetune_steps * len(frames)
         on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
         finetune(model, self.views, frames, settings, radius=subject.tracker.radius, on_step=on_step)
         return model

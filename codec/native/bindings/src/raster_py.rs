@@ -1,6 +1,7 @@
 //! `_native.Rasterizer`: numpy arrays in, numpy arrays out.
 //!
-//! Parameters are the tuple (means, quats, log_scales, logit_opacities, sh0, shN), f32 and contiguous. Gradients are a tuple
+//! Parameters are the tuple (means, quats, log_scales, logit_opacities, sh0, shN), f32 and contiguous, or with the rotations by
+//! which harmonics are turned behind them. Gradients are a tuple
 //! of the same shapes and (grad2d, max_weight, sum_weight), written in place.
 
 mod arrays;
@@ -9,12 +10,32 @@ mod kernels;
 use arrays::{In, InOut, contiguous, level, usage};
 use numpy::{PyArray1, PyReadonlyArrayDyn, prelude::*};
 use pyo3::prelude::*;
+use pyo3::types::PyTuple;
 use raster::{
     Background, Gradients, Lambdas, Projected, Region, SimdLevel, Splats, Step, StepValue, Surface, TargetImage, View,
 };
 
 type Bytes<'py> = PyReadonlyArrayDyn<'py, u8>;
-type Params<'py> = (In<'py>, In<'py>, In<'py>, In<'py>, In<'py>, In<'py>);
+/// The six arrays of the parameters; and, or not, rotations [N, 4] by which harmonics are turned.
+struct Params<'py> {
+    own: (In<'py>, In<'py>, In<'py>, In<'py>, In<'py>, In<'py>),
+    turns: Option<In<'py>>,
+}
+
+impl<'a, 'py> FromPyObject<'a, 'py> for Params<'py> {
+    type Error = PyErr;
+
+    fn extract(arrays: Borrowed<'a, 'py, PyAny>) -> PyResult<Self> {
+        let all = arrays.cast::<PyTuple>()?;
+        let six = all.get_slice(0, 6);
+        let turns = (all.len() == 7).then(|| all.get_item(6)?.extract()).transpose()?;
+        Ok(Params {
+            own: six.extract()?,
+            turns,
+        })
+    }
+}
+
 type Grads<'py> = (
     (InOut<'py>, InOut<'py>, InOut<'py>, InOut<'py>, InOut<'py>, InOut<'py>),
     (InOut<'py>, InOut<'py>, InOut<'py>),
@@ -29,14 +50,16 @@ type Value = (f64, f64, f64, f64, f64, f64, [f64; 3], [f64; 3]);
 type Picture<'py> = (Bound<'py, PyArray1<f32>>, Bound<'py, PyArray1<f32>>);
 
 fn splats<'a>(p: &'a Params) -> PyResult<Splats<'a>> {
+    let own = &p.own;
     Ok(Splats {
-        means: contiguous(p.0.as_slice())?,
-        quats: contiguous(p.1.as_slice())?,
-        log_scales: contiguous(p.2.as_slice())?,
-        logit_opacities: contiguous(p.3.as_slice())?,
-        sh0: contiguous(p.4.as_slice())?,
-        sh_n: contiguous(p.5.as_slice())?,
-        sh_k: p.5.shape().get(1).copied().unwrap_or(0),
+        means: contiguous(own.0.as_slice())?,
+        quats: contiguous(own.1.as_slice())?,
+        log_scales: contiguous(own.2.as_slice())?,
+        logit_opacities: contiguous(own.3.as_slice())?,
+        sh0: contiguous(own.4.as_slice())?,
+        sh_n: contiguous(own.5.as_slice())?,
+        sh_k: own.5.shape().get(1).copied().unwrap_or(0),
+        turns: p.turns.as_ref().map_or(Ok(&[][..]), |t| contiguous(t.as_slice()))?,
     })
 }
 

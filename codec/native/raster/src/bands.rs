@@ -164,6 +164,7 @@ mod tests {
             sh0: &sh0,
             sh_n: &[],
             sh_k: 0,
+            turns: &[],
         };
         let (view, background) = (view(150, 141), Background::new([0.2, 0.4, 0.6]));
         let mut whole = Rasterizer::new(SimdLevel::best(), 0);
@@ -210,6 +211,7 @@ mod tests {
                 sh0: part(4, 3),
                 sh_n: &[],
                 sh_k: 0,
+                turns: &[],
             };
             let mut project = Rasterizer::new(SimdLevel::best(), 0);
             project.project(&splats, &view).unwrap().to_vec()

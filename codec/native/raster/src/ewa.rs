@@ -167,6 +167,35 @@ pub fn direction<V: Vector>(soa: &Soa, lens: &Lens, at: usize) -> ([V; 3], V) {
     ([d[0] * inv, d[1] * inv, d[2] * inv], inv)
 }
 
+/// A direction as the harmonics see it: turned back where they are turned.
+#[inline(always)]
+pub fn seen<V: Vector>(soa: &Soa, dir: [V; 3], at: usize) -> [V; 3] {
+    if !soa.turned {
+        return dir;
+    }
+    let [w, x, y, z] = load_rows(&soa.turns, at);
+    turn([w, -x, -y, -z], dir)
+}
+
+/// `v`, turned by a unit quaternion.
+#[inline(always)]
+pub fn turn<V: Vector>([w, x, y, z]: [V; 4], v: [V; 3]) -> [V; 3] {
+    let u = [x, y, z];
+    let across = cross(u, v);
+    let once = [across[0] + w * v[0], across[1] + w * v[1], across[2] + w * v[2]];
+    let twice = cross(u, once);
+    std::array::from_fn(|i| v[i] + c::<V>(2.0) * twice[i])
+}
+
+#[inline(always)]
+fn cross<V: Vector>(a: [V; 3], b: [V; 3]) -> [V; 3] {
+    [
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    ]
+}
+
 /// Colour before the clamp at 0.
 #[inline(always)]
 pub fn colour<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize) -> [V; 3] {
@@ -176,7 +205,7 @@ pub fn colour<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize) -> [V; 3] 
     }
     if k > 0 {
         let (dir, _) = direction::<V>(soa, lens, at);
-        let basis = sh::basis(k, dir);
+        let basis = sh::basis(k, seen(soa, dir, at));
         for i in 0..k {
             for ch in 0..3 {
                 rgb[ch] = basis[i].mul_add(V::load(&soa.sh_n[i][ch][at..]), rgb[ch]);

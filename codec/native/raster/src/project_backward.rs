@@ -6,11 +6,11 @@
 use std::ops::Range;
 
 use crate::backward::Sums;
-use crate::ewa::{Ewa, Lens, WHITEN, colour, direction, dot3, ewa};
+use crate::ewa::{Ewa, Lens, WHITEN, colour, direction, dot3, ewa, seen, turn};
 use crate::scene::{Gradients, Splats};
 use crate::sh;
 use crate::simd::{Vector, c, dispatch, prefetch};
-use crate::soa::{CHUNK, Row, Soa, write_columns};
+use crate::soa::{CHUNK, Row, Soa, load_rows, write_columns};
 use crate::tile_binning::TileBins;
 
 /// Gradients of a chunk as rows.
@@ -204,7 +204,8 @@ fn colour_backward<V: Vector>(soa: &Soa, lens: &Lens, k: usize, sums: &[Row; 12]
         return;
     }
     let (dir, inv) = direction::<V>(soa, lens, at);
-    let basis = sh::basis(k, dir);
+    let own = seen(soa, dir, at);
+    let basis = sh::basis(k, own);
     let mut dbasis = [c::<V>(0.0); 15];
     for i in 0..k {
         for ch in 0..3 {
@@ -212,7 +213,10 @@ fn colour_backward<V: Vector>(soa: &Soa, lens: &Lens, k: usize, sums: &[Row; 12]
             dbasis[i] = d[ch].mul_add(V::load(&soa.sh_n[i][ch][at..]), dbasis[i]);
         }
     }
-    let ddir = sh::basis_backward(k, dir, &dbasis);
+    let mut ddir = sh::basis_backward(k, own, &dbasis);
+    if soa.turned {
+        ddir = turn(load_rows(&soa.turns, at), ddir);
+    }
     let along = dot3(ddir, dir);
     for j in 0..3 {
         let mean = V::load(&out.means[j][at..]) + inv * (ddir[j] - dir[j] * along);

@@ -14,6 +14,7 @@ pub struct Splats<'a> {
     pub sh0: &'a [f32],             // [N, 3]
     pub sh_n: &'a [f32],            // [N, K, 3]
     pub sh_k: usize,                // K = 0, 3, 8 or 15
+    pub turns: &'a [f32],           // [N, 4] wxyz, unit, by which harmonics are turned; empty: they are not
 }
 
 impl Splats<'_> {
@@ -47,6 +48,9 @@ impl Splats<'_> {
         check_length("quats", self.quats.len(), 4 * n)?;
         check_length("log_scales", self.log_scales.len(), 3 * n)?;
         check_length("sh0", self.sh0.len(), 3 * n)?;
+        if !self.turns.is_empty() {
+            check_length("turns", self.turns.len(), 4 * n)?;
+        }
         check_length("shN", self.sh_n.len(), 3 * k * n)
     }
 }

@@ -16,6 +16,9 @@ pub struct Soa {
     pub logits: [Row; 1],
     pub sh0: [Row; 3],
     pub sh_n: [[Row; 3]; 15],
+    pub turns: [Row; 4],
+    /// Harmonics are turned.
+    pub turned: bool,
 }
 
 impl Soa {
@@ -28,6 +31,8 @@ impl Soa {
             logits: [z],
             sh0: [z; 3],
             sh_n: [[z; 3]; 15],
+            turns: [z; 4],
+            turned: false,
         }
     }
 
@@ -50,6 +55,10 @@ impl Soa {
                     }
                 }
             }
+        }
+        self.turned = s.sh_k > 0 && !s.turns.is_empty();
+        if self.turned {
+            columns(&mut self.turns, &s.turns[4 * first..4 * (first + n)]);
         }
         n
     }

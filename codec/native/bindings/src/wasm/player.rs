@@ -300,6 +300,7 @@ fn splats(slot: Option<&Option<Slot>>) -> Splats<'_> {
         sh0: &f.sh0,
         sh_n: &f.sh_n,
         sh_k,
+        turns: &[],
     }
 }
 

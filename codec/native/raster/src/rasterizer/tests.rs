@@ -22,6 +22,7 @@ fn draw_at(level: SimdLevel, n: usize, log_scale: f32, size: usize, training: bo
         sh0: &(0..3 * n).map(|i| (i as f32).sin()).collect::<Vec<f32>>(),
         sh_n: &[],
         sh_k: 0,
+        turns: &[],
     };
     let region = Region {
         x: 0,
