@@ -22,7 +22,7 @@ def pytest_sessionfinish(session):
 
 @pytest.fixture(scope="session")
 def gsv(tmp_path_factory) -> Path:
-    """A stream of 5 groups of 6 frames."""
+    """A stream of 5 groups of 6 frames, whose harmonics turn."""
     from playing import FPS, LENGTH, cameras, sequence
     from synthetic import encode_sequence
 
@@ -34,7 +34,7 @@ def gsv(tmp_path_factory) -> Path:
     config = stream_config(
         fps=FPS, sh_degree=1, gaussians=400, frames=LENGTH, cameras=cameras(), background=(0.2, 0.3, 0.5)
     )
-    encode_sequence(s, path, config, EncodeSettings(quality=80))
+    encode_sequence(s, path, config, EncodeSettings(quality=80), turned=True)
     return path
 
 

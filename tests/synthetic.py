@@ -1,5 +1,7 @@
 """Small Gaussian sequences with known motion, for tests."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from gscodec import _native
@@ -92,14 +94,16 @@ def assert_close(a, b, means=1e-6, log_scales=1e-6, angle=1e-5, opacity=1e-6, sh
     np.testing.assert_allclose(b.shN, a.shN, atol=shN)
 
 
-def encode_sequence(sequence, path, config, settings=None, **options):
-    """A dense sequence -> a .gsv file; returns the report. `options` go to StreamOutput (fingerprint)."""
+def encode_sequence(sequence, path, config, settings=None, turned=False, **options):
+    """A dense sequence -> a .gsv file; returns the report. `turned`: its harmonics turn with the nodes, whatever those
+    of the sequence do. `options` go to StreamOutput (fingerprint)."""
     settings = settings or EncodeSettings(50.0)
     groups = sequence.groups
 
     def fitted(done, _):
         quality = 50.0 if settings.quality is None else settings.quality
-        return fit_groups(groups, start=done, random_access=settings.random_access, quality=quality)
+        fitted = fit_groups(groups, start=done, random_access=settings.random_access, quality=quality)
+        return (replace(group, turned_harmonics=turned) for group in fitted)
 
     return encode_groups(fitted, StreamOutput(path, config, **options), settings)
 

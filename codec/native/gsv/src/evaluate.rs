@@ -137,6 +137,12 @@ impl Evaluator {
         self.frame_into(t, &mut frame.as_mut());
     }
 
+    /// The same, but for harmonics (`Parametric::frame_at_rest`).
+    pub fn frame_at_rest(&self, t: u16, frame: &mut Frame) -> Vec<Quat> {
+        frame.resize_as(&self.canonical);
+        self.parametric().frame_at_rest(t, &mut frame.as_mut())
+    }
+
     /// Evaluates frame `t` (clamped to the group) into buffers as long as those of `Frame`.
     pub fn frame_into(&self, t: u16, out: &mut FrameMut) {
         self.parametric().frame_into(t, out);

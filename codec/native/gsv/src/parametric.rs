@@ -177,6 +177,12 @@ pub struct Parametric<'a, V> {
 impl<V: Coefficient> Parametric<'_, V> {
     /// Evaluates frame `t` (clamped to the group) into buffers as long as those of `Frame`.
     pub fn frame_into(&self, t: u16, out: &mut FrameMut) {
+        let turns = self.frame_at_rest(t, out);
+        harmonics::turn(out.sh_n, &turns);
+    }
+
+    /// The same, but for harmonics, which are as at rest: returns the rotations by which they are turned; empty: by none.
+    pub fn frame_at_rest(&self, t: u16, out: &mut FrameMut) -> Vec<Quat> {
         let basis = &basis(self.frames, t.min(self.frames.saturating_sub(1)))[..];
         let rest = self.rest;
         let still = [
@@ -201,12 +207,13 @@ impl<V: Coefficient> Parametric<'_, V> {
                 });
             },
         );
-        if self.turned && self.blend.per > 0 {
+        let mut turns = Vec::new();
+        if self.turned && self.blend.per > 0 && !out.sh_n.is_empty() {
             let by_nodes = |(q, own): (&Quat, &Quat)| multiply(*q, [own[0], -own[1], -own[2], -own[3]]);
-            let turns: Vec<Quat> = out.quats.iter().zip(self.rotations).map(by_nodes).collect();
-            harmonics::turn(out.sh_n, &turns);
+            turns.extend(out.quats.iter().zip(self.rotations).map(by_nodes));
         }
         self.add_residuals(basis, out.means, out.quats);
+        turns
     }
 
     /// Means and quaternions alone, of frame `t`.

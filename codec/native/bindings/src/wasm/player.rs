@@ -7,6 +7,7 @@ use gsv::decode::{Decoding, decode_group, read_header, reference_of};
 use gsv::error::Error;
 use gsv::evaluate::Evaluator;
 use gsv::group::Group;
+use gsv::harmonics;
 use gsv::header::Header;
 use gsv::levels::{LEVELS, Level};
 use gsv::parametric::Frame;
@@ -24,7 +25,16 @@ const SLOTS: usize = 255;
 struct Slot {
     group: Evaluator,
     frame: Frame,
+    turns: Vec<[f32; 4]>,        // by which its harmonics are still to be turned; empty: by none
     at: Option<(u16, Vec<f32>)>, // which frame it is, and its transform
+}
+
+impl Slot {
+    /// Turns the harmonics of the frame, which the rasterizer does for less by itself.
+    fn turn_harmonics(&mut self) {
+        harmonics::turn(&mut self.frame.sh_n, &self.turns);
+        self.turns.clear();
+    }
 }
 
 pub struct Player {
@@ -113,6 +123,7 @@ impl Player {
                 *place = Some(Slot {
                     group: Evaluator::new(group),
                     frame: Frame::default(),
+                    turns: Vec::new(),
                     at: None,
                 });
                 true
@@ -146,26 +157,27 @@ impl Player {
     }
 
     pub fn frame(&mut self, slot: usize, t: u16) -> bool {
-        let Some(Some(Slot { group, frame, at })) = self.groups.get_mut(slot) else {
+        let Some(Some(own)) = self.groups.get_mut(slot) else {
             self.output = b"no group in this slot".to_vec();
             return false;
         };
         self.shown = slot;
         let now = (t, numbers(&self.input));
-        if at.as_ref() == Some(&now) {
+        if own.at.as_ref() == Some(&now) {
             return true;
         }
-        group.frame(t, frame);
-        let visible = group.visible(t).into_iter().flatten();
-        for (logit, shown) in frame.logit_opacities.iter_mut().zip(visible) {
+        own.turns = own.group.frame_at_rest(t, &mut own.frame);
+        let visible = own.group.visible(t).into_iter().flatten();
+        for (logit, shown) in own.frame.logit_opacities.iter_mut().zip(visible) {
             if !shown {
                 *logit = f32::NEG_INFINITY; // the projection leaves it out
             }
         }
         if let Some(transform) = now.1.first_chunk() {
-            place(frame, *transform);
+            own.turn_harmonics();
+            place(&mut own.frame, *transform);
         }
-        *at = Some(now);
+        own.at = Some(now);
         true
     }
 
@@ -193,9 +205,11 @@ impl Player {
     }
 
     pub fn attribute(&mut self, which: usize) {
-        let Some(Some(Slot { frame: f, .. })) = self.groups.get(self.shown) else {
+        let Some(Some(own)) = self.groups.get_mut(self.shown) else {
             return self.output.clear();
         };
+        own.turn_harmonics();
+        let f = &own.frame;
         self.output = floats(match which {
             0 => f.means.as_flattened(),
             1 => f.quats.as_flattened(),
@@ -229,6 +243,9 @@ impl Player {
     }
 
     pub fn pack(&mut self, origin: [f32; 3], all: bool) -> bool {
+        if let Some(Some(own)) = self.groups.get_mut(self.shown) {
+            own.turn_harmonics();
+        }
         let shown = self.groups.get(self.shown);
         self.output.clear();
         let drawn = self.raster.project(&splats(shown), &view(&numbers(&self.input)));
@@ -288,7 +305,10 @@ fn describe_units(before: &[u8], own: &[u8]) -> Result<String, Error> {
 
 /// The frame of a slot; none without one.
 fn splats(slot: Option<&Option<Slot>>) -> Splats<'_> {
-    let Some(Some(Slot { frame: f, group, .. })) = slot else {
+    let Some(Some(Slot {
+        frame: f, group, turns, ..
+    })) = slot
+    else {
         return Splats::default();
     };
     let sh_k = sh_coefficients(group.group().header.sh_degree);
@@ -300,7 +320,7 @@ fn splats(slot: Option<&Option<Slot>>) -> Splats<'_> {
         sh0: &f.sh0,
         sh_n: &f.sh_n,
         sh_k,
-        turns: &[],
+        turns: turns.as_flattened(),
     }
 }
 
