@@ -32,9 +32,11 @@ def train_chart(result: dict):
             axes.set(xlabel=label, ylabel="PSNR of the subject, dB", xscale="log")
             timed = key == "seconds_per_frame"  # other qualities of a training take the same time
             _panel(axes, [e for e in entries if e[key] and not (timed and e["quality"])], key)
+            for full in [e for e in entries if e["recipe"] == "full" and not e[key]]:  # has no size: the line to reach
+                axes.axhline(full["psnr_fg"], color=LOOK["full"][1], linestyle="--", label=LOOK["full"][0])
+                axes.legend(frameon=False, fontsize=7)
         row[0].set_title(capture, loc="left", weight="bold")
-    text = f"test cameras; {stamp(result['entries'])}"
-    figure.text(0.995, 0.995, text, ha="right", va="top", fontsize=7, color="#888888")
+    figure.supxlabel(f"test cameras; {stamp(result['entries'])}", fontsize=7, color="#888888")
     return figure
 
 
