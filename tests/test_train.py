@@ -16,6 +16,7 @@ from gscodec.train.budget import keyframe_budget, with_frame_budget
 from gscodec.train.checkpoint import Checkpoint
 from gscodec.train.ray_jobs import train_segment
 from gscodec.train.settings import train_settings
+from gscodec.train.tracking import Tracker
 from gscodec.train.train import segments, train_groups
 
 
@@ -36,6 +37,22 @@ def test_light_that_comes_on_starts_anew():
     assert second.parents is None
     (alone,) = train_groups(of_frames(lit, lit), settings)
     assert psnr_of(second.frame(1), capture, 6) > psnr_of(alone.frame(1), capture, 6) - 1.0
+
+
+def test_the_first_frame_that_is_fitted_may_lose_more_than_the_next(capture, monkeypatch):
+    """No tracked frame comes near a keyframe's own fit, so that the bound of a cut is none for the first."""
+    advance, losses = Tracker.advance, iter((1.8, 2.9))  # times that of the keyframe; a cut is at 1.5 times the last
+
+    def scripted(self, frame, on_step=None):
+        key = self.loss if frame == 1 else self.loss / 1.8
+        advance(self, frame, on_step)
+        self.loss = key * next(losses)
+        return self.loss
+
+    monkeypatch.setattr(Tracker, "advance", scripted)
+    group = dataclasses.replace(TINY.group, drift_ratio=10.0, cut_loss_floor=0.0)
+    first = next(train_groups(capture, dataclasses.replace(TINY, group=group)))
+    assert (len(first), first.ended) == (2, "cut")
 
 
 def test_larger_pictures_have_longer_keyframes_whose_fit_frames_need_not_reach():
