@@ -208,7 +208,9 @@ impl Player {
         let Some(Some(own)) = self.groups.get_mut(self.shown) else {
             return self.output.clear();
         };
-        own.turn_harmonics();
+        if which > 4 {
+            own.turn_harmonics();
+        }
         let f = &own.frame;
         self.output = floats(match which {
             0 => f.means.as_flattened(),
@@ -243,9 +245,6 @@ impl Player {
     }
 
     pub fn pack(&mut self, origin: [f32; 3], all: bool) -> bool {
-        if let Some(Some(own)) = self.groups.get_mut(self.shown) {
-            own.turn_harmonics();
-        }
         let shown = self.groups.get(self.shown);
         self.output.clear();
         let drawn = self.raster.project(&splats(shown), &view(&numbers(&self.input)));
