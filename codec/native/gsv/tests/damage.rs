@@ -152,7 +152,8 @@ fn later_versions() {
         (3, "reserved flags"),
         (9, "reserved flags"),
         (4, "reserved flags"),
-        (64, "reserved flags"),
+        (65, "reserved flags"), // a predicted group has what its reference has
+        (128, "reserved flags"),
     ] {
         let mut header = header.clone();
         header[2] = flags;
