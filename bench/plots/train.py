@@ -15,6 +15,7 @@ LOOK = {  # recipe -> name, colour
     "v3": ("V3's recipe", "#9a9a9a"),
     "v3-coded": ("V3's recipe and packing", "#555555"),
 }
+BUSY_MOST = 0.5  # cores that other work keeps busy beside a time that is drawn
 SPAN_X, SPAN_Y = 1.6, 0.25  # margin around the points: a factor, dB
 PANELS = {"seconds_per_frame": "training, seconds a frame", "kb_per_frame": "kB a frame"}
 
@@ -30,14 +31,19 @@ def train_chart(result: dict):
         entries = [e for e in shown if e["capture"] == capture]
         for axes, (key, label) in zip(row, PANELS.items(), strict=True):
             axes.set(xlabel=label, ylabel="PSNR of the subject, dB", xscale="log")
-            timed = key == "seconds_per_frame"  # other qualities of a training take the same time
-            _panel(axes, [e for e in entries if e[key] and not (timed and e["quality"])], key)
+            timed = key == "seconds_per_frame"
+            _panel(axes, [e for e in entries if e[key] and not (timed and _time_says_nothing(e))], key)
             for full in [e for e in entries if e["recipe"] == "full" and not e[key]]:  # has no size: the line to reach
                 axes.axhline(full["psnr_fg"], color=LOOK["full"][1], linestyle="--", label=LOOK["full"][0])
                 axes.legend(frameon=False, fontsize=7)
         row[0].set_title(capture, loc="left", weight="bold")
     figure.supxlabel(f"test cameras; {stamp(result['entries'])}", fontsize=7, color="#888888")
     return figure
+
+
+def _time_says_nothing(entry: dict) -> bool:
+    """Whether its time is that of another quality of the same training, or was taken beside other work."""
+    return bool(entry["quality"]) or entry.get("measured", {}).get("busy_beside", 0.0) > BUSY_MOST
 
 
 def _name(entry: dict) -> str:
