@@ -9,7 +9,7 @@ gscodec       the same decoded from the stream, with still_gaussians and still_b
 alone         a keyframe for every frame with the keyframe budget of the preset: the reference for tracking
 alone-coded   the same decoded from our stream, every frame a group of its own
 full          a keyframe for every frame with all the steps and Gaussians that help (FULL): what the pictures allow
-v3            V3's recipe, on lumberjack in the time of our preset medium (baselines/v3.py)
+v3            V3's recipe, with steps for about the time of our preset medium on lumberjack (baselines/v3.py)
 v3-coded      the same through V3's packing (baselines/videogs.py)
 """
 

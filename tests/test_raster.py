@@ -311,6 +311,10 @@ def test_wrong_arguments_are_named():
     params = [getattr(g, k) for k in PARAMETERS]
     with pytest.raises(UsageError, match="quats has 39 values, expected 40"):
         Workspace().forward((params[0], params[1].reshape(-1)[:-1], *params[2:]), cam, BACKGROUND)
+    with pytest.raises(UsageError, match="length 6"):
+        Workspace().forward((*params, params[1], params[1]), cam, BACKGROUND)
+    with pytest.raises(UsageError, match="turns has 30 values, expected 40"):
+        Workspace().forward((*params, params[0]), cam, BACKGROUND)
     with pytest.raises(UsageError, match="region 0x3"):
         Workspace().forward(tuple(params), cam, BACKGROUND, (0, 0, 0, 3))
     with pytest.raises(UsageError, match='simd "neon9" is not available'):

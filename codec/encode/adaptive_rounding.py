@@ -141,20 +141,22 @@ class AdaptiveRounding:
         q = replace(q, integers=replace(q.integers, channels=channels))
         self._quantized = with_rotations(q, self._settings.rdo)
         self._variables.remove(moving[0])
-        vars(self).pop("_before", None)  # decoded anew
+        for name in ("_decoded", "_before"):  # decoded anew; nothing is carried elsewhere
+            vars(self).pop(name, None)
 
     @cached_property
     def _before(self) -> list[tuple[Gaussians, dict[str, np.ndarray]]]:
         """Each frame as decoded with the integers that variables start from, as Gaussians and as coded values;
         harmonics as at rest."""
-        decoded, out = self._decoded(), []
+        out = []
         for t in range(self.frames):
-            g = Gaussians(**decoded.frame(t))
+            g = Gaussians(**self._decoded.frame(t))
             if self._turns is not None:
                 g = replace(g, shN=turned_harmonics(g.shN, self._turns[t], back=True))
             out.append((g, {n: v for n, v in channel_values(g).items() if n in MOVING_OVER_TIME}))
         return out
 
+    @cached_property
     def _decoded(self):
         """The group as decoded with the integers that variables start from."""
         reference = self._reference.decoded if self._reference else None
@@ -165,7 +167,7 @@ class AdaptiveRounding:
         """[T, N, 4] by which harmonics are turned in each frame; None: they are not."""
         q = self._quantized.integers
         turns = q.turned_harmonics and q.nodes is not None and "shN" in q.channels
-        return self._decoded().carried()[1] if turns else None
+        return self._decoded.carried()[1] if turns else None
 
     def _shown(self, g: Gaussians, t: int) -> Gaussians:
         """The same with an opacity that shows nothing, where frame `t` is outside of a lifetime."""

@@ -177,6 +177,8 @@ class GroupCoder:
         lineage = _lineage(group, state)
         if lineage is None or state.frames + len(group) > self.settings.random_access:
             return self._independent(state, group, importance, quality, first_frame)
+        if group.turned_harmonics != state.integers.turned_harmonics:
+            return self._independent(state, group, importance, quality, first_frame)
         reference = ReferenceGroup(state.integers, state.decoded, state.back)
         form = coded_form(group, lineage, state)
         own = importance.with_axes(form.axis_order)
@@ -243,7 +245,7 @@ def _lineage(group: ParametricGroup, state: CoderState | None) -> np.ndarray | N
     Raises:
         CaptureError: two Gaussians have the same parent, or one that is not there.
     """
-    if group.parents is None or state is None or group.turned_harmonics != state.integers.turned_harmonics:
+    if group.parents is None or state is None:
         return None
     before = state.lineage
     parents = checked_parents(group.parents, len(group.canonical), len(before))

@@ -1,8 +1,8 @@
 //! `_native.Rasterizer`: numpy arrays in, numpy arrays out.
 //!
-//! Parameters are the tuple (means, quats, log_scales, logit_opacities, sh0, shN), f32 and contiguous, or with the rotations by
-//! which harmonics are turned behind them. Gradients are a tuple
-//! of the same shapes and (grad2d, max_weight, sum_weight), written in place.
+//! Parameters are the tuple (means, quats, log_scales, logit_opacities, sh0, shN), f32 and contiguous; the rotations by which
+//! harmonics are turned may follow. Gradients are a tuple of the shapes of the six and (grad2d, max_weight, sum_weight), written
+//! in place.
 
 mod arrays;
 mod kernels;
@@ -27,11 +27,13 @@ impl<'a, 'py> FromPyObject<'a, 'py> for Params<'py> {
 
     fn extract(arrays: Borrowed<'a, 'py, PyAny>) -> PyResult<Self> {
         let all = arrays.cast::<PyTuple>()?;
-        let six = all.get_slice(0, 6);
-        let turns = (all.len() == 7).then(|| all.get_item(6)?.extract()).transpose()?;
+        if all.len() != 7 {
+            let own = all.extract()?; // refuses any but six
+            return Ok(Params { own, turns: None });
+        }
         Ok(Params {
-            own: six.extract()?,
-            turns,
+            own: all.get_slice(0, 6).extract()?,
+            turns: Some(all.get_item(6)?.extract()?),
         })
     }
 }

@@ -42,7 +42,8 @@ pub fn group_from(d: &Bound<PyAny>, reference: Option<&Group>) -> PyResult<Group
     header.lifetimes = group.lifetimes.is_some();
     if header.reference > 0 && !reference.is_some_and(|r| same_parameters(&r.header, &header)) {
         return invalid(
-            "a predicted group: expected its reference, with the same grid, steps, offsets, companding, exponents and turned_harmonics"
+            "a predicted group: expected its reference, with the same grid, steps, offsets, companding, exponents and \
+             turned_harmonics"
                 .into(),
         );
     }

@@ -44,7 +44,8 @@ pub struct ParametricEvaluator {
 
 #[pymethods]
 impl ParametricEvaluator {
-    /// `canonical`: means, quats, log_scales, logit_opacities, sh0, shN. `trajectories`: (attribute, [K, C, N]) pairs. `turned`: harmonics turn with the nodes.
+    /// `canonical`: means, quats, log_scales, logit_opacities, sh0, shN. `trajectories`: (attribute, [K, C, N]) pairs.
+    /// `turned`: harmonics turn with the nodes.
     #[new]
     fn new(
         py: Python,
