@@ -1,8 +1,8 @@
 """Benchmarks of the whole pipeline through the command line: a JSON in bench/results per case.
 
-usage: python -m bench.run [statue] [statue40] [splatv] [lumberjack] [demo]
+usage: python -m bench.run [statue] [statue40] [splatv] [demo]
 
-All cases but `demo` need the data folder that the environment variable GSCODEC_DATA names, with lumberjack/,
+All cases but `demo` need the data folder that the environment variable GSCODEC_DATA names, with
 splats/statue.ply and splats/yellow_clip3.splatv; without it they are left out, and a line says so. `demo` also draws
 bench/charts/demo.png.
 """
@@ -80,11 +80,6 @@ def animated(data: Path, folder: Path, frames: int) -> Path:
     return plys
 
 
-def lumberjack(data: Path, folder: Path) -> dict:
-    """The capture: 30 frames, 512 x 512, 20 training cameras."""
-    return measure("lumberjack", existing(data / "lumberjack"), folder)
-
-
 def demo(_: Path | None, folder: Path) -> dict:
     """The bundled example of `make demo`; also draws its picture."""
     source = ROOT / "examples" / "lumberjack"
@@ -105,7 +100,7 @@ def beside(stream: Path, source: Path, frames: tuple[int, ...]) -> np.ndarray:
     return np.hstack(pictures)
 
 
-CASES = {"demo": demo, "statue": statue, "statue40": statue40, "splatv": splatv, "lumberjack": lumberjack}
+CASES = {"demo": demo, "statue": statue, "statue40": statue40, "splatv": splatv}
 
 
 def main() -> None:

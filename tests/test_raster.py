@@ -11,7 +11,7 @@ from gscodec.errors import LimitError, UsageError  # noqa: E402
 from gscodec.model.camera import Camera, look_at  # noqa: E402
 from gscodec.model.gaussians import PARAMETERS, Gaussians  # noqa: E402
 from gscodec.model.rotations import turned_harmonics  # noqa: E402
-from gscodec.render.backend import STATISTICS, TURNS, Crop  # noqa: E402
+from gscodec.render.backend import STATISTICS, TURNS, TargetView  # noqa: E402
 from gscodec.render.cpu import CpuBackend  # noqa: E402
 from gscodec.render.image import render_image, render_rgba  # noqa: E402
 from gscodec.render.reference import image_loss_reference, rasterize_reference  # noqa: E402
@@ -139,8 +139,8 @@ def test_threads_change_no_bit():
     target = np.random.default_rng(0).integers(0, 256, (150, 203, 3), np.uint8)
     results = []
     for threads in (1, 2, 5):
-        crop = Crop(cam, target, target[..., 0], BACKGROUND, ((1, 0.9, 1.1), (0, 0.1, 0)))
-        r = CpuBackend(threads).photometric_loss(params, [crop], mask_lambda=0.1)
+        view = TargetView(cam, target, target[..., 0], BACKGROUND, ((1, 0.9, 1.1), (0, 0.1, 0)))
+        r = CpuBackend(threads).photometric_loss(params, [view], mask_lambda=0.1)
         results.append([r.loss, r.grad_exposure, *r.grads.values(), *(getattr(r, s) for s in STATISTICS)])
     for other in results[1:]:
         for a, b in zip(results[0], other, strict=True):
@@ -172,7 +172,7 @@ def test_poison_is_skipped_or_harmless(simd, values):
     assert np.isfinite(alpha).all()
     assert alpha.min() >= 0
     assert alpha.max() <= 1
-    backend.photometric_loss(params, [Crop(cam, target, None, BACKGROUND)])
+    backend.photometric_loss(params, [TargetView(cam, target, None, BACKGROUND)])
     if not np.isfinite(values).all():  # such Gaussians are dropped whole
         bad = ~np.all([np.isfinite(p.reshape(len(p), -1)).all(1) for p in params.values()], axis=0)
         want, _ = backend.render({n: p[~bad] for n, p in params.items()}, cam, BACKGROUND)
@@ -193,7 +193,7 @@ def test_extreme_scenes():
     for g in (on_one_tile, filling, behind, nothing, flat):
         params = {k: getattr(g, k) for k in PARAMETERS}
         target = np.full((cam.height, cam.width, 3), 128, np.uint8)
-        r = backend.photometric_loss(params, [Crop(cam, target, None, BACKGROUND)])
+        r = backend.photometric_loss(params, [TargetView(cam, target, None, BACKGROUND)])
         assert np.isfinite(r.loss)
         assert all(np.isfinite(v).all() for v in r.grads.values())
     assert (render_image(behind, cam, (0.5, 0.5, 0.5)) == 128).all()
@@ -204,7 +204,6 @@ def test_step_is_the_sum_of_its_parts():
     rng = np.random.default_rng(2)
     rgb = rng.integers(0, 256, (cam.height, cam.width, 3), np.uint8)
     mask = rng.integers(0, 256, (cam.height, cam.width), np.uint8)
-    weight = rng.random((cam.height, cam.width), np.float32)
     params = scene(k=3)
     gain = torch.tensor([1.1, 0.9, 1.0], dtype=torch.float64, requires_grad=True)
     offset = torch.tensor([0.05, -0.02, 0.0], dtype=torch.float64)
@@ -213,49 +212,40 @@ def test_step_is_the_sum_of_its_parts():
     image = gain * black + (1 - alpha)[..., None] * (background - offset)  # less the offset, as the target
     a = torch.from_numpy(mask) / 255.0
     target = torch.from_numpy(rgb) / 255.0 * a[..., None] + (1 - a)[..., None] * background - offset
-    loss = image_loss_reference(image, target, ssim_lambda, torch.from_numpy(weight).double())
+    loss = image_loss_reference(image, target, ssim_lambda)
     loss = loss + mask_lambda * (alpha - a).abs().mean()
     want = torch.autograd.grad(loss, [*params, gain])
     named = {k: p.detach().float() for k, p in zip(PARAMETERS, params, strict=True)}
-    crop = Crop(cam, rgb, mask, BACKGROUND, (gain.tolist(), offset.tolist()), weight)
-    r = CpuBackend().photometric_loss(named, [crop], ssim_lambda=ssim_lambda, mask_lambda=mask_lambda)
+    view = TargetView(cam, rgb, mask, BACKGROUND, (gain.tolist(), offset.tolist()))
+    r = CpuBackend().photometric_loss(named, [view], ssim_lambda=ssim_lambda, mask_lambda=mask_lambda)
     assert r.loss == pytest.approx(loss.item(), rel=1e-5)
     for w, (name, g) in zip(want, r.grads.items(), strict=False):
         assert (g - w).norm() <= 1e-3 * w.norm(), name
     np.testing.assert_allclose(r.grad_exposure[0, 0], want[-1].numpy(), rtol=1e-4)
 
 
-def test_region_is_a_crop():
-    cam, g = camera(203, 150), dense()
-    params = {k: getattr(g, k) for k in PARAMETERS}
-    whole, _ = CpuBackend().render(params, cam, BACKGROUND)
-    part, _ = CpuBackend().render(params, cam, BACKGROUND, (37, 21, 90, 70))
-    np.testing.assert_allclose(part, whole[21:91, 37:127], atol=2e-5)
-
-
-def test_batch_of_crops_is_the_sum_of_its_crops():
+def test_batch_is_the_sum_of_its_views():
     cam, g = camera(), dense(300)
     params = {k: getattr(g, k) for k in PARAMETERS}
     rng = np.random.default_rng(1)
     rgb = rng.integers(0, 256, (cam.height, cam.width, 3), np.uint8)
     other = replace(cam, viewmat=cam.viewmat @ np.diag([-1.0, 1.0, -1.0, 1.0]))
-    crops = [
-        Crop(cam, rgb, region=(5, 3, 20, 17)),
-        Crop(cam, rgb, None, BACKGROUND, ((1.1, 0.9, 1.0), (0, 0, 0))),
-        Crop(other, rgb),
+    views = [
+        TargetView(cam, rgb, 255 - rgb[..., 0], BACKGROUND),
+        TargetView(cam, rgb, None, BACKGROUND, ((1.1, 0.9, 1.0), (0, 0, 0))),
+        TargetView(other, rgb),
     ]
-    batch = CpuBackend().photometric_loss(params, crops)
-    single = [CpuBackend().photometric_loss(params, [crop]) for crop in crops]
+    batch = CpuBackend().photometric_loss(params, views)
+    single = [CpuBackend().photometric_loss(params, [view]) for view in views]
     assert batch.loss == pytest.approx(sum(s.loss for s in single))
     for name in PARAMETERS:
         total = sum(np.asarray(s.grads[name], np.float64) for s in single)
         assert np.abs(total).max() > 0
         np.testing.assert_allclose(batch.grads[name], total, rtol=1e-5, atol=1e-6 * np.abs(total).max())
-    np.testing.assert_allclose(batch.sum_weight, sum(s.sum_weight for s in single), rtol=1e-5)
     for name in ("max_weight", "radii"):
         np.testing.assert_array_equal(getattr(batch, name), np.max([getattr(s, name) for s in single], 0))
     np.testing.assert_array_equal(batch.grad_exposure, [s.grad_exposure[0] for s in single])
-    with pytest.raises(UsageError, match="at least one crop"):
+    with pytest.raises(UsageError, match="at least one view"):
         CpuBackend().photometric_loss(params, [])
 
 
@@ -289,9 +279,8 @@ def test_turned_harmonics_are_seen_as_if_their_coefficients_were_turned():
 def test_statistics():
     cam, params = camera(), {n: p.detach().float() for n, p in zip(PARAMETERS, scene(), strict=True)}
     black = np.zeros((cam.height, cam.width, 3), np.uint8)
-    found = CpuBackend().photometric_loss(params, [Crop(cam, black)], ssim_lambda=0.0)  # its gradient: 1 / pixels
+    found = CpuBackend().photometric_loss(params, [TargetView(cam, black)], ssim_lambda=0.0)  # its gradient: 1 / pixels
     _, _, want = rasterize_reference(*scene(), cam)
-    torch.testing.assert_close(torch.from_numpy(found.sum_weight), want.float(), rtol=1e-4, atol=1e-4)
     assert ((found.max_weight > 0) == (want > 0).numpy()).all()
     assert (found.max_weight <= 0.999).all()
     assert (found.grad2d[want > 0] > 0).all()
@@ -315,8 +304,8 @@ def test_wrong_arguments_are_named():
         Workspace().forward((*params, params[1], params[1]), cam, BACKGROUND)
     with pytest.raises(UsageError, match="turns has 30 values, expected 40"):
         Workspace().forward((*params, params[0]), cam, BACKGROUND)
-    with pytest.raises(UsageError, match="region 0x3"):
-        Workspace().forward(tuple(params), cam, BACKGROUND, (0, 0, 0, 3))
+    with pytest.raises(UsageError, match="an image of 0 x 3 pixels is empty"):
+        render_image(g, Camera("c", cam.K, cam.viewmat, 0, 3))
     with pytest.raises(UsageError, match='simd "neon9" is not available'):
         Workspace(simd="neon9")
     with pytest.raises(LimitError, match="more than 16384 pixels on a side"):

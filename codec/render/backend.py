@@ -13,9 +13,8 @@ import numpy as np
 
 from ..model.camera import Camera
 
-STATISTICS = ("grad2d", "max_weight", "sum_weight")
+STATISTICS = ("grad2d", "max_weight")
 
-Region = tuple[int, int, int, int]  # x, y, width, height in pixels
 TURNS = "turns"  # rotations [N, 4] wxyz by which shN is turned
 Params = Mapping[str, np.ndarray]  # PARAMETERS -> numpy arrays or torch CPU tensors, f32, contiguous; or TURNS, too
 PixelGradient = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -23,19 +22,17 @@ PendingLoss = Callable[[], "RenderLoss"]
 
 
 @dataclass(frozen=True)
-class Crop:
-    """A view, or a part of one, and its target image.
+class TargetView:
+    """A view and its target image.
 
     Attributes:
-        camera: pinhole camera of the whole image.
-        target_rgb: [h, w, 3] u8, unassociated colour, of the region.
-        target_alpha: [h, w] u8; the target is composited on `background` with it. None: opaque, and no mask term.
+        camera: pinhole camera.
+        target_rgb: [H, W, 3] u8, unassociated colour.
+        target_alpha: [H, W] u8; the target is composited on `background` with it. None: opaque, and no mask term.
         background: 3 floats in [0, 1]; a random one in each step where there are masks.
         exposure: gain and offset of this camera, 3 floats each, of the light of the Gaussians and not of the
             background.
-        weight: [h, w] f32, weights of pixels in the image loss (a weighted mean).
-        target_depth: [h, w] f32, world units along the optical axis, 0 where it is unknown. None: no depth term.
-        region: part of the image that is rendered; None: all of it.
+        target_depth: [H, W] f32, world units along the optical axis, 0 where it is unknown. None: no depth term.
     """
 
     camera: Camera
@@ -43,31 +40,25 @@ class Crop:
     target_alpha: np.ndarray | None = None
     background: Sequence[float] = (0.0, 0.0, 0.0)
     exposure: tuple[Sequence[float], Sequence[float]] | None = None
-    weight: np.ndarray | None = None
     target_depth: np.ndarray | None = None
-    region: Region | None = None
-
-    def part(self) -> Region:
-        """The region; all of the image if none is given."""
-        return self.region or (0, 0, self.camera.width, self.camera.height)
 
 
 @dataclass(frozen=True)
 class RenderLoss:
-    """Loss of a batch of crops and its gradients. Arrays belong to the backend; its next call overwrites them.
+    """Loss of a batch of views and its gradients. Arrays belong to the backend; its next call overwrites them.
 
     Attributes:
-        loss: image_loss + mask_lambda * mask + depth_lambda * depth, summed over the crops.
-        image_loss: (1 - ssim_lambda) * l1 + ssim_lambda * (1 - ssim), summed over the crops.
-        l1, mse, ssim, mask, depth: the terms; means over pixels (and channels) and crops. psnr = -10 log10(mse). The
+        loss: image_loss + mask_lambda * mask + depth_lambda * depth, summed over the views.
+        image_loss: (1 - ssim_lambda) * l1 + ssim_lambda * (1 - ssim), summed over the views.
+        l1, mse, ssim, mask, depth: the terms; means over pixels (and channels) and views. psnr = -10 log10(mse). The
             depth term is |sum of weights * (depth - target)| / target, 0 where the target is unknown.
-        pixels: of all crops together.
+        pixels: of all views together.
         grads: by parameter name, in the shapes of the parameters; tensors where the parameter was a tensor.
         grad2d: [N] f32, norm of the gradient by the projected mean in units of half the image (the densification
-            measure of 3D Gaussian Splatting), summed over the crops.
-        max_weight, sum_weight: [N] f32, largest and summed blending weight alpha * transmittance.
-        radii: [N] f32, pixels, largest over the crops; 0 for a Gaussian that is not visible.
-        grad_exposure: [crops, 2, 3] f64, gradient by the gain and the offset of each.
+            measure of 3D Gaussian Splatting), summed over the views.
+        max_weight: [N] f32, largest blending weight alpha * transmittance.
+        radii: [N] f32, pixels, largest over the views; 0 for a Gaussian that is not visible.
+        grad_exposure: [views, 2, 3] f64, gradient by the gain and the offset of each.
     """
 
     loss: float
@@ -81,7 +72,6 @@ class RenderLoss:
     grads: dict
     grad2d: np.ndarray
     max_weight: np.ndarray
-    sum_weight: np.ndarray
     radii: np.ndarray
     grad_exposure: np.ndarray
 
@@ -90,22 +80,32 @@ class Backend(Protocol):
     """Rendering with gradients, and the optimiser step. All methods raise UsageError where shapes disagree or a camera
     has distortion, and LimitError where there are too many Gaussians or pixels."""
 
-    def render(
-        self, params: Params, camera: Camera, background: Sequence[float], region: Region | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Image [h, w, 3] f32 over `background` and alpha [h, w] f32 of the region (None: all of the image)."""
+    def render(self, params: Params, camera: Camera, background: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+        """Image [H, W, 3] f32 over `background` and alpha [H, W] f32."""
 
     def render_depth(self, params: Params, camera: Camera) -> np.ndarray:
         """[H, W] f32 expected depth along the optical axis, world units, as blending weighs it; 0 where nothing is
         drawn."""
 
     def photometric_loss(
-        self, params: Params, crops: Sequence[Crop], *, ssim_lambda: float, mask_lambda: float, depth_lambda: float
+        self,
+        params: Params,
+        views: Sequence[TargetView],
+        *,
+        ssim_lambda: float,
+        mask_lambda: float,
+        depth_lambda: float,
     ) -> RenderLoss:
-        """Loss of Gaussians against the targets of `crops`, and its gradients."""
+        """Loss of Gaussians against the targets of `views`, and its gradients."""
 
     def start_photometric_loss(
-        self, params: Params, crops: Sequence[Crop], *, ssim_lambda: float, mask_lambda: float, depth_lambda: float
+        self,
+        params: Params,
+        views: Sequence[TargetView],
+        *,
+        ssim_lambda: float,
+        mask_lambda: float,
+        depth_lambda: float,
     ) -> PendingLoss:
         """Starts `photometric_loss` of the Gaussians as they are now, beside the caller.
 

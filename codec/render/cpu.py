@@ -14,7 +14,7 @@ from .. import _native
 from ..errors import UsageError
 from ..model.camera import Camera
 from ..model.gaussians import PARAMETERS
-from .backend import STATISTICS, TURNS, Crop, Params, PendingLoss, PixelGradient, Region, RenderLoss
+from .backend import STATISTICS, TURNS, Params, PendingLoss, PixelGradient, RenderLoss, TargetView
 from .workspace import Workspace, call, host_array, rgb, view
 
 
@@ -33,11 +33,9 @@ class CpuBackend:
         self.workspace = Workspace(threads, simd)
         self._worker = ThreadPoolExecutor(1, "render")
 
-    def render(
-        self, params: Params, camera: Camera, background: Sequence[float], region: Region | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def render(self, params: Params, camera: Camera, background: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         """As of `Backend`."""
-        return self.workspace.forward(_arrays(params), camera, background, region)
+        return self.workspace.forward(_arrays(params), camera, background)
 
     def render_depth(self, params: Params, camera: Camera) -> np.ndarray:
         """As of `Backend`."""
@@ -46,7 +44,7 @@ class CpuBackend:
     def photometric_loss(
         self,
         params: Params,
-        crops: Sequence[Crop],
+        views: Sequence[TargetView],
         *,
         ssim_lambda: float = 0.2,
         mask_lambda: float = 0.0,
@@ -55,14 +53,14 @@ class CpuBackend:
         """As of `Backend`.
 
         Raises:
-            UsageError: shapes disagree, a camera has distortion, or there are no crops.
+            UsageError: shapes disagree, a camera has distortion, or there are no views.
         """
-        return self._photometric_loss(params, _arrays(params), crops, (ssim_lambda, mask_lambda, depth_lambda))
+        return self._photometric_loss(params, _arrays(params), views, (ssim_lambda, mask_lambda, depth_lambda))
 
     def start_photometric_loss(
         self,
         params: Params,
-        crops: Sequence[Crop],
+        views: Sequence[TargetView],
         *,
         ssim_lambda: float = 0.2,
         mask_lambda: float = 0.0,
@@ -70,17 +68,17 @@ class CpuBackend:
     ) -> PendingLoss:
         """As of `Backend`."""
         arrays, lambdas = tuple(a.copy() for a in _arrays(params)), (ssim_lambda, mask_lambda, depth_lambda)
-        return self._worker.submit(self._photometric_loss, params, arrays, crops, lambdas).result
+        return self._worker.submit(self._photometric_loss, params, arrays, views, lambdas).result
 
     def _photometric_loss(
-        self, params: Params, arrays: tuple[np.ndarray, ...], crops: Sequence[Crop], lambdas: tuple[float, ...]
+        self, params: Params, arrays: tuple[np.ndarray, ...], views: Sequence[TargetView], lambdas: tuple[float, ...]
     ) -> RenderLoss:
         """`photometric_loss` of the `arrays`; `params`: what the gradients look like. `lambdas`: of SSIM, mask and
         depth."""
-        if not crops:
-            raise UsageError("a batch has at least one crop, got none")
+        if not views:
+            raise UsageError("a batch has at least one view, got none")
         grads, statistics = self.workspace.gradients(arrays)
-        step, native = self.workspace.native.step, [_native_crop(crop) for crop in crops]
+        step, native = self.workspace.native.step, [_native_view(v) for v in views]
         values, radii = call(step, arrays, native, lambdas, (grads, statistics))
         losses, exposure = np.array([v[:6] for v in values]), np.array([v[6:] for v in values])
         loss, means = float(losses[:, 0].sum()), losses[:, 1:].mean(0).tolist()
@@ -89,7 +87,7 @@ class CpuBackend:
             loss,
             loss - others,
             *means,
-            pixels=sum(crop.part()[2] * crop.part()[3] for crop in crops),
+            pixels=sum(v.camera.width * v.camera.height for v in views),
             grads={k: _like(g, params[k]) for k, g in zip(PARAMETERS, grads, strict=True)},
             radii=radii,
             grad_exposure=exposure,
@@ -149,12 +147,12 @@ def _arrays(params: Params) -> tuple[np.ndarray, ...]:
     return tuple(np.ascontiguousarray(host_array(params[name]), np.float32) for name in names)
 
 
-def _native_crop(crop: Crop) -> tuple:
-    """A crop as the native side takes it."""
-    target = (crop.target_rgb, crop.target_alpha, crop.weight, crop.target_depth)
+def _native_view(v: TargetView) -> tuple:
+    """A view and its target as the native side takes it."""
+    target = (v.target_rgb, v.target_alpha, v.target_depth)
     return (
-        view(crop.camera, crop.part()),
-        (rgb(crop.background), None if crop.exposure is None else tuple(map(rgb, crop.exposure))),
+        view(v.camera),
+        (rgb(v.background), None if v.exposure is None else tuple(map(rgb, v.exposure))),
         tuple(None if t is None else np.ascontiguousarray(t) for t in target),
     )
 

@@ -120,9 +120,6 @@ def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     return s[:, 0].permute(1, 2, 0)
 
 
-def image_loss_reference(image, target, ssim_lambda=0.2, weight=None) -> torch.Tensor:
-    """Image loss of training, (1 - ssim_lambda) L1 + ssim_lambda (1 - SSIM); `weight` [H, W]: a weighted mean."""
-    value = (1 - ssim_lambda) * (image - target).abs() + ssim_lambda * (1 - ssim_map(image, target))
-    if weight is None:
-        return value.mean()
-    return (value * weight[..., None]).sum() / (3 * weight.sum())
+def image_loss_reference(image, target, ssim_lambda=0.2) -> torch.Tensor:
+    """Image loss of training, (1 - ssim_lambda) L1 + ssim_lambda (1 - SSIM)."""
+    return ((1 - ssim_lambda) * (image - target).abs() + ssim_lambda * (1 - ssim_map(image, target))).mean()

@@ -11,7 +11,7 @@ from .. import _native
 from ..errors import LimitError, UsageError
 from ..model.camera import Camera
 from ..model.gaussians import PARAMETERS
-from .backend import STATISTICS, Region
+from .backend import STATISTICS
 
 
 def simd_levels() -> list[str]:
@@ -51,29 +51,27 @@ class Workspace:
         """Milliseconds of the last passes: project, bin, blend, loss, backward_tiles, backward_project."""
         return dict(self.native.timings())
 
-    def forward(self, params, camera: Camera, background, region: Region | None = None, training: bool = False):
+    def forward(self, params, camera: Camera, background, training: bool = False):
         """Renders `params`, the six arrays in the order of PARAMETERS, and TURNS behind them or not.
 
         Returns:
-            image [H, W, 3] f32 and alpha [H, W] f32 of the region, new arrays.
+            image [H, W, 3] f32 and alpha [H, W] f32, new arrays.
         """
-        region = region or (0, 0, camera.width, camera.height)
-        image, alpha = call(self.native.forward, params, view(camera, region), rgb(background), training)
-        return image.reshape(region[3], region[2], 3), alpha.reshape(region[3], region[2])
+        image, alpha = call(self.native.forward, params, view(camera), rgb(background), training)
+        return image.reshape(camera.height, camera.width, 3), alpha.reshape(camera.height, camera.width)
 
     def depth(self, params, camera: Camera) -> np.ndarray:
         """[H, W] f32 expected depth of `params` along the optical axis, world units; 0 where nothing is drawn."""
-        total, alpha = call(self.native.depth, params, view(camera, (0, 0, camera.width, camera.height)))
+        total, alpha = call(self.native.depth, params, view(camera))
         return (total / np.maximum(alpha, 1e-6)).reshape(camera.height, camera.width)
 
     def draw(self, params, camera: Camera, background) -> np.ndarray:
         """Renders `params`; returns [H, W, 3] uint8, rounded."""
-        whole = (0, 0, camera.width, camera.height)
-        flat = call(self.native.draw, params, view(camera, whole), rgb(background))
+        flat = call(self.native.draw, params, view(camera), rgb(background))
         return flat.reshape(camera.height, camera.width, 3)
 
     def gradients(self, params) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-        """Arrays in the shapes of `params`, without TURNS, and three statistics [N]; every second call gives the same
+        """Arrays in the shapes of `params`, without TURNS, and two statistics [N]; every second call gives the same
         ones while the shapes stay, so that those of the step before can still be read."""
         self._grads = self._grads[::-1]
         grads = self._grads[0]
@@ -86,8 +84,8 @@ class Workspace:
         return tuple(grads[k] for k in PARAMETERS), tuple(grads[k] for k in STATISTICS)
 
 
-def view(camera: Camera, region: Region) -> dict:
-    """Camera and region as the native side takes them.
+def view(camera: Camera) -> dict:
+    """A camera as the native side takes them.
 
     Raises:
         UsageError: the camera has distortion or skew.
@@ -102,7 +100,6 @@ def view(camera: Camera, region: Region) -> dict:
         "intrinsics": [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
         "viewmat": m[:3].tolist(),
         "near": float(camera.near),
-        "region": [int(v) for v in region],
     }
 
 

@@ -55,7 +55,7 @@ def sweep(
             neighbours = _neighbours(cameras, i, s)
             normals += world_normals(cameras, s.upright_planes)
         near.append(neighbours)
-        depths.append(_depth(cameras, greys, where[i], i, neighbours, _facing(camera, normals), inverse, s))
+        depths.append(_depth(cameras, greys, where[i], i, neighbours, normals, inverse, s))
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for i, camera in enumerate(cameras):
         y, x = np.nonzero(depths[i])
@@ -180,65 +180,75 @@ class _Best:
             return 1 / (self._at + vertex.clip(-0.5, 0.5) * self._step)
 
 
-def _depth(
-    cameras,
-    greys,
-    where: np.ndarray,
-    i: int,
-    near: list[int],
-    directions: list[np.ndarray],
-    inverse: np.ndarray,
-    settings: PlaneSweepSettings,
-) -> np.ndarray:
-    """Depth of view `i`, [H, W], 0 where it is unknown.
+class _Part:
+    """The part of a view whose depth is searched.
 
-    Args:
-        where: [H, W] bool, pixels whose depth is searched.
-        near: indices of the neighbours.
-        directions: normals [3] of the planes in the axes of the camera.
-        inverse: [P], 1 / distance of the planes of each direction.
+    Attributes:
+        camera, grey: of this part.
+        deviation: [H, W], contrast of the window around each pixel.
+        rays: [H, W, 3], at unit depth.
     """
-    import cv2
 
+    def __init__(self, camera, grey: np.ndarray, settings: PlaneSweepSettings):
+        self.camera, self.grey, self._settings = camera, grey, settings
+        self._mean, self.deviation = _windows(grey, settings.window)
+        y, x = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
+        self.rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.K).T
+        self._slant = settings.slant_cosine_min * np.linalg.norm(self.rays, axis=2)
+
+    def depth(self, neighbours: list[tuple], directions: list[np.ndarray], inverse: np.ndarray) -> np.ndarray:
+        """[H, W], 0 where it is unknown.
+
+        Args:
+            neighbours: (camera, grey) of each.
+            directions: normals [3] of the planes in the axes of the camera.
+            inverse: [P], 1 / distance of the planes of each direction.
+        """
+        s, best = self._settings, _Best(self.grey.shape, self._settings.other_depth)
+        for direction in directions:
+            best.start()
+            along = self.rays @ direction
+            for d in inverse:
+                faces = (along > self._slant) & (d * along * self.camera.near < 1)
+                if np.count_nonzero(faces) >= s.window**2:
+                    scores = np.stack([self._correlation(*n, d * direction, faces) for n in neighbours])
+                    score = np.sort(scores, 0)[-s.scored_neighbours :].mean(0)
+                    best.add(score, d * along, (inverse[1] - inverse[0]) * along)
+        depth = best.depth()
+        unsure = (best.score < s.correlation_min) | (best.score - best.second < s.unique_min)
+        depth[unsure | (self.deviation < s.contrast_min)] = 0
+        return depth
+
+    def _correlation(self, other, grey: np.ndarray, plane: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """With the picture `grey` of the camera `other` by way of a plane n . x = 1, [H, W]; -1 where it does not see
+        the plane."""
+        import cv2
+
+        ray_map, size = _ray_map(self.camera, other, plane), (self._settings.window, self._settings.window)
+        H, flags = _homography(self.camera, other, ray_map), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        seen = cv2.warpPerspective(grey, H, self.grey.shape[::-1], flags=flags, borderValue=-1)
+        inside = (seen >= 0) & faces & (self.rays @ ray_map[2] > 0)
+        if not inside.any():
+            return np.full(self.grey.shape, -1, np.float32)
+        mean, deviation = _windows(seen, self._settings.window)
+        score = cv2.blur(self.grey * seen, size) - self._mean * mean
+        score /= self.deviation * np.maximum(deviation, self._settings.contrast_min)
+        score[~inside] = -1
+        return score
+
+
+def _depth(
+    cameras, greys, where: np.ndarray, i: int, near: list[int], normals: list[np.ndarray], inverse: np.ndarray, settings
+) -> np.ndarray:
+    """Depth of view `i` on the pixels `where` [H, W] bool, 0 where it is unknown, by its neighbours `near` over planes
+    of the `normals` at 1 / `inverse`."""
     whole = np.zeros(greys[i].shape, np.float32)
     rows, cols = np.flatnonzero(where.any(1)), np.flatnonzero(where.any(0))
     if not near or not len(rows):
         return whole
     top, bottom, left, right = rows[0], rows[-1] + 1, cols[0], cols[-1] + 1
-    part = (slice(top, bottom), slice(left, right))
-    camera, grey = cameras[i].cropped(left, top, right - left, bottom - top), greys[i][part]
-    mean, deviation = _windows(grey, settings.window)
-    best = _Best(grey.shape, settings.other_depth)
-    y, x = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
-    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.K).T
-    slant = settings.slant_cosine_min * np.linalg.norm(rays, axis=2)
-
-    def correlation(j: int, plane: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """With neighbour `j` by way of a plane n . x = 1, [H, W]; -1 where it does not see the plane."""
-        ray_map, size = _ray_map(camera, cameras[j], plane), (settings.window, settings.window)
-        H, flags = _homography(camera, cameras[j], ray_map), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        seen = cv2.warpPerspective(greys[j], H, grey.shape[::-1], flags=flags, borderValue=-1)
-        inside = (seen >= 0) & faces & (rays @ ray_map[2] > 0)
-        if not inside.any():
-            return np.full(grey.shape, -1, np.float32)
-        mean_seen, deviation_seen = _windows(seen, settings.window)
-        score = cv2.blur(grey * seen, size) - mean * mean_seen
-        score /= deviation * np.maximum(deviation_seen, settings.contrast_min)
-        score[~inside] = -1
-        return score
-
-    for direction in directions:
-        best.start()
-        along = rays @ direction
-        for d in inverse:
-            faces = (along > slant) & (d * along * camera.near < 1)
-            if np.count_nonzero(faces) < settings.window**2:
-                continue
-            scores = np.stack([correlation(j, d * direction, faces) for j in near])
-            score = np.sort(scores, 0)[-settings.scored_neighbours :].mean(0)
-            best.add(score, d * along, (inverse[1] - inverse[0]) * along)
-    depth = best.depth()
-    unsure = (best.score < settings.correlation_min) | (best.score - best.second < settings.unique_min)
-    depth[unsure | (deviation < settings.contrast_min) | ~where[part]] = 0
-    whole[part] = depth
+    box = (slice(top, bottom), slice(left, right))
+    part = _Part(cameras[i].cropped(left, top, right - left, bottom - top), greys[i][box], settings)
+    depth = part.depth([(cameras[j], greys[j]) for j in near], _facing(part.camera, normals), inverse)
+    whole[box] = np.where(where[box], depth, 0)
     return whole

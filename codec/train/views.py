@@ -19,7 +19,7 @@ from ..capture.epipolar import epipolar_error
 from ..errors import CaptureError
 from ..model.camera import Calibration, Camera, working_distance
 from ..model.gaussians import Gaussians
-from ..render.backend import Backend, Crop, PendingLoss, RenderLoss
+from ..render.backend import Backend, PendingLoss, RenderLoss, TargetView
 from ..render.sensitivity import params_of
 from .calibration import Exposure, Extrinsics
 from .settings import TrainSettings
@@ -199,9 +199,9 @@ def shrink(target: Target, scale: float) -> Target:
     )
 
 
-def _crop(target: Target, rng: np.random.Generator) -> Crop:
+def _target_view(target: Target, rng: np.random.Generator) -> TargetView:
     background = GREY if target.opaque else tuple(rng.uniform(0, 1, 3))
-    return Crop(target.camera, target.rgb, target.alpha, background, target.exposure, target_depth=target.depth)
+    return TargetView(target.camera, target.rgb, target.alpha, background, target.exposure, target.depth)
 
 
 def photometric_loss(
@@ -209,7 +209,7 @@ def photometric_loss(
 ) -> RenderLoss:
     """Loss of Gaussians against one target (`Backend.photometric_loss`). Behind a target with alpha the background is
     random: with a known one, Gaussians in its colour could stand for transparency. An opaque one is to be covered."""
-    return backend.photometric_loss(params, [_crop(target, rng)], **_lambdas(settings))
+    return backend.photometric_loss(params, [_target_view(target, rng)], **_lambdas(settings))
 
 
 def start_photometric_loss(
@@ -217,8 +217,8 @@ def start_photometric_loss(
 ) -> PendingLoss:
     """`photometric_loss` of Gaussians as they are now against all `targets`, summed, beside the caller
     (`Backend.start_photometric_loss`)."""
-    crops = [_crop(t, rng) for t in targets]
-    return backend.start_photometric_loss(params, crops, **_lambdas(settings))
+    views = [_target_view(t, rng) for t in targets]
+    return backend.start_photometric_loss(params, views, **_lambdas(settings))
 
 
 def _lambdas(settings: TrainSettings) -> dict[str, float]:

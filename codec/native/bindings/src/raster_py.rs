@@ -1,7 +1,7 @@
 //! `_native.Rasterizer`: numpy arrays in, numpy arrays out.
 //!
 //! Parameters are the tuple (means, quats, log_scales, logit_opacities, sh0, shN), f32 and contiguous; the rotations by which
-//! harmonics are turned may follow. Gradients are a tuple of the shapes of the six and (grad2d, max_weight, sum_weight), written
+//! harmonics are turned may follow. Gradients are a tuple of the shapes of the six and (grad2d, max_weight), written
 //! in place.
 
 mod arrays;
@@ -12,7 +12,7 @@ use numpy::{PyArray1, PyReadonlyArrayDyn, prelude::*};
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 use raster::{
-    Background, Gradients, Lambdas, Projected, Region, SimdLevel, Splats, Step, StepValue, Surface, TargetImage, View,
+    Background, Gradients, Lambdas, Projected, SimdLevel, Size, Splats, Step, StepValue, Surface, TargetImage, View,
 };
 
 type Bytes<'py> = PyReadonlyArrayDyn<'py, u8>;
@@ -40,12 +40,12 @@ impl<'a, 'py> FromPyObject<'a, 'py> for Params<'py> {
 
 type Grads<'py> = (
     (InOut<'py>, InOut<'py>, InOut<'py>, InOut<'py>, InOut<'py>, InOut<'py>),
-    (InOut<'py>, InOut<'py>, InOut<'py>),
+    (InOut<'py>, InOut<'py>),
 );
-type Crop<'py> = (
+type TargetView<'py> = (
     ViewArgs,
     ([f32; 3], Option<([f32; 3], [f32; 3])>),
-    (Bytes<'py>, Option<Bytes<'py>>, Option<In<'py>>, Option<In<'py>>),
+    (Bytes<'py>, Option<Bytes<'py>>, Option<In<'py>>),
 );
 type Value = (f64, f64, f64, f64, f64, f64, [f64; 3], [f64; 3]);
 /// (image, alpha), flat
@@ -77,11 +77,10 @@ fn gradients<'a>(g: &'a mut Grads) -> PyResult<Gradients<'a>> {
         sh_n: contiguous(params.5.as_slice_mut())?,
         grad2d: contiguous(stats.0.as_slice_mut())?,
         max_weight: contiguous(stats.1.as_slice_mut())?,
-        sum_weight: contiguous(stats.2.as_slice_mut())?,
     })
 }
 
-/// size, (fx, fy, cx, cy), rows of the world-to-camera matrix, near plane and the region (x, y, width, height).
+/// size, (fx, fy, cx, cy), rows of the world-to-camera matrix and near plane.
 #[derive(FromPyObject)]
 struct ViewArgs {
     #[pyo3(item)]
@@ -92,24 +91,20 @@ struct ViewArgs {
     viewmat: [[f32; 4]; 3],
     #[pyo3(item)]
     near: f32,
-    #[pyo3(item)]
-    region: [usize; 4],
 }
 
 impl ViewArgs {
     fn view(&self) -> View {
         let [fx, fy, cx, cy] = self.intrinsics;
         let m = &self.viewmat;
-        let [x, y, width, height] = self.region;
+        let [width, height] = self.size;
         View {
-            width: self.size[0],
-            height: self.size[1],
+            size: Size { width, height },
             focal: [fx, fy],
             center: [cx, cy],
             rotation: std::array::from_fn(|i| [m[i][0], m[i][1], m[i][2]]),
             translation: [m[0][3], m[1][3], m[2][3]],
             near: self.near,
-            region: Region { x, y, width, height },
         }
     }
 }
@@ -194,15 +189,15 @@ impl Rasterizer {
             .map_err(usage)
     }
 
-    /// One training step on a batch of crops. Returns for each crop (loss, l1, mse, ssim, mask, depth, gradient of the gain,
-    /// of the offset), and [N] the largest radii. The gradients are those of the sum of the losses. A crop is (view,
-    /// (background, (gain, offset) or None), (rgb, alpha or None, weight or None, depth or None)); the lambdas are those of
+    /// One training step on a batch of views. Returns for each (loss, l1, mse, ssim, mask, depth, gradient of the gain,
+    /// of the offset), and [N] the largest radii. The gradients are those of the sum of the losses. A view is (camera,
+    /// (background, (gain, offset) or None), (rgb, alpha or None, depth or None)); the lambdas are those of
     /// SSIM, mask and depth.
     fn step<'py>(
         &mut self,
         py: Python<'py>,
         params: Params,
-        crops: Vec<Crop>,
+        views: Vec<TargetView>,
         lambdas: (f32, f32, f32),
         grads: Grads,
     ) -> PyResult<(Vec<Value>, Bound<'py, PyArray1<f32>>)> {
@@ -215,11 +210,10 @@ impl Rasterizer {
         };
         let (step, inner) = (&mut self.step, &mut self.inner);
         let (mut values, mut radii) = (Vec::new(), vec![0.0f32; splats.len()]);
-        for (view, (background, exposure), (rgb, alpha, weight, depth)) in &crops {
+        for (view, (background, exposure), (rgb, alpha, depth)) in &views {
             let target = TargetImage {
                 rgb: contiguous(rgb.as_slice())?,
                 alpha: alpha.as_ref().map(|a| contiguous(a.as_slice())).transpose()?,
-                weight: weight.as_ref().map(|w| contiguous(w.as_slice())).transpose()?,
                 depth: depth.as_ref().map(|d| contiguous(d.as_slice())).transpose()?,
                 offset: exposure.map_or([0.0; 3], |e| e.1),
             };
@@ -254,7 +248,7 @@ impl Rasterizer {
     ) -> PyResult<Bound<'py, PyArray1<u8>>> {
         let (splats, view) = (splats(&params)?, view.view());
         view.check().map_err(usage)?; // before its size is allocated
-        let mut out = vec![[0; 3]; view.region.pixels()];
+        let mut out = vec![[0; 3]; view.size.pixels()];
         let surface = Surface::Rgb(&mut out);
         py.detach(|| self.inner.paint(surface, &splats, &view, Background::new(background)))
             .map_err(usage)?;

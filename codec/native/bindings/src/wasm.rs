@@ -11,6 +11,7 @@ mod text;
 
 use gsv::container::demux::Demuxer;
 use player::Player;
+use raster::Size;
 use std::cell::RefCell;
 
 thread_local! {
@@ -198,7 +199,7 @@ pub extern "C" fn splats(count: usize) -> *mut u8 {
 /// Draws the Gaussians in `splats` over a background.
 #[unsafe(no_mangle)]
 pub extern "C" fn draw(width: usize, height: usize, red: f32, green: f32, blue: f32) -> bool {
-    with(|p| p.draw([width, height], [red, green, blue]))
+    with(|p| p.draw(Size { width, height }, [red, green, blue]))
 }
 
 /// [height, width, 4] u8: the drawn image.

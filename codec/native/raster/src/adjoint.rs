@@ -13,7 +13,7 @@ pub struct Adjoint {
     pub channels: [Plane; 4],
 }
 
-/// A rendered region and the gradient of the loss with respect to it.
+/// A rendered image and the gradient of the loss with respect to it.
 pub struct Pixels<'a> {
     pub image: &'a [f32],
     pub alpha: &'a [f32],

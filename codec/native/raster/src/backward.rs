@@ -16,12 +16,15 @@ use crate::simd::{Vector, c, dispatch};
 use crate::tile::{BATCH, BLOCK, BLOCKS, Batch, Hits, Local, PIXEL_X, PIXEL_Y, Plane, opacities};
 
 /// Sums over the pixels of a pair. With a = dL/dalpha * alpha (the gradient with respect to ln alpha) and w the blending
-/// weight: a, a u, a v, a u^2, a u v, a v^2, w g (3), w, largest w, w times the gradient of depth.
+/// weight: a, a u, a v, a u^2, a u v, a v^2, w g (3), w times the gradient of depth; and the largest w.
 ///
 /// One cache line, since they are gathered in random order.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
 pub struct Sums(pub [f32; 12]);
+
+/// Where the largest weight is, behind what is summed; the last value is not used.
+pub const LARGEST: usize = 10;
 
 impl Sums {
     pub const ZERO: Sums = Sums([0.0; 12]);
@@ -156,9 +159,8 @@ fn visit<V: Vector, const C: usize>(
         sums[6 + ch] = weight.mul_add(g[ch], sums[6 + ch]);
     }
     if C > 3 {
-        sums[11] = weight.mul_add(g[3], sums[11]);
+        sums[9] = weight.mul_add(g[3], sums[9]);
     }
-    sums[9] = sums[9] + weight;
     acc.1 = acc.1.max(weight);
 }
 
@@ -217,7 +219,7 @@ fn backward_kernel<V: Vector, const C: usize>(
                 }
                 k = last;
                 V::sum12(&acc.0, &mut out.0);
-                out.0[10] = acc.1.max_lane();
+                out.0[LARGEST] = acc.1.max_lane();
             }
             first = end;
         }

@@ -2,6 +2,7 @@
 //! band with `Rasterizer::draw`. Bands start at multiples of TILE rows, so the pixels are the same as without bands.
 
 use crate::projected::{MANY, Projected, TILE};
+use crate::size::Size;
 
 /// Rows of the image and the Gaussians that meet them; y and tiles count from the first row of the band.
 #[derive(Default)]
@@ -23,7 +24,7 @@ const TILE_COST: f32 = 8.0;
 
 impl Bands {
     /// At most `count` bands of about the same number of Gaussian-tile pairs.
-    pub fn split(&mut self, projected: &[Projected], size: [usize; 2], count: usize) -> &[Band] {
+    pub fn split(&mut self, projected: &[Projected], size: Size, count: usize) -> &[Band] {
         self.measure(projected, size);
         let ends = ends(&self.load, count);
         self.cut(projected, size, &ends);
@@ -31,7 +32,7 @@ impl Bands {
     }
 
     /// Bands whose rows of tiles end at `ends`, as `ends()` gives them: those of an image of which others draw other Gaussians.
-    pub fn split_at(&mut self, projected: &[Projected], size: [usize; 2], ends: &[usize]) -> &[Band] {
+    pub fn split_at(&mut self, projected: &[Projected], size: Size, ends: &[usize]) -> &[Band] {
         self.measure(projected, size);
         let rows = self.load.len();
         let mut fit: Vec<usize> = ends.iter().map(|end| (*end).clamp(1, rows.max(1))).collect();
@@ -47,20 +48,20 @@ impl Bands {
         &self.load
     }
 
-    fn cut(&mut self, projected: &[Projected], [_, height]: [usize; 2], ends: &[usize]) {
+    fn cut(&mut self, projected: &[Projected], size: Size, ends: &[usize]) {
         self.bands.resize_with(ends.len(), Band::default);
         let mut first = 0;
         for (band, end) in self.bands.iter_mut().zip(ends) {
             band.first = first * TILE;
-            band.rows = (end * TILE).min(height) - band.first;
+            band.rows = (end * TILE).min(size.height) - band.first;
             band.take(projected);
             first = *end;
         }
     }
 
     /// Gaussian-tile pairs of each row of tiles, by the boxes of the ellipses.
-    fn measure(&mut self, projected: &[Projected], [width, height]: [usize; 2]) {
-        let (columns, rows) = (width.div_ceil(TILE), height.div_ceil(TILE));
+    fn measure(&mut self, projected: &[Projected], size: Size) {
+        let (columns, rows) = (size.width.div_ceil(TILE), size.height.div_ceil(TILE));
         self.load.clear();
         self.load.resize(rows, TILE_COST * columns as f32);
         for p in projected.iter().filter(|p| p.visible()) {
@@ -117,7 +118,12 @@ impl Band {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Background, Rasterizer, Region, SimdLevel, Splats, Surface, View};
+    use crate::{Background, Rasterizer, SimdLevel, Splats, Surface, View};
+
+    const SIZE: Size = Size {
+        width: 150,
+        height: 141,
+    };
 
     /// A spiral of Gaussians, denser at the top.
     fn scene(n: usize) -> [Vec<f32>; 5] {
@@ -135,21 +141,14 @@ mod tests {
         ]
     }
 
-    fn view(width: usize, height: usize) -> View {
+    fn view(size: Size) -> View {
         View {
-            width,
-            height,
+            size,
             focal: [150.0, 150.0],
-            center: [width as f32 / 2.0, height as f32 / 2.0],
+            center: [size.width as f32 / 2.0, size.height as f32 / 2.0],
             rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
             translation: [0.0; 3],
             near: crate::constants::NEAR,
-            region: Region {
-                x: 0,
-                y: 0,
-                width,
-                height,
-            },
         }
     }
 
@@ -166,7 +165,7 @@ mod tests {
             sh_k: 0,
             turns: &[],
         };
-        let (view, background) = (view(150, 141), Background::new([0.2, 0.4, 0.6]));
+        let (view, background) = (view(SIZE), Background::new([0.2, 0.4, 0.6]));
         let mut whole = Rasterizer::new(SimdLevel::best(), 0);
         whole.forward(&splats, &view, background, false, false).unwrap();
         for count in [1, 2, 3, 9, 40] {
@@ -175,7 +174,7 @@ mod tests {
                 Rasterizer::new(SimdLevel::best(), 0),
             );
             let (mut bands, mut row) = (Bands::default(), 0);
-            for band in bands.split(project.project(&splats, &view).unwrap(), [150, 141], count) {
+            for band in bands.split(project.project(&splats, &view).unwrap(), view.size, count) {
                 assert_eq!(band.first, row);
                 assert!(band.rows > 0);
                 let (from, to) = (3 * 150 * row, 3 * 150 * (row + band.rows));
@@ -185,8 +184,16 @@ mod tests {
                     alpha: &mut alpha,
                     depth: &mut [],
                 };
-                draw.draw(surface, [150, band.rows], background, |p| p.clone_from(&band.splats))
-                    .unwrap();
+                draw.draw(
+                    surface,
+                    Size {
+                        width: 150,
+                        height: band.rows,
+                    },
+                    background,
+                    |p| p.clone_from(&band.splats),
+                )
+                .unwrap();
                 for (a, b) in image.iter().zip(&whole.image()[from..to]) {
                     assert!((a - b).abs() < 1e-4, "{count} bands: {a} {b}");
                 }
@@ -200,7 +207,7 @@ mod tests {
     #[test]
     fn bands_of_parts() {
         let all = scene(3000);
-        let view = view(150, 141);
+        let view = view(SIZE);
         let projected = |range: std::ops::Range<usize>| {
             let part = |i: usize, c: usize| &all[i][range.start * c..range.end * c];
             let splats = Splats {
@@ -218,33 +225,33 @@ mod tests {
         };
         let parts = [projected(0..1000), projected(1000..3000)];
         let mut bands = [Bands::default(), Bands::default(), Bands::default()];
-        let whole = bands[2].split(&projected(0..3000), [150, 141], 3);
+        let whole = bands[2].split(&projected(0..3000), SIZE, 3);
         let whole: Vec<[usize; 3]> = whole.iter().map(|b| [b.first, b.rows, b.splats.len()]).collect();
         let mut load = vec![0.0; 141usize.div_ceil(TILE)];
         for (bands, part) in bands.iter_mut().zip(&parts) {
-            bands.split(part, [150, 141], 1);
+            bands.split(part, SIZE, 1);
             load.iter_mut().zip(bands.load()).for_each(|(sum, v)| *sum += v);
         }
         let at = ends(&load, 3);
         let mut sum: Vec<[usize; 3]> = vec![[0; 3]; 3];
         for (bands, part) in bands.iter_mut().zip(&parts) {
-            for (sum, b) in sum.iter_mut().zip(bands.split_at(part, [150, 141], &at)) {
+            for (sum, b) in sum.iter_mut().zip(bands.split_at(part, SIZE, &at)) {
                 *sum = [b.first, b.rows, sum[2] + b.splats.len()];
             }
         }
         assert_eq!(sum, whole);
-        assert_eq!(bands[0].split_at(&[], [150, 20], &[9, 1, 7]).len(), 2); // ends beyond the image
+        assert_eq!(bands[0].split_at(&[], Size { height: 20, ..SIZE }, &[9, 1, 7]).len(), 2); // ends beyond it
     }
 
     #[test]
     fn no_gaussians_is_background() {
-        let mut bands = Bands::default();
-        let split = bands.split(&[], [20, 40], 2);
+        let (mut bands, size) = (Bands::default(), Size { width: 20, height: 40 });
+        let split = bands.split(&[], size, 2);
         assert_eq!(split.iter().map(|b| b.rows).sum::<usize>(), 40);
         let mut draw = Rasterizer::new(SimdLevel::best(), 0);
         let mut pixels = vec![[0; 4]; 800];
         let surface = Surface::Rgba(&mut pixels);
-        draw.draw(surface, [20, 40], Background::new([1.0, 0.5, 0.0]), Vec::clear)
+        draw.draw(surface, size, Background::new([1.0, 0.5, 0.0]), Vec::clear)
             .unwrap();
         assert!(pixels.iter().all(|p| *p == [255, 128, 0, 255]));
     }

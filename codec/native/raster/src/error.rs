@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::region::Region;
+use crate::size::Size;
 
 /// Why a call was refused; nothing was drawn or written then.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -12,11 +12,7 @@ pub enum RasterError {
         expected: usize,
         got: usize,
     },
-    Region {
-        region: Region,
-        width: usize,
-        height: usize,
-    },
+    Empty(Size),
     TooMany {
         what: &'static str,
         limit: usize,
@@ -29,15 +25,7 @@ impl fmt::Display for RasterError {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         match self {
             RasterError::Shape { name, expected, got } => write!(f, "{name} has {got} values, expected {expected}"),
-            RasterError::Region {
-                region: r,
-                width,
-                height,
-            } => write!(
-                f,
-                "region {}x{} at ({}, {}) is empty or not inside of the {width}x{height} image",
-                r.width, r.height, r.x, r.y
-            ),
+            RasterError::Empty(size) => write!(f, "an image of {} x {} pixels is empty", size.width, size.height),
             RasterError::TooMany { what, limit } => write!(f, "more than {limit} {what}"),
             RasterError::Near => f.write_str("the near plane is not in front of the camera"),
             RasterError::NothingRendered => {

@@ -22,26 +22,23 @@ pub struct Lens {
     pub center: [f32; 2],
     pub slope_min: [f32; 2],
     pub slope_max: [f32; 2],
-    pub size: [f32; 2], // of the region
-    pub full: [f32; 2], // of the image
+    pub size: [f32; 2],
     pub near: f32,
 }
 
 impl Lens {
     pub fn new(view: &View) -> Lens {
-        let full = [view.width as f32, view.height as f32];
-        let origin = [view.region.x as f32, view.region.y as f32];
-        let margin = |i: usize| FOV_MARGIN * 0.5 * full[i] / view.focal[i];
+        let size = [view.size.width as f32, view.size.height as f32];
+        let margin = |i: usize| FOV_MARGIN * 0.5 * size[i] / view.focal[i];
         Lens {
             rotation: view.rotation,
             translation: view.translation,
             eye: view.eye(),
             focal: view.focal,
-            center: [view.center[0] - origin[0], view.center[1] - origin[1]],
+            center: view.center,
             slope_min: std::array::from_fn(|i| -view.center[i] / view.focal[i] - margin(i)),
-            slope_max: std::array::from_fn(|i| (full[i] - view.center[i]) / view.focal[i] + margin(i)),
-            size: [view.region.width as f32, view.region.height as f32],
-            full,
+            slope_max: std::array::from_fn(|i| (size[i] - view.center[i]) / view.focal[i] + margin(i)),
+            size,
             near: view.near,
         }
     }

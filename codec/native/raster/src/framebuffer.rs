@@ -5,11 +5,11 @@ use std::ops::Range;
 use crate::error::{RasterError, check_length};
 use crate::forward::Canvas;
 use crate::projected::TILE;
-use crate::region::Region;
 use crate::scene::Background;
+use crate::size::Size;
 use crate::tile::swizzle;
 
-/// The pixels of the rendered region, in rows. Viewers draw straight to bytes, without a float image in between.
+/// The pixels of an image, in rows. Viewers draw straight to bytes, without a float image in between.
 pub enum Surface<'a> {
     /// [H, W, 3], [H, W], and [H, W] sums of weight times depth, or nothing where depth is not asked for.
     Floats {
@@ -24,9 +24,9 @@ pub enum Surface<'a> {
 
 impl<'a> Surface<'a> {
     /// # Errors
-    /// A length other than that of the region.
-    pub fn check(&self, region: Region) -> Result<(), RasterError> {
-        let pixels = region.pixels();
+    /// A length other than that of the image.
+    pub fn check(&self, size: Size) -> Result<(), RasterError> {
+        let pixels = size.pixels();
         match self {
             Surface::Floats { image, alpha, depth } => {
                 check_length("image", image.len(), 3 * pixels)?;

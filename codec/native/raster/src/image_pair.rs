@@ -1,13 +1,11 @@
 //! The two images that a loss compares.
 
-/// Two images [H, W, 3] and their weights.
+/// Two images [H, W, 3].
 #[derive(Clone, Copy)]
 pub struct Pair<'a> {
     pub image: &'a [f32],
     pub target: &'a [f32],
     pub width: usize,
-    /// [H, W]
-    pub weight: Option<&'a [f32]>,
 }
 
 impl Pair<'_> {

@@ -16,7 +16,7 @@ use crate::simd::{SimdLevel, Vector, c, dispatch};
 use crate::ssim::{derivative_rows, gradient_rows};
 use crate::ssim_window::ROWS;
 
-/// Means over the (weighted) pixels and channels.
+/// Means over the pixels and channels.
 #[derive(Clone, Copy, Default, Debug, PartialEq)]
 pub struct LossValue {
     pub loss: f64,
@@ -35,7 +35,7 @@ pub struct ImageLoss {
 }
 
 impl ImageLoss {
-    /// The loss, and its gradient into `grad` [H, W, 3]. The mean is weighted by `weight` if there is one.
+    /// The loss, and its gradient into `grad` [H, W, 3].
     ///
     /// # Errors
     /// Lengths that disagree.
@@ -49,22 +49,7 @@ impl ImageLoss {
         check_length("target", pair.target.len(), pair.image.len())?;
         check_length("gradient of the image", grad.len(), pair.image.len())?;
         check_length("image", pair.image.len(), pair.rows() * pair.row_values())?;
-        let pixels = pair.image.len() / 3;
-        let total = match pair.weight {
-            None => pixels as f64,
-            Some(w) => {
-                check_length("weight", w.len(), pixels)?;
-                w.iter().map(|&v| f64::from(v)).sum()
-            }
-        };
-        if total <= 0.0 {
-            grad.fill(0.0);
-            return Ok(LossValue {
-                ssim: 1.0,
-                ..Default::default()
-            });
-        }
-        let mean = 1.0 / (3.0 * total);
+        let mean = 1.0 / pair.image.len().max(1) as f64;
         let sums = self.derivatives(level, pair, -f64::from(lambda) * mean);
         self.gradient(level, pair, ((1.0 - f64::from(lambda)) * mean) as f32, grad);
         let [l1, mse, ssim] = sums.map(|s| s * mean);
@@ -72,7 +57,7 @@ impl ImageLoss {
         Ok(LossValue { loss, l1, mse, ssim })
     }
 
-    /// Pass 1: derivative maps, times `scale` and the weight. Returns the sums of |x - y|, (x - y)^2 and SSIM.
+    /// Pass 1: derivative maps, times `scale`. Returns the sums of |x - y|, (x - y)^2 and SSIM.
     fn derivatives(&mut self, level: SimdLevel, pair: Pair, scale: f64) -> [f64; 3] {
         let (values, rows) = (pair.row_values(), pair.rows());
         self.partial.clear();

@@ -5,7 +5,7 @@
 
 use std::ops::Range;
 
-use crate::backward::Sums;
+use crate::backward::{LARGEST, Sums};
 use crate::ewa::{Ewa, Lens, WHITEN, colour, direction, dot3, ewa, seen, turn};
 use crate::scene::{Gradients, Splats};
 use crate::sh;
@@ -48,9 +48,8 @@ impl GradientRows {
         write_columns(&self.logits, seen, add, &mut out.logit_opacities[at..to]);
         write_columns(&self.sh0, seen, add, &mut out.sh0[3 * at..3 * to]);
         write_columns(&self.grad2d, seen, add, &mut out.grad2d[at..to]);
-        write_columns(&[sums[9]], seen, add, &mut out.sum_weight[at..to]);
         let largest = out.max_weight[at..to].iter_mut();
-        for (lane, (old, &new)) in largest.zip(&sums[10]).enumerate() {
+        for (lane, (old, &new)) in largest.zip(&sums[LARGEST]).enumerate() {
             let new = if seen >> lane & 1 == 1 { new } else { 0.0 };
             *old = if add { old.max(new) } else { new };
         }
@@ -90,11 +89,10 @@ fn gather(bins: &TileBins, sums: &[Sums], first: usize, n: usize, rows: &mut [Ro
         let mut total = Sums::ZERO.0;
         bins.places(g, |place| {
             let s = &sums[place].0;
-            for k in 0..10 {
+            for k in 0..LARGEST {
                 total[k] += s[k];
             }
-            total[11] += s[11];
-            total[10] = total[10].max(s[10]);
+            total[LARGEST] = total[LARGEST].max(s[LARGEST]);
             seen |= 1 << lane;
         });
         for (row, v) in rows.iter_mut().zip(total) {
@@ -230,14 +228,14 @@ fn chunk<V: Vector>(soa: &Soa, lens: &Lens, k: usize, sums: &[Row; 12], out: &mu
     for at in (0..CHUNK).step_by(V::LANES) {
         let e = ewa::<V>(soa, lens, at);
         let s = screen(&e, sums, at);
-        geometry(&e, lens, &s, V::load(&sums[11][at..]), at, out);
+        geometry(&e, lens, &s, V::load(&sums[9][at..]), at, out);
         colour_backward::<V>(soa, lens, k, sums, at, out);
         // d ln(sigmoid(x)) / dx = 1 - sigmoid(x)
         let logit = V::load(&soa.logits[0][at..]).max(c(-55.0));
         let up = crate::ewa::exp(-logit);
         (V::load(&sums[0][at..]) * up / (c::<V>(1.0) + up)).store(&mut out.logits[0][at..]);
-        let gx = s.mean2d[0] * c(0.5 * lens.full[0]);
-        let gy = s.mean2d[1] * c(0.5 * lens.full[1]);
+        let gx = s.mean2d[0] * c(0.5 * lens.size[0]);
+        let gy = s.mean2d[1] * c(0.5 * lens.size[1]);
         gx.mul_add(gx, gy * gy).sqrt().store(&mut out.grad2d[0][at..]);
     }
 }

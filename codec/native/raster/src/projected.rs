@@ -7,7 +7,7 @@ pub const TILE: usize = 16;
 /// Relative and absolute margin of the box and the ellipse, so that rounding never loses a pixel that blending would draw.
 pub const SLACK: f32 = 1e-3;
 
-/// A Gaussian on the image; x and y in pixels of the region.
+/// A Gaussian on the image; x and y in pixels.
 ///
 /// One cache line: tiles fetch them in depth order, which is random in memory.
 #[derive(Clone, Copy, Default, Debug)]

@@ -17,9 +17,9 @@ use crate::ewa::Lens;
 use crate::framebuffer::Surface;
 use crate::project::project;
 use crate::projected::Projected;
-use crate::region::Region;
 use crate::scene::{Background, MAX_PAIRS, Splats, View, check_size};
 use crate::simd::SimdLevel;
+use crate::size::Size;
 use crate::sort::DepthSort;
 use crate::tile::{BLOCKS, Hits};
 use crate::tile_binning::TileBins;
@@ -54,10 +54,10 @@ pub struct Rasterizer {
     bins: TileBins,
     seen: Vec<Hits>,
     sums: Vec<Sums>,
-    pub(crate) image: Vec<f32>, // [H, W, 3] of the region
+    pub(crate) image: Vec<f32>, // [H, W, 3]
     pub(crate) alpha: Vec<f32>, // [H, W]
     pub(crate) depth: Vec<f32>, // [H, W] sums of weight times depth, or empty
-    drawn: Option<(Lens, Region, Background)>,
+    drawn: Option<(Lens, Size, Background)>,
     pub timings: Timings,
 }
 
@@ -89,17 +89,17 @@ impl Rasterizer {
         self.level
     }
 
-    /// [H, W, 3] of the region, by the last forward pass.
+    /// [H, W, 3] by the last forward pass.
     pub fn image(&self) -> &[f32] {
         &self.image
     }
 
-    /// [H, W] of the region, by the last forward pass.
+    /// [H, W] by the last forward pass.
     pub fn alpha(&self) -> &[f32] {
         &self.alpha
     }
 
-    /// [H, W] of the region, by the last forward pass: weight times depth, summed over the Gaussians; empty if not asked for.
+    /// [H, W] by the last forward pass: weight times depth, summed over the Gaussians; empty if not asked for.
     pub fn depth(&self) -> &[f32] {
         &self.depth
     }
@@ -130,7 +130,7 @@ impl Rasterizer {
         Ok(&self.projected)
     }
 
-    /// The second half of `forward` alone: draws projected Gaussians on an image of width x height. `fill` gets the
+    /// The second half of `forward` alone: draws projected Gaussians on an image of that size. `fill` gets the
     /// Gaussians of the last call and replaces them; they must come from `project` for an image of that size.
     ///
     /// # Errors
@@ -138,21 +138,15 @@ impl Rasterizer {
     pub fn draw(
         &mut self,
         surface: Surface,
-        [width, height]: [usize; 2],
+        size: Size,
         background: Background,
         fill: impl FnOnce(&mut Vec<Projected>),
     ) -> Result<(), RasterError> {
         fill(&mut self.projected);
-        let region = Region {
-            x: 0,
-            y: 0,
-            width,
-            height,
-        };
-        check_size(region, width, height)?;
-        surface.check(region)?;
+        check_size(size)?;
+        surface.check(size)?;
         self.drawn = None;
-        self.run(|s| s.draw_on(surface, region, background, false))
+        self.run(|s| s.draw_on(surface, size, background, false))
     }
 
     /// Renders the view onto a surface of the caller; `image` and `alpha` keep their values.
@@ -167,8 +161,8 @@ impl Rasterizer {
         background: Background,
     ) -> Result<(), RasterError> {
         self.project(splats, view)?;
-        surface.check(view.region)?;
-        self.run(|s| s.draw_on(surface, view.region, background, false))
+        surface.check(view.size)?;
+        self.run(|s| s.draw_on(surface, view.size, background, false))
     }
 
     /// Runs `f` in the thread pool of this rasterizer.
@@ -212,19 +206,19 @@ impl Rasterizer {
         self.drawn = None;
         self.project_here(splats, &lens);
         let (mut image, mut alpha, mut depths) = (take(&mut self.image), take(&mut self.alpha), take(&mut self.depth));
-        image.resize(3 * view.region.pixels(), 0.0);
-        alpha.resize(view.region.pixels(), 0.0);
-        depths.resize(if depth { view.region.pixels() } else { 0 }, 0.0);
+        image.resize(3 * view.size.pixels(), 0.0);
+        alpha.resize(view.size.pixels(), 0.0);
+        depths.resize(if depth { view.size.pixels() } else { 0 }, 0.0);
         let surface = Surface::Floats {
             image: &mut image,
             alpha: &mut alpha,
             depth: &mut depths,
         };
-        let drawn = self.draw_on(surface, view.region, background, training);
+        let drawn = self.draw_on(surface, view.size, background, training);
         (self.image, self.alpha, self.depth) = (image, alpha, depths);
         drawn?;
         if training {
-            self.drawn = Some((lens, view.region, background));
+            self.drawn = Some((lens, view.size, background));
         }
         Ok(())
     }
@@ -241,14 +235,14 @@ impl Rasterizer {
     fn draw_on(
         &mut self,
         mut surface: Surface,
-        region: Region,
+        size: Size,
         background: Background,
         training: bool,
     ) -> Result<(), RasterError> {
         let start = Clock::start();
         self.sort.sort(&self.projected);
         (self.timings.bin, self.timings.blend) = (start.ms(), 0.0);
-        self.draw_tiles(&mut surface, TileRect::of(region), region, background, training)
+        self.draw_tiles(&mut surface, TileRect::of(size), size, background, training)
     }
 
     /// Bins and blends a rectangle of tiles. If its pairs exceed the memory limit, both halves one after the other; not in
@@ -257,7 +251,7 @@ impl Rasterizer {
         &mut self,
         surface: &mut Surface,
         tiles: TileRect,
-        region: Region,
+        size: Size,
         background: Background,
         training: bool,
     ) -> Result<(), RasterError> {
@@ -273,8 +267,8 @@ impl Rasterizer {
         self.timings.bin += start.ms();
         match (built, halves) {
             (Err(_), Some([first, second])) if !training => {
-                self.draw_tiles(surface, first, region, background, training)?;
-                return self.draw_tiles(surface, second, region, background, training);
+                self.draw_tiles(surface, first, size, background, training)?;
+                return self.draw_tiles(surface, second, size, background, training);
             }
             (built, _) => built?,
         }
@@ -282,7 +276,7 @@ impl Rasterizer {
         let batches = self.bins.batches(self.bins.tiles.len());
         self.seen.resize(if training { batches } else { 0 }, [0; BLOCKS]);
         let (level, projected, seen) = (self.level, &self.projected, &mut self.seen);
-        blend_tiles(level, projected, &self.bins, region, background, surface, seen);
+        blend_tiles(level, projected, &self.bins, size, background, surface, seen);
         self.timings.blend += start.ms();
         Ok(())
     }

@@ -2,7 +2,7 @@
 //! Python arrays.
 
 use crate::error::{RasterError, check_length};
-use crate::region::Region;
+use crate::size::Size;
 
 /// N Gaussians, parameters before activation (exp, sigmoid and normalisation happen inside).
 #[derive(Clone, Copy, Default)]
@@ -67,9 +67,8 @@ pub struct Gradients<'a> {
     pub sh_n: &'a mut [f32],
     /// [N] norm of the gradient of the projected mean, in units of half the image (3DGS's densification measure).
     pub grad2d: &'a mut [f32],
-    /// [N] largest and summed blending weight alpha * transmittance over the pixels.
+    /// [N] largest blending weight alpha * transmittance over the pixels.
     pub max_weight: &'a mut [f32],
-    pub sum_weight: &'a mut [f32],
 }
 
 impl<'a> Gradients<'a> {
@@ -84,7 +83,6 @@ impl<'a> Gradients<'a> {
             sh_n: self.sh_n,
             grad2d: self.grad2d,
             max_weight: self.max_weight,
-            sum_weight: self.sum_weight,
         }
     }
 
@@ -98,7 +96,6 @@ impl<'a> Gradients<'a> {
         let (sh_n, sh_n2) = self.sh_n.split_at_mut(3 * sh_k * n);
         let (grad2d, grad2d2) = self.grad2d.split_at_mut(n);
         let (max_weight, max_weight2) = self.max_weight.split_at_mut(n);
-        let (sum_weight, sum_weight2) = self.sum_weight.split_at_mut(n);
         (
             Gradients {
                 add: self.add,
@@ -110,7 +107,6 @@ impl<'a> Gradients<'a> {
                 sh_n,
                 grad2d,
                 max_weight,
-                sum_weight,
             },
             Gradients {
                 add: self.add,
@@ -122,7 +118,6 @@ impl<'a> Gradients<'a> {
                 sh_n: sh_n2,
                 grad2d: grad2d2,
                 max_weight: max_weight2,
-                sum_weight: sum_weight2,
             },
         )
     }
@@ -138,32 +133,29 @@ impl<'a> Gradients<'a> {
         check_length("gradient of sh0", self.sh0.len(), 3 * n)?;
         check_length("gradient of shN", self.sh_n.len(), splats.sh_n.len())?;
         check_length("grad2d", self.grad2d.len(), n)?;
-        check_length("max_weight", self.max_weight.len(), n)?;
-        check_length("sum_weight", self.sum_weight.len(), n)
+        check_length("max_weight", self.max_weight.len(), n)
     }
 }
 
-/// A pinhole camera (OpenCV axes, pixel centres at half-integers) and the region of its image to render.
+/// A pinhole camera (OpenCV axes, pixel centres at half-integers).
 #[derive(Clone, Copy, Debug)]
 pub struct View {
-    pub width: usize,
-    pub height: usize,
+    pub size: Size,
     pub focal: [f32; 2],
     pub center: [f32; 2],
     pub rotation: [[f32; 3]; 3], // world to camera
     pub translation: [f32; 3],
     pub near: f32, // world units; Gaussians whose centre is nearer are not drawn
-    pub region: Region,
 }
 
 impl View {
     /// # Errors
-    /// An empty or too large image; a region that is not inside the image; a near plane that is not in front.
+    /// An empty or too large image; a near plane that is not in front.
     pub fn check(&self) -> Result<(), RasterError> {
         if !(self.near > 0.0 && self.near.is_finite()) {
             return Err(RasterError::Near);
         }
-        check_size(self.region, self.width, self.height)
+        check_size(self.size)
     }
 
     /// Position of the camera in the world.
@@ -194,16 +186,11 @@ pub const MAX_GAUSSIANS: usize = 1 << 26;
 pub const MAX_PAIRS: usize = 1 << 28;
 
 /// See `View::check`.
-pub(crate) fn check_size(r: Region, width: usize, height: usize) -> Result<(), RasterError> {
-    let inside = r.x.saturating_add(r.width) <= width && r.y.saturating_add(r.height) <= height;
-    if !inside || r.width == 0 || r.height == 0 {
-        return Err(RasterError::Region {
-            region: r,
-            width,
-            height,
-        });
+pub(crate) fn check_size(size: Size) -> Result<(), RasterError> {
+    if size.width == 0 || size.height == 0 {
+        return Err(RasterError::Empty(size));
     }
-    if width > MAX_SIDE || height > MAX_SIDE {
+    if size.width > MAX_SIDE || size.height > MAX_SIDE {
         return Err(RasterError::TooMany {
             what: "pixels on a side",
             limit: MAX_SIDE,

@@ -11,6 +11,17 @@ use crate::ssim_window::{Narrow, STRIP, Strip, Wide, horizontal, moments, tap_ro
 const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
 
+/// 1 for the values of a strip of n, 0 past its end: read from STRIP - n on.
+static INSIDE: [f32; 2 * STRIP] = {
+    let mut inside = [0.0; 2 * STRIP];
+    let mut i = 0;
+    while i < STRIP {
+        inside[i] = 1.0;
+        i += 1;
+    }
+    inside
+};
+
 /// SSIM of the local means, and its derivatives with respect to E[x], E[x^2] and E[xy].
 #[inline(always)]
 fn ssim<V: Vector>([x, y, squares, xy]: [V; 4]) -> (V, [V; 3]) {
@@ -26,22 +37,6 @@ fn ssim<V: Vector>([x, y, squares, xy]: [V; 4]) -> (V, [V; 3]) {
     (s, [d_x, d_xx, d_xy])
 }
 
-/// The weights of the values of a strip; 0 past its end.
-fn weights(pair: Pair, row: usize, strip: &Strip, out: &mut Narrow) {
-    match pair.weight {
-        None => out.0[..strip.n].fill(1.0),
-        Some(w) => {
-            let first = strip.start;
-            let row = &w[row * pair.width..(row + 1) * pair.width];
-            out.0[..strip.n]
-                .iter_mut()
-                .enumerate()
-                .for_each(|(i, o)| *o = row[(first + i) / 3]);
-        }
-    }
-    out.0[strip.n..].fill(0.0);
-}
-
 #[inline(always)]
 fn derivative_kernel<V: Vector>(
     pair: Pair,
@@ -52,8 +47,8 @@ fn derivative_kernel<V: Vector>(
     partial: &mut [[f64; 3]],
 ) {
     let (values, rows) = (pair.row_values(), pair.rows());
-    for (i, sums) in partial.iter_mut().enumerate() {
-        sums[2] = equal_weight(pair, first_row + i, columns);
+    for sums in partial.iter_mut() {
+        sums[2] = (values - columns.len()) as f64; // outside of the columns the images are equal and SSIM is 1
     }
     for start in columns.clone().step_by(STRIP) {
         let strip = Strip::new(start, columns.end, values);
@@ -84,19 +79,6 @@ fn derivative_kernel<V: Vector>(
     }
 }
 
-/// Weight of the values of a row outside of `columns`, where the images are equal and SSIM is 1.
-fn equal_weight(pair: Pair, row: usize, columns: &Range<usize>) -> f64 {
-    let Some(weight) = pair.weight else {
-        return (pair.row_values() - columns.len()) as f64;
-    };
-    let row = &weight[row * pair.width..(row + 1) * pair.width];
-    let outside = |i: &usize| !columns.contains(i);
-    (0..pair.row_values())
-        .filter(outside)
-        .map(|i| f64::from(row[i / 3]))
-        .sum()
-}
-
 /// Horizontal taps and SSIM of one row of a strip.
 #[inline(always)]
 fn derivative_strip<V: Vector>(
@@ -112,21 +94,17 @@ fn derivative_strip<V: Vector>(
     let mut local = [Narrow::ZERO; 3];
     local[0].copy(&pair.image[at..at + strip.n]);
     local[1].copy(&pair.target[at..at + strip.n]);
-    weights(pair, row, strip, &mut local[2]);
+    let inside = &INSIDE[STRIP - strip.n..];
     let mut sum = [c::<V>(0.0); 3];
     for i in (0..strip.n).step_by(V::LANES) {
-        let (x, y, w) = (
-            V::load(&local[0].0[i..]),
-            V::load(&local[1].0[i..]),
-            V::load(&local[2].0[i..]),
-        );
+        let (x, y) = (V::load(&local[0].0[i..]), V::load(&local[1].0[i..]));
         let (s, d) = ssim(horizontal::<V, 4>(temp, i));
         let difference = (x - y).abs();
-        sum[0] = difference.mul_add(w, sum[0]);
-        sum[1] = (difference * difference).mul_add(w, sum[1]);
-        sum[2] = s.mul_add(w, sum[2]);
+        sum[0] = sum[0] + difference;
+        sum[1] = difference.mul_add(difference, sum[1]);
+        sum[2] = s.mul_add(V::load(&inside[i..]), sum[2]);
         for j in 0..3 {
-            (d[j] * (w * c(scale))).store(&mut local[j].0[i..]);
+            (d[j] * c(scale)).store(&mut local[j].0[i..]);
         }
     }
     for j in 0..3 {
@@ -137,7 +115,7 @@ fn derivative_strip<V: Vector>(
     }
 }
 dispatch!(
-    /// Writes the derivative maps of the columns, times `scale` and weight, and the sums of |x - y|, (x - y)^2 and SSIM.
+    /// Writes the derivative maps of the columns, times `scale`, and the sums of |x - y|, (x - y)^2 and SSIM.
     pub fn derivative_rows = derivative_kernel(
         pair: Pair,
         scale: f32,
@@ -192,19 +170,14 @@ fn gradient_kernel<V: Vector>(
 #[inline(always)]
 fn gradient_strip<V: Vector>(pair: Pair, l1: f32, row: usize, strip: &Strip, temp: &[Wide; 3], grad: &mut [f32]) {
     let at = row * pair.row_values() + strip.start;
-    let mut local = [Narrow::ZERO; 3];
+    let mut local = [Narrow::ZERO; 2];
     local[0].copy(&pair.image[at..at + strip.n]);
     local[1].copy(&pair.target[at..at + strip.n]);
-    weights(pair, row, strip, &mut local[2]);
     let zero = c::<V>(0.0);
     for i in (0..strip.n).step_by(V::LANES) {
-        let (x, y, w) = (
-            V::load(&local[0].0[i..]),
-            V::load(&local[1].0[i..]),
-            V::load(&local[2].0[i..]),
-        );
+        let (x, y) = (V::load(&local[0].0[i..]), V::load(&local[1].0[i..]));
         let [d_x, d_xx, d_xy] = horizontal::<V, 3>(temp, i);
-        let sign = (w * c(l1)).select(y.lt(x), zero) - (w * c(l1)).select(x.lt(y), zero);
+        let sign = c::<V>(l1).select(y.lt(x), zero) - c::<V>(l1).select(x.lt(y), zero);
         let g = y.mul_add(d_xy, (x + x).mul_add(d_xx, d_x + sign));
         g.store(&mut local[0].0[i..]);
     }

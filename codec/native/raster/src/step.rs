@@ -13,12 +13,11 @@ use crate::loss::{ImageLoss, LossValue};
 use crate::rasterizer::Rasterizer;
 use crate::scene::{Background, Gradients, Splats, View};
 
-/// The target of a view: [H, W, 3] and thrice [H, W] of the whole image, not of the region.
+/// The target of a view: [H, W, 3] and twice [H, W].
 #[derive(Clone, Copy)]
 pub struct TargetImage<'a> {
     pub rgb: &'a [u8],
     pub alpha: Option<&'a [u8]>,
-    pub weight: Option<&'a [f32]>,
     /// World units along the optical axis; 0: unknown.
     pub depth: Option<&'a [f32]>,
     /// Added by the camera to all light of the Gaussians; the loss compares what is left without it.
@@ -55,12 +54,11 @@ static BYTE: [f32; 256] = {
     table
 };
 
-/// Buffers of a step, [H, W, ...] of the region.
+/// Buffers of a step, [H, W, ...].
 #[derive(Default)]
 pub struct Step {
     loss: ImageLoss,
     target: Vec<f32>,
-    weight: Vec<f32>,
     grad_image: Vec<f32>,
     grad_alpha: Vec<f32>,
     grad_depth: Vec<f32>, // empty without a target depth
@@ -83,10 +81,9 @@ impl Step {
     ) -> Result<StepValue, RasterError> {
         splats.check()?;
         view.check()?;
-        let pixels = view.width * view.height;
+        let pixels = view.size.pixels();
         check_length("target rgb", target.rgb.len(), 3 * pixels)?;
         check_length("target alpha", target.alpha.map_or(pixels, <[u8]>::len), pixels)?;
-        check_length("weight", target.weight.map_or(pixels, <[f32]>::len), pixels)?;
         check_length("target depth", target.depth.map_or(pixels, <[f32]>::len), pixels)?;
         // gain sum(w rgb) + (1 - T) offset + T background, less the offset, is that over a background less the offset
         let less = std::array::from_fn(|ch| background.rgb[ch] - target.offset[ch]);
@@ -112,31 +109,21 @@ impl Step {
         target: TargetImage,
         lambdas: Lambdas,
     ) -> Result<StepValue, RasterError> {
-        let n = view.region.pixels();
+        let n = view.size.pixels();
         self.target.resize(3 * n, 0.0);
         self.grad_image.resize(3 * n, 0.0);
         self.grad_alpha.resize(n, 0.0);
-        self.rows.resize(view.region.height, [0.0; 8]);
+        self.rows.resize(view.size.height, [0.0; 8]);
         self.composite(r, view, background, target, lambdas.mask);
         let depth = self.depth_loss(r, view, target.depth, lambdas.depth);
-        let weight = target.weight.map(|w| {
-            let region = view.region;
-            self.weight.clear();
-            for y in region.y..region.y + region.height {
-                self.weight
-                    .extend_from_slice(&w[y * view.width + region.x..][..region.width]);
-            }
-            &self.weight[..]
-        });
         let pair = Pair {
             image: r.image(),
             target: &self.target,
-            width: view.region.width,
-            weight,
+            width: view.size.width,
         };
         let image = self.loss.run(r.level(), pair, lambdas.ssim, &mut self.grad_image)?;
         let mask = self.rows.iter().map(|s| s[0]).sum::<f64>() / n as f64;
-        let (gain, offset) = self.exposure_gradient(r, view.region.width, background, target.offset);
+        let (gain, offset) = self.exposure_gradient(r, view.size.width, background, target.offset);
         Ok(StepValue {
             image,
             mask,
@@ -156,16 +143,15 @@ impl Step {
         target: TargetImage,
         mask_lambda: f32,
     ) {
-        let region = view.region;
-        let width = region.width;
-        let slope = mask_lambda / region.pixels() as f32;
+        let width = view.size.width;
+        let slope = mask_lambda / view.size.pixels() as f32;
         let rows = self
             .target
             .par_chunks_mut(3 * width)
             .zip(self.grad_alpha.par_chunks_mut(width));
         let rows = rows.zip(r.alpha().par_chunks(width)).zip(&mut self.rows).enumerate();
         rows.for_each(|(y, (((out, grad), drawn), sums))| {
-            let at = (region.y + y) * view.width + region.x;
+            let at = y * width;
             let rgb = &target.rgb[3 * at..3 * (at + width)];
             let Some(alpha) = target.alpha.map(|a| &a[at..at + width]) else {
                 for (o, v) in out.as_chunks_mut::<3>().0.iter_mut().zip(rgb.as_chunks::<3>().0) {
@@ -200,26 +186,23 @@ impl Step {
         });
     }
 
-    /// The loss of depth, a mean over all pixels of the region. Writes its gradient by the sums, and adds that by alpha.
+    /// The loss of depth, a mean over all pixels. Writes its gradient by the sums, and adds that by alpha.
     fn depth_loss(&mut self, r: &Rasterizer, view: &View, target: Option<&[f32]>, lambda: f32) -> f64 {
         self.grad_depth.clear();
         let Some(target) = target else {
             return 0.0;
         };
-        let region = view.region;
-        self.grad_depth.resize(region.pixels(), 0.0);
-        let slope = lambda / region.pixels() as f32;
+        let (width, pixels) = (view.size.width, view.size.pixels());
+        self.grad_depth.resize(pixels, 0.0);
+        let slope = lambda / pixels as f32;
         let grads = self
             .grad_depth
-            .par_chunks_mut(region.width)
-            .zip(self.grad_alpha.par_chunks_mut(region.width));
-        let drawn = r
-            .depth()
-            .par_chunks(region.width)
-            .zip(r.alpha().par_chunks(region.width));
-        let rows = grads.zip(drawn).zip(&mut self.rows).enumerate();
-        rows.for_each(|(y, (((grad, grad_alpha), (drawn, alpha)), sums))| {
-            let target = &target[(region.y + y) * view.width + region.x..][..region.width];
+            .par_chunks_mut(width)
+            .zip(self.grad_alpha.par_chunks_mut(width));
+        let drawn = r.depth().par_chunks(width).zip(r.alpha().par_chunks(width));
+        let rows = grads.zip(drawn).zip(target.par_chunks(width)).zip(&mut self.rows);
+        rows.for_each(|(((grads, drawn), target), sums)| {
+            let ((grad, grad_alpha), (drawn, alpha)) = (grads, drawn);
             let mut sum = 0.0;
             for (x, &d) in target.iter().enumerate() {
                 if !(d > 0.0 && d.is_finite()) {
@@ -233,7 +216,7 @@ impl Step {
             }
             sums[7] = f64::from(sum);
         });
-        self.rows.iter().map(|s| s[7]).sum::<f64>() / region.pixels() as f64
+        self.rows.iter().map(|s| s[7]).sum::<f64>() / pixels as f64
     }
 
     /// By the gain: sum over pixels of g . (image - T background) / gain; by the offset: sum of g (1 - T).

@@ -10,9 +10,9 @@ use crate::forward::{Canvas, forward};
 use crate::framebuffer::{Surface, finish, finish_empty};
 use crate::parallel::parallel_for;
 use crate::projected::{Projected, TILE};
-use crate::region::Region;
 use crate::scene::Background;
 use crate::simd::SimdLevel;
+use crate::size::Size;
 use crate::tile::Hits;
 use crate::tile_binning::TileBins;
 
@@ -22,14 +22,14 @@ pub fn blend_tiles(
     level: SimdLevel,
     projected: &[Projected],
     bins: &TileBins,
-    region: Region,
+    size: Size,
     background: Background,
     surface: &mut Surface,
     seen: &mut [Hits],
 ) {
-    let width = region.width;
+    let width = size.width;
     let (top, left) = (bins.tiles.rows.start, bins.tiles.columns.start);
-    let pixels = top * TILE * width..(bins.tiles.rows.end * TILE).min(region.height) * width;
+    let pixels = top * TILE * width..(bins.tiles.rows.end * TILE).min(size.height) * width;
     let work = (surface.part(pixels), seen);
     let (rows, columns) = (bins.tiles.rows.len(), bins.tiles.columns.len());
     parallel_for(

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use crate::ellipse::{Ellipse, reach};
 use crate::projected::{MANY, Projected, SLACK, TILE};
-use crate::region::Region;
+use crate::size::Size;
 
 /// A rectangle of tiles.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -14,11 +14,11 @@ pub struct TileRect {
 }
 
 impl TileRect {
-    /// The tiles that cover a region.
-    pub fn of(region: Region) -> TileRect {
+    /// The tiles that cover an image.
+    pub fn of(size: Size) -> TileRect {
         TileRect {
-            columns: 0..region.width.div_ceil(TILE),
-            rows: 0..region.height.div_ceil(TILE),
+            columns: 0..size.width.div_ceil(TILE),
+            rows: 0..size.height.div_ceil(TILE),
         }
     }
 

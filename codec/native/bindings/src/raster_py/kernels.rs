@@ -9,24 +9,21 @@ use super::arrays::{In, InOut, contiguous, level, usage};
 
 /// (loss, l1, mse, ssim, gradient [H * W * 3]) of an image [H, W, 3].
 #[pyfunction]
-#[pyo3(signature = (image, target, weight, ssim_lambda, simd="auto"))]
+#[pyo3(signature = (image, target, ssim_lambda, simd="auto"))]
 #[allow(clippy::type_complexity)]
 pub fn image_loss<'py>(
     py: Python<'py>,
     image: In,
     target: In,
-    weight: Option<In>,
     ssim_lambda: f32,
     simd: &str,
 ) -> PyResult<(f64, f64, f64, f64, Bound<'py, PyArray1<f32>>)> {
     let (level, width) = (level(simd)?, image.shape().get(1).copied().unwrap_or(0));
-    let weight = weight.as_ref().map(|w| contiguous(w.as_slice())).transpose()?;
     let (x, y) = (contiguous(image.as_slice())?, contiguous(target.as_slice())?);
     let pair = Pair {
         image: x,
         target: y,
         width,
-        weight,
     };
     let (value, grad) = py
         .detach(|| {

@@ -13,7 +13,7 @@ use gsv::levels::{LEVELS, Level};
 use gsv::parametric::Frame;
 use gsv::pose::Pose;
 use gsv::unit;
-use raster::{Background, Band, Bands, Projected, Rasterizer, Region, SimdLevel, Splats, Surface, View, band_ends};
+use raster::{Background, Band, Bands, Projected, Rasterizer, SimdLevel, Size, Splats, Surface, View, band_ends};
 use std::fmt::Display;
 
 /// Most pixels of an image, 4096 x 4096: a failed allocation would end the instance.
@@ -226,7 +226,7 @@ impl Player {
         let input = numbers(&self.input);
         let (view, shown) = (view(&input), self.groups.get(self.shown));
         let given: Vec<usize> = input.iter().skip(VIEW).map(|v| *v as usize).collect();
-        let size = [view.width, view.height];
+        let size = view.size;
         let drawn = self.raster.project(&splats(shown), &view);
         let drawn = drawn.map(|projected| match given.is_empty() {
             true => self.bands.split(projected, size, bands).len(),
@@ -265,10 +265,10 @@ impl Player {
         self.splats.as_mut_ptr().cast()
     }
 
-    pub fn draw(&mut self, size: [usize; 2], background: [f32; 3]) -> bool {
+    pub fn draw(&mut self, size: Size, background: [f32; 3]) -> bool {
         let (background, splats) = (Background::new(background), &mut self.splats);
         self.pixels
-            .resize(size[0].saturating_mul(size[1]).min(MAX_PIXELS), [255; 4]);
+            .resize(size.width.saturating_mul(size.height).min(MAX_PIXELS), [255; 4]);
         let surface = Surface::Rgba(&mut self.pixels);
         let drawn = self
             .raster
@@ -367,18 +367,11 @@ fn view(numbers: &[f32]) -> View {
     let (width, height) = (v[0] as usize, v[1] as usize);
     let m = |i: usize, j: usize| v[6 + 4 * i + j];
     View {
-        width,
-        height,
+        size: Size { width, height },
         focal: [v[2], v[3]],
         center: [v[4], v[5]],
         rotation: std::array::from_fn(|i| std::array::from_fn(|j| m(i, j))),
         translation: std::array::from_fn(|i| m(i, 3)),
         near: v[18],
-        region: Region {
-            x: 0,
-            y: 0,
-            width,
-            height,
-        },
     }
 }

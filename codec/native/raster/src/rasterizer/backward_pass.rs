@@ -12,7 +12,7 @@ use crate::scene::{Gradients, Splats};
 use crate::tile_passes::backward_tiles;
 
 impl Rasterizer {
-    /// Gradients of the last image rendered with `training`. `grad_image` [H, W, 3] and `grad_alpha` [H, W] of the region;
+    /// Gradients of the last image rendered with `training`. `grad_image` [H, W, 3] and `grad_alpha` [H, W];
     /// `grad_depth` likewise where depth was rendered, or empty.
     ///
     /// # Errors
@@ -38,7 +38,7 @@ impl Rasterizer {
         out: &mut Gradients,
     ) -> Result<(), RasterError> {
         out.check(splats)?;
-        let Some((lens, region, background)) = self.drawn.take() else {
+        let Some((lens, size, background)) = self.drawn.take() else {
             return Err(RasterError::NothingRendered);
         };
         check_length(
@@ -46,8 +46,8 @@ impl Rasterizer {
             splats.len(),
             self.projected.len(),
         )?;
-        check_length("gradient of the image", grad_image.len(), 3 * region.pixels())?;
-        check_length("gradient of alpha", grad_alpha.len(), region.pixels())?;
+        check_length("gradient of the image", grad_image.len(), 3 * size.pixels())?;
+        check_length("gradient of alpha", grad_alpha.len(), size.pixels())?;
         if !grad_depth.is_empty() {
             check_length("gradient of depth", grad_depth.len(), self.depth.len())?;
         }
@@ -60,7 +60,7 @@ impl Rasterizer {
             grad_depth,
             grad_image,
             grad_alpha,
-            width: region.width,
+            width: size.width,
         };
         let (level, projected, seen) = (self.level, &self.projected, &self.seen);
         backward_tiles(level, projected, &self.bins, &pixels, background, seen, &mut self.sums);
@@ -68,7 +68,7 @@ impl Rasterizer {
         let start = Clock::start();
         self.backward_gaussians(splats, &lens, out);
         self.timings.backward_project = start.ms();
-        self.drawn = Some((lens, region, background));
+        self.drawn = Some((lens, size, background));
         Ok(())
     }
 

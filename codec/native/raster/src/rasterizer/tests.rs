@@ -24,38 +24,23 @@ fn draw_at(level: SimdLevel, n: usize, log_scale: f32, size: usize, training: bo
         sh_k: 0,
         turns: &[],
     };
-    let region = Region {
-        x: 0,
-        y: 0,
-        width: size,
-        height: size,
-    };
     let view = View {
-        width: size,
-        height: size,
+        size: Size {
+            width: size,
+            height: size,
+        },
         focal: [size as f32; 2],
         center: [0.5 * size as f32; 2],
         rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
         translation: [0.0; 3],
         near: crate::constants::NEAR,
-        region,
     };
     let mut r = Rasterizer::new(level, 0);
     r.forward(&splats, &view, Background::new([0.1, 0.2, 0.3]), training, training)
         .unwrap();
-    let mut grads = [3, 4, 3, 1, 3, 0, 1, 1, 1].map(|d| vec![0.0; d * n]);
+    let mut grads = [3, 4, 3, 1, 3, 0, 1, 1].map(|d| vec![0.0; d * n]);
     if training {
-        let [
-            means,
-            quats,
-            log_scales,
-            logit_opacities,
-            sh0,
-            sh_n,
-            grad2d,
-            max_weight,
-            sum_weight,
-        ] = &mut grads;
+        let [means, quats, log_scales, logit_opacities, sh0, sh_n, grad2d, max_weight] = &mut grads;
         let mut out = Gradients {
             add: false,
             means,
@@ -66,7 +51,6 @@ fn draw_at(level: SimdLevel, n: usize, log_scale: f32, size: usize, training: bo
             sh_n,
             grad2d,
             max_weight,
-            sum_weight,
         };
         let slope: Vec<f32> = (0..3 * size * size).map(|i| (0.1 * i as f32).sin()).collect();
         let (grad_alpha, grad_depth) = (&slope[..size * size], &slope[size * size..2 * size * size]);

@@ -1,15 +1,13 @@
-//! The part of an image that is rendered.
+//! The size of an image.
 
-/// A rectangle of pixels of the view.
+/// Width and height in pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Region {
-    pub x: usize,
-    pub y: usize,
+pub struct Size {
     pub width: usize,
     pub height: usize,
 }
 
-impl Region {
+impl Size {
     pub fn pixels(&self) -> usize {
         self.width * self.height
     }
