@@ -5,13 +5,15 @@ are full rooms, into one of which a ball drops; the others are stress cases. ben
 per capture and variant, all from the same seed and preset; "another seed" says which differences mean nothing. `psnr`
 is that of the model before coding, `psnr_coded` that of the decoded stream; both are measured on the test cameras, of
 the subject where there are masks. A variant is a change of the training settings, so that each entry can be repeated by
-any caller of the training. What moves the nodes is compared at equal time: a variant that is faster or slower than the
-whole recipe is trained again with as many more steps a frame, or fewer.
+any caller of the training; but for V3's recipe (`baselines/v3.py`), which has a hash grid for each frame and a packing
+of its own. What moves Gaussians is compared at equal time: a variant that is faster or slower than the whole recipe is
+trained again with as many more steps a frame, or fewer.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +21,7 @@ from pathlib import Path
 from gscodec.capture import Capture
 from gscodec.encode.settings import EncodeSettings
 from gscodec.errors import UsageError
-from gscodec.model.parametric_group import ParametricGroup
+from gscodec.model.gaussians import Gaussians
 from gscodec.train.settings import MOTIONS, TrackingSettings, TrainSettings, train_settings
 
 from . import train
@@ -34,17 +36,49 @@ EQUAL = 0.05  # share by which times may differ
 
 
 @dataclass(frozen=True)
+class Trained:
+    """A sequence that a recipe has trained.
+
+    Attributes:
+        models: Gaussians of each frame. groups: frames in each group.
+        code: bytes and decoded frames of the stream.
+    """
+
+    models: list[Gaussians]
+    groups: list[int]
+    code: Callable[[], tuple[int, list[Gaussians]]]
+
+
+def ours(capture: Capture, settings: TrainSettings, quality: float) -> Trained:
+    """gscodec's training and coding."""
+    groups, _ = train.sequence(capture, settings)
+    code = lambda: train.coded(capture, groups, settings, EncodeSettings(quality))[:2]  # noqa: E731
+    return Trained(train.shown(groups), [len(g) for g in groups], code)
+
+
+def v3(capture: Capture, settings: TrainSettings, _: float) -> Trained:
+    """V3's, with the steps of a frame that the settings have."""
+    from .baselines.v3 import train_v3
+
+    steps = (settings.motion_steps, settings.finetune_steps)
+    models = train_v3(capture, range(capture.frame_count), settings, steps)
+    return Trained(models, [len(models)], lambda: train.v3_coded(models))
+
+
+@dataclass(frozen=True)
 class Variant:
     """A change of the settings.
 
     Attributes:
         captures: those that use what it takes away.
         equal_time: the steps of a frame are scaled until training takes as long as the whole recipe.
+        recipe: what trains and codes.
     """
 
     change: Callable[[TrainSettings], TrainSettings]
     captures: tuple[str, ...] = (LUMBERJACK, STAGE)
     equal_time: bool = False
+    recipe: Callable[[Capture, TrainSettings, float], Trained] = ours
 
 
 def run_with(**values) -> Callable[[TrainSettings], TrainSettings]:
@@ -71,6 +105,9 @@ VARIANTS = {
         ),
         tuple(FRAMES),
         equal_time=True,
+    ),
+    "V3's grid": Variant(  # steps of motion and of fine-tuning in the proportion of its public code
+        run_with(motion_steps=100, finetune_steps=250), tuple(FRAMES), equal_time=True, recipe=v3
     ),
     "harmonics stay in the world": Variant(run_with(turned_harmonics=False), tuple(FRAMES)),
     "no rate term": Variant(run_with(rate_lambda=0.0)),
@@ -135,13 +172,19 @@ def _entries(capture: Capture, names: Sequence[str], preset: str, quality: float
     for name in names:
         variant = VARIANTS[name]
         settings = variant.change(train_settings(preset, quality=quality))
-        groups, seconds = train.sequence(capture, settings)
+        trained, seconds = _timed(variant.recipe, capture, settings, quality)
         if name == WHOLE:
             whole = seconds
         elif variant.equal_time and abs(whole / seconds - 1) > EQUAL:
             settings = _with_steps(settings, whole / seconds)
-            groups, seconds = train.sequence(capture, settings)
-        yield {"variant": name, "preset": preset, **_measured(capture, groups, seconds, settings, quality)}
+            trained, seconds = _timed(variant.recipe, capture, settings, quality)
+        yield {"variant": name, "preset": preset, **_measured(capture, trained, seconds, settings, quality)}
+
+
+def _timed(recipe: Callable[..., Trained], *args) -> tuple[Trained, float]:
+    """What a recipe trains, and the seconds."""
+    start = time.perf_counter()
+    return recipe(*args), time.perf_counter() - start
 
 
 def _with_steps(settings: TrainSettings, factor: float) -> TrainSettings:
@@ -150,22 +193,19 @@ def _with_steps(settings: TrainSettings, factor: float) -> TrainSettings:
     return replace(settings, **steps)
 
 
-def _measured(
-    capture: Capture, groups: list[ParametricGroup], seconds: float, settings: TrainSettings, quality: float
-) -> dict:
-    models = train.shown(groups)
-    size, decoded, *_ = train.coded(capture, groups, settings, EncodeSettings(quality))
-    model, stream = (train.evaluate(capture, frames) for frames in (models, decoded))
+def _measured(capture: Capture, trained: Trained, seconds: float, settings: TrainSettings, quality: float) -> dict:
+    size, decoded = trained.code()
+    model, stream = (train.evaluate(capture, frames) for frames in (trained.models, decoded))
     return {
         "quality": quality,
-        "frames": len(models),
+        "frames": len(decoded),
         "psnr": model["psnr_fg"] or model["psnr"],
         "psnr_coded": stream["psnr_fg"] or stream["psnr"],
-        "kb_per_frame": size / 1000 / len(models),
+        "kb_per_frame": size / 1000 / len(decoded),
         "haze": stream["haze"],
         "flicker": stream["flicker"],
         "gaussians": model["gaussians"],
-        "groups": [len(g) for g in groups],
+        "groups": trained.groups,
         "steps": [settings.motion_steps, settings.finetune_steps],
-        "seconds_per_frame": round(seconds / len(models), 2),
+        "seconds_per_frame": round(seconds / len(decoded), 2),
     }

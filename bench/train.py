@@ -220,18 +220,25 @@ def _full(capture: Capture, frames: range, settings, _) -> Iterator[tuple]:
 
 
 def _v3(capture: Capture, frames: range, settings, _) -> Iterator[tuple]:
-    from .baselines import videogs
     from .baselines.v3 import train_v3
 
     start = time.perf_counter()
     models = train_v3(part(capture, frames), range(len(frames)), settings)
     yield "v3", time.perf_counter() - start, None, models
+    size, decoded = v3_coded(models)
+    yield "v3-coded", time.perf_counter() - start, size, decoded
+
+
+def v3_coded(models: list[Gaussians]) -> tuple[int, list[Gaussians]]:
+    """Bytes of frames in V3's packing, and the decoded frames."""
+    from .baselines import videogs
+
     size, decoded = 0, []
     for first in range(0, len(models), V3_GOP):
         files = videogs.encode(models[first : first + V3_GOP], **V3_PACKING)
         size += sum(map(len, files.values()))
         decoded += videogs.decode(files)
-    yield "v3-coded", time.perf_counter() - start, size, decoded
+    return size, decoded
 
 
 def sequence(capture: Capture, settings) -> tuple[list[ParametricGroup], float]:

@@ -158,3 +158,9 @@ def test_the_table_of_sources_is_that_of_the_results():
     page = sources.PAGE.read_text()
     assert sources.with_table(page) == page, "run python -m bench.sources"
     assert len(rows("figures")) > 15
+
+
+def test_every_result_is_of_a_commit_without_changes():
+    for file in RESULTS.glob("*.json"):
+        dirty = set(re.findall(r'"commit": "(\w*\+)"', file.read_text()))
+        assert not dirty, f"{file.name}: measure it again"

@@ -53,9 +53,10 @@ class MotionField(torch.nn.Module):
         return out[:, :3] * OUTPUT[0], out[:, 3:] * OUTPUT[1]
 
 
-def train_v3(capture, frames: range, settings: TrainSettings) -> list:
-    """Gaussians of each frame: a keyframe for the first, then one frame from the other."""
-    settings = replace(settings, sh_degree=0)  # its packing has no more
+def train_v3(capture, frames: range, settings: TrainSettings, steps: tuple[int, int] = STEPS) -> list:
+    """Gaussians of each frame: a keyframe for the first, then one frame from the other, by `steps` of motion and of
+    fine-tuning."""
+    settings = replace(settings.of_capture(capture), sh_degree=0)  # its packing has no more
     views = Views(capture, settings, CpuBackend())
     model, radius = initial_model(capture, frames[0], settings.initial_points or POINTS, settings)
     train_keyframe(model, views, frames[0], settings, steps=settings.keyframe_steps, radius=radius)
@@ -63,13 +64,15 @@ def train_v3(capture, frames: range, settings: TrainSettings) -> list:
     torch.manual_seed(settings.seed)
     field = MotionField()
     for frame in frames[1:]:
-        model = _moved(model, field, views, frame, settings, radius)
-        _fine(model, views, frame, settings, radius)
+        model = _moved(model, field, views, frame, settings, radius, steps[0])
+        _fine(model, views, frame, settings, radius, steps[1])
         out.append(model.gaussians())
     return out
 
 
-def _moved(model: Model, field: MotionField, views: Views, frame: int, settings: TrainSettings, radius: float) -> Model:
+def _moved(
+    model: Model, field: MotionField, views: Views, frame: int, settings: TrainSettings, radius: float, steps: int
+) -> Model:
     rng = np.random.default_rng([settings.seed, frame, 3])
     p = model.params
     low, high = p["means"].min(0).values, p["means"].max(0).values
@@ -79,26 +82,26 @@ def _moved(model: Model, field: MotionField, views: Views, frame: int, settings:
         {"params": field.mlp.parameters(), "base": FIELD_RATES["mlp"]},
     ]
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
-    for step in range(STEPS[0] + 1):
+    for step in range(steps + 1):
         move, turn = field(unit)
         means = p["means"] + radius * move
         quats = quat_multiply(rotvec_to_quat(turn), p["quats"])
-        if step == STEPS[0]:
+        if step == steps:
             return Model({**p, "means": means, "quats": quats})
         moved = {**p, "means": means, "quats": quats}
         grads = photometric_loss(moved, views.draw(frame), settings, rng, views.backend).grads
         for g in optimizer.param_groups:
-            g["lr"] = g["base"] * 0.1 ** (step / STEPS[0])
+            g["lr"] = g["base"] * 0.1 ** (step / steps)
         optimizer.zero_grad()
         torch.autograd.backward([means, quats], [grads["means"], grads["quats"]])
         optimizer.step()
 
 
-def _fine(model: Model, views: Views, frame: int, settings: TrainSettings, radius: float) -> None:
+def _fine(model: Model, views: Views, frame: int, settings: TrainSettings, radius: float, steps: int) -> None:
     rng = np.random.default_rng([settings.seed, frame, 4])
     model.start_optimizer(views.backend, settings.adam)
-    for step in range(STEPS[1]):
-        fade = 0.1 ** (step / STEPS[1])
+    for step in range(steps):
+        fade = 0.1 ** (step / steps)
         grads = photometric_loss(model.params, views.draw(frame), settings, rng, views.backend).grads
         rates = settings.keyframe.rates.scaled(radius, FINE_SHARE * fade)
         model.step(grads, {**rates, "means": MEANS_RATE * radius * fade})
