@@ -55,6 +55,24 @@ def test_the_first_frame_that_is_fitted_may_lose_more_than_the_next(capture, mon
     assert (len(first), first.ended) == (2, "cut")
 
 
+@pytest.mark.parametrize(("last", "lengths"), [(6, [3, 3]), (7, [3, 2, 2])])
+def test_few_frames_that_drift_pay_for_no_keyframe(last, lengths, monkeypatch):
+    """From frame 5 on. Of six frames one is left, less than a quarter of the five that the keyframe has lasted."""
+    advance = Tracker.advance
+
+    def scripted(self, frame, on_step=None):
+        key = self.loss / (1.2 if frame > 1 else 1.0)
+        advance(self, frame, on_step)
+        self.loss = 1.2 * key
+        return self.loss * (2 if frame == 5 else 1)
+
+    monkeypatch.setattr(Tracker, "advance", scripted)
+    group = dataclasses.replace(TINY.group, drift_ratio=2.0, cut_loss_floor=0.0)
+    settings = dataclasses.replace(TINY, group=group, cut_ratio=10.0)
+    groups = list(train_groups(capture_of(turning(300, frames=last)), settings))
+    assert [len(g) for g in groups] == lengths
+
+
 def test_larger_pictures_have_longer_keyframes_whose_fit_frames_need_not_reach():
     """The same for a keyframe that a preset trains longer; small pictures change neither its fit nor the bound."""
 

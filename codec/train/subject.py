@@ -22,7 +22,8 @@ class Subject:
 
     Attributes:
         tracker: holds them as they are in the last frame.
-        loss: image loss of their keyframe.
+        first: frame of their keyframe.
+        loss: image loss of it.
         radius: of the points that the keyframe started from, without the far shell, world units.
         canonical: Gaussians that all groups since the keyframe refer to; None before the first is fine-tuned.
         parents: [N] index of each Gaussian in the group before.
@@ -30,6 +31,7 @@ class Subject:
     """
 
     tracker: Tracker
+    first: int
     loss: float
     radius: float
     canonical: Model | None = None
@@ -48,7 +50,7 @@ class Subject:
         canonical = {f"canonical.{n}": p.numpy() for n, p in self.canonical.params.items()}
         exposure, poses = self.tracker.views.exposure, self.tracker.views.extrinsics
         cameras = {"exposure": exposure.values, "extrinsics": poses.values, "center": poses.center}
-        whole = {"loss_radius": np.array([self.loss, self.radius]), "parents": self.parents}
+        whole = {"keyframe": np.array([self.first, self.loss, self.radius]), "parents": self.parents}
         whole["steps"] = _steps_to_array(self.steps)
         return {**whole, **cameras, **canonical, **self.tracker.state()}
 
@@ -58,12 +60,12 @@ class Subject:
     ) -> Subject:
         """Inverse of `state`; also sets the calibration of `views`."""
         canonical = {n: torch.from_numpy(state[f"canonical.{n}"]) for n in NAMES}
-        loss, radius = state["loss_radius"].tolist()
+        first, loss, radius = state["keyframe"].tolist()
         views.exposure.values, views.extrinsics.values = state["exposure"], state["extrinsics"]
         views.extrinsics.set_subject(state["center"], radius)
         steps = _steps_from_array(state["steps"])
         tracker = Tracker.restored(state, views, settings, rig)
-        return Subject(tracker, loss, radius, Model(canonical), state["parents"], steps)
+        return Subject(tracker, int(first), loss, radius, Model(canonical), state["parents"], steps)
 
 
 def _steps_to_array(steps: Steps | None) -> np.ndarray:

@@ -65,10 +65,10 @@ def train_groups(
     """Trains `capture` from `first_frame` on and yields each group when it is done.
 
     A group continues the Gaussians of the one before (`parents`). It ends early before a frame whose image loss is
-    `cut_ratio` times that of the tracked frame before, or `drift_ratio` times that of the keyframe, and before one in
-    which a large fraction of the Gaussians begins to change; then the next group starts with a keyframe. Frames without
-    a subject, until a camera sees something, are a group without Gaussians. Every segment of `random_access` frames
-    starts with a keyframe: a segment depends on no frames but its own.
+    `cut_ratio` times that of the tracked frame before, or `drift_ratio` times that of the keyframe (unless few frames
+    are left), and before one in which a large fraction of the Gaussians begins to change; then the next group starts
+    with a keyframe. Frames without a subject, until a camera sees something, are a group without Gaussians. Every
+    segment of `random_access` frames starts with a keyframe: a segment depends on no frames but its own.
 
     Args:
         first_frame: where an earlier run stopped, the first frame of a group.
@@ -95,7 +95,7 @@ def train_groups(
     for segment in segments(capture.frame_count, settings.gop, random_access):
         while start < segment.stop:
             run.estimate(capture.frame_count - start)
-            group = run.group(range(start, min(start + settings.gop, segment.stop)))
+            group = run.group(range(start, min(start + settings.gop, segment.stop)), segment.stop)
             calibration = run.views.calibration(range(start, start + len(group)))
             start += len(group)
             if start == segment.stop:
@@ -141,11 +141,11 @@ class _Run:
 
         return on_step
 
-    def group(self, frames: range) -> ParametricGroup:
-        """Trains one group, of all `frames` or of the first ones."""
+    def group(self, frames: range, stop: int) -> ParametricGroup:
+        """Trains one group, of all `frames` or of the first ones; Gaussians are followed up to frame `stop` at most."""
         track = _TrackedFrames()
         self.views.restart_order()
-        ended = "" if self.subject is None else self._track(frames, track)
+        ended = "" if self.subject is None else self._track(frames, stop, track)
         parents = self.subject.parents if track.models else None
         if parents is None:  # no Gaussians to track, or cut at once
             self.subject = None
@@ -153,7 +153,7 @@ class _Run:
                 return ParametricGroup(empty, Gaussians.none(), ended="empty" if empty < len(frames) else "")
             self.subject = self._keyframe(frames)
             track.add(self.subject.tracker)
-            ended = self._track(frames[1:], track)
+            ended = self._track(frames[1:], stop, track)
         subject, done = self.subject, frames[: len(track.models)]
         if ended:
             self.subject = None
@@ -184,14 +184,16 @@ class _Run:
         model, radius = initial_model(self.capture, frames[0], budget.points, s, self.views.view)
         on_step = self._report(f"keyframe {frames[0]}")
         loss = train_keyframe(model, self.views, frames[0], s, steps=budget.steps, radius=radius, on_step=on_step)
-        return Subject(Tracker.start(model, self.views, s, loss, frames, self.rig), loss, radius)
+        return Subject(Tracker.start(model, self.views, s, loss, frames, self.rig), frames[0], loss, radius)
 
-    def _track(self, frames: range, track: _TrackedFrames) -> str:
+    def _track(self, frames: range, stop: int, track: _TrackedFrames) -> str:
         """Tracks `frames` up to the end of the group and adds them to `track`; returns why that came early
         (`ParametricGroup.ended`); then the next group needs a keyframe.
 
         The group ends where a large fraction of resting Gaussians changes at once: with few temporal frequencies, a
         light that is switched on would show in all frames of the group, and what was frozen without it shows it badly.
+        Where a keyframe has lasted long, the few frames that are left before `stop` lose little more by drift, and do
+        not pay for another one.
         """
         subject, g = self.subject, self.settings.group
         for frame in frames:
@@ -201,6 +203,8 @@ class _Run:
             near, far = self.settings.cut_ratio * subject.tracker.loss, g.drift_ratio * subject.loss
             if subject.tracker.loss == subject.loss:  # a keyframe's own fit, which no tracked frame comes near
                 near = far
+            if stop - frame < g.drift_share * (frame - subject.first):
+                far = np.inf
             loss = subject.tracker.advance(frame, self._report(f"track {frame}"))
             if loss is not None and loss > min(near, far) + g.cut_loss_floor:
                 return "cut" if near <= far else "drift"
