@@ -34,8 +34,9 @@ def commit() -> str:
 
 
 def write_result(path: Path, result: dict) -> None:
-    """Writes machine, commit and `result` to `path`, complete or not at all."""
-    _write(path, {"machine": machine(), "commit": commit(), **result})
+    """Writes to `path`, complete or not at all, `result` and how it was measured: machine, commit, seconds since the
+    last result of this process, and the cores that other processes kept busy meanwhile."""
+    _write(path, {"machine": machine(), "commit": commit(), **_SINCE_THE_LAST_RESULT.lap(), **result})
 
 
 def update_entries(
@@ -79,6 +80,9 @@ class _Clock:
         before, self._last = self._last, self._now()
         wall, busy, own = (b - a for a, b in zip(before, self._last, strict=True))
         return {"seconds": round(wall, 1), "busy_beside": round(max(0.0, busy - own) / max(wall, 1e-9), 2)}
+
+
+_SINCE_THE_LAST_RESULT = _Clock()
 
 
 def stamp(entries: Iterable[dict]) -> str:

@@ -1,6 +1,5 @@
 """Where each figure of README.md and docs/ comes from: its file in bench/results, the command that makes it, the commit
-at which it was measured ("+": with changes that were not committed; in older ones also of results alone), and the cores
-that other work kept busy meanwhile.
+at which it was measured, without changes of its own, and the cores that other work kept busy meanwhile.
 
 usage: python -m bench.sources        writes the table into docs/figures.md; a test compares both
 """
@@ -23,6 +22,8 @@ FILES = {  # what -> file, command
     "yellow_clip3.splatv": ("splatv.json", "python -m bench.run splatv"),
     "rasterizer": ("raster.json", "gscodec bench raster"),
     "tiles": ("tiles.json", "python -m bench.tiles"),
+    "layers": ("layers.json", "python -m bench.layers"),
+    "rate term beside the bits of the coder": ("rate_term.json", "python -m bench.rate_term"),
 }
 
 
@@ -45,6 +46,8 @@ def _rows() -> Iterator[tuple[str, ...]]:
         ("rd.json", "other codecs", "gscodec bench rd"),
         ("ablation.json", "losses and tools", "gscodec bench ablation"),
         ("stress.json", "stress", "gscodec bench stress"),
+        ("gop.json", "length of groups", "python -m bench.gop"),
+        ("rig.json", "a rig", "python -m bench.rig"),
         ("fuzz.json", "fuzzing", "python -m bench.fuzz"),
     ):
         yield what, file, f"`{command}`", _commits(_entries(file)), "-"

@@ -12,7 +12,7 @@ from types import ModuleType
 
 from gscodec.model.gaussians import Gaussians
 
-from . import draco, gsav, sog, spz, svt_av1, videogs, webp, x265_anchor, zstd
+from . import draco, gpcc, gsav, sog, spz, svt_av1, videogs, webp, x265_anchor, zstd
 from .maps import order_of
 
 
@@ -50,6 +50,7 @@ BASELINES = {
     "webp": Baseline(webp, webp.SETTINGS, order_of),
     "zstd": Baseline(zstd, zstd.SETTINGS),
     "draco": Baseline(draco, draco.SETTINGS, per_frame=True),
+    "gpcc": Baseline(gpcc, gpcc.SETTINGS, per_frame=True),
     "sog": Baseline(sog, sog.SETTINGS, per_frame=True),
     "spz": Baseline(spz, spz.SETTINGS, per_frame=True),
 }

@@ -19,6 +19,7 @@ LOOK = {  # codec -> (name on the chart, colour)
     "webp": ("WebP of all frames", "#c49a00"),
     "zstd": ("zstd of planes", "#7a7a7a"),
     "draco": ("Draco each frame", "#7d4f9e"),
+    "gpcc": ("G-PCC each frame", "#d0679b"),
     "sog": ("SOG each frame", "#111111"),
     "spz": ("SPZ each frame", "#b07aa1"),
 }
