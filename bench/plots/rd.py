@@ -46,7 +46,7 @@ def size_chart(result: dict):
         sizes, tops = zip(*(p for points in swapped.values() for p in points), strict=True)
         axes.set(xlabel="kB a frame", ylabel="codec PSNR, dB", xscale="log")
         axes.set(xlim=_limits(sizes), ylim=(PSNR_MIN, max(tops) + 1))
-        _plain_ticks(axes.xaxis, (10, 20, 50, 100, 200, 500, 1000))
+        _plain_ticks(axes.xaxis, (2, 5, 10, 20, 50, 100, 200, 500, 1000))
         _lines(axes, swapped, end_by=1)
         axes.set_title(f"{SEQUENCES[name]}\n{_saving(result, name)}", loc="left", fontsize=9.5)
     figure.suptitle("Size against quality: up and to the left is better", x=0.01, ha="left", fontsize=11, weight="bold")
@@ -183,4 +183,4 @@ def _saving(result: dict, sequence: str) -> str:
 
 def _footer(figure, result: dict) -> None:
     text = f"{stamp(result['entries'])}; PSNR on every {result['settings']['psnr_every']}th frame"
-    figure.text(0.995, 0.995, text, ha="right", va="top", fontsize=7, color="#888888")
+    figure.supxlabel(text, x=0.995, ha="right", fontsize=7, color="#888888")
