@@ -10,6 +10,7 @@ Bits per Gaussian.
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -42,15 +43,18 @@ def rows(capture, weight: float) -> list[dict]:
     cameras = [capture.cameras[i] for i in capture.indices("train")]
     coder = GroupCoder(EncodeSettings(QUALITY, refine=0), cameras=lambda _: cameras)
     coded, _ = coder.code(None, group, coder.measure(group, 0), QUALITY, 0)
+    bits = Counter()
+    for unit in coded.units:  # of all layers
+        if unit["type"] == "channels":
+            bits[unit["attribute"]] += 8 * unit["bytes"]
     return [
         {
             "rate_lambda": weight,
-            "attribute": unit["attribute"],
-            "estimated": round(estimated[unit["attribute"]].item() / len(model), 2),
-            "coded": round(8 * unit["bytes"] / coded.gaussians, 2),
+            "attribute": name,
+            "estimated": round(estimated[name].item() / len(model), 2),
+            "coded": round(count / coded.gaussians, 2),
         }
-        for unit in coded.units
-        if unit["type"] == "channels"
+        for name, count in bits.items()
     ]
 
 
