@@ -40,29 +40,30 @@ class Trained:
     """A sequence that a recipe has trained.
 
     Attributes:
-        models: Gaussians of each frame. groups: frames in each group.
+        models: Gaussians of each frame. groups: frames in each group. seconds: of training.
         code: bytes and decoded frames of the stream.
     """
 
     models: list[Gaussians]
     groups: list[int]
+    seconds: float
     code: Callable[[], tuple[int, list[Gaussians]]]
 
 
 def ours(capture: Capture, settings: TrainSettings, quality: float) -> Trained:
     """gscodec's training and coding."""
-    groups, _ = train.sequence(capture, settings)
+    groups, seconds = train.sequence(capture, settings)
     code = lambda: train.coded(capture, groups, settings, EncodeSettings(quality))[:2]  # noqa: E731
-    return Trained(train.shown(groups), [len(g) for g in groups], code)
+    return Trained(train.shown(groups), [len(g) for g in groups], seconds, code)
 
 
 def v3(capture: Capture, settings: TrainSettings, _: float) -> Trained:
     """V3's, with the steps of a frame that the settings have."""
     from .baselines.v3 import train_v3
 
-    steps = (settings.motion_steps, settings.finetune_steps)
+    steps, start = (settings.motion_steps, settings.finetune_steps), time.perf_counter()
     models = train_v3(capture, range(capture.frame_count), settings, steps)
-    return Trained(models, [len(models)], lambda: train.v3_coded(models))
+    return Trained(models, [len(models)], time.perf_counter() - start, lambda: train.v3_coded(models))
 
 
 @dataclass(frozen=True)
@@ -172,19 +173,13 @@ def _entries(capture: Capture, names: Sequence[str], preset: str, quality: float
     for name in names:
         variant = VARIANTS[name]
         settings = variant.change(train_settings(preset, quality=quality))
-        trained, seconds = _timed(variant.recipe, capture, settings, quality)
+        trained = variant.recipe(capture, settings, quality)
         if name == WHOLE:
-            whole = seconds
-        elif variant.equal_time and abs(whole / seconds - 1) > EQUAL:
-            settings = _with_steps(settings, whole / seconds)
-            trained, seconds = _timed(variant.recipe, capture, settings, quality)
-        yield {"variant": name, "preset": preset, **_measured(capture, trained, seconds, settings, quality)}
-
-
-def _timed(recipe: Callable[..., Trained], *args) -> tuple[Trained, float]:
-    """What a recipe trains, and the seconds."""
-    start = time.perf_counter()
-    return recipe(*args), time.perf_counter() - start
+            whole = trained.seconds
+        elif variant.equal_time and abs(whole / trained.seconds - 1) > EQUAL:
+            settings = _with_steps(settings, whole / trained.seconds)
+            trained = variant.recipe(capture, settings, quality)
+        yield {"variant": name, "preset": preset, **_measured(capture, trained, settings, quality)}
 
 
 def _with_steps(settings: TrainSettings, factor: float) -> TrainSettings:
@@ -193,7 +188,7 @@ def _with_steps(settings: TrainSettings, factor: float) -> TrainSettings:
     return replace(settings, **steps)
 
 
-def _measured(capture: Capture, trained: Trained, seconds: float, settings: TrainSettings, quality: float) -> dict:
+def _measured(capture: Capture, trained: Trained, settings: TrainSettings, quality: float) -> dict:
     size, decoded = trained.code()
     model, stream = (train.evaluate(capture, frames) for frames in (trained.models, decoded))
     return {
@@ -207,5 +202,5 @@ def _measured(capture: Capture, trained: Trained, seconds: float, settings: Trai
         "gaussians": model["gaussians"],
         "groups": trained.groups,
         "steps": [settings.motion_steps, settings.finetune_steps],
-        "seconds_per_frame": round(seconds / len(decoded), 2),
+        "seconds_per_frame": round(trained.seconds / len(decoded), 2),
     }

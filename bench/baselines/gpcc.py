@@ -12,17 +12,15 @@ Gaussians in one place would be one point, so that the second moves to the next 
 
 from __future__ import annotations
 
-import os
-import shutil
-import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from gscodec.errors import UsageError
 from gscodec.model.gaussians import Gaussians
+
+from .tool import run_tool
 
 SETTINGS = {
     f"{p} bit, QP {qp}": {"position": p, "qp": qp}
@@ -33,20 +31,7 @@ SPARSE = "inferredDirectCodingMode=3 maxNumQtBtBeforeOt=6 minQtbtSizeLog2=0 plan
 CONTEXTS = "neighbourAvailBoundaryLog2=8 intra_pred_max_node_size_log2=6 rahtPredictionSearchRange=2500"
 POINTS, ATTRIBUTES = 2, (4, 7)  # types of units of the byte stream that hold points, or attributes
 STEPS = 255  # of an attribute
-
-
-def tmc3() -> str:
-    """The command.
-
-    Raises:
-        UsageError: it is not installed.
-    """
-    found = shutil.which(os.environ.get("TMC3", "tmc3"))
-    if not found:
-        raise UsageError(
-            "the G-PCC baseline needs tmc3, built from https://github.com/MPEGGroup/mpeg-pcc-tmc13, or named in TMC3"
-        )
-    return found
+NEEDED = "the G-PCC baseline needs tmc3; build it from https://github.com/MPEGGroup/mpeg-pcc-tmc13"
 
 
 def encode(frames: Sequence[Gaussians], position: int, qp: int) -> dict[str, bytes]:
@@ -155,7 +140,4 @@ def _units(stream: bytes) -> Iterator[bytes]:
 
 
 def _run(options: str, *paths: str) -> None:
-    arguments = [f"--{o}" for o in (*options.split(), *paths)]
-    done = subprocess.run([tmc3(), *arguments], capture_output=True, text=True)
-    if done.returncode:
-        raise UsageError(f"tmc3 failed: {(done.stderr or done.stdout).strip()[-500:]}")
+    run_tool("tmc3", "TMC3", NEEDED, [f"--{o}" for o in (*options.split(), *paths)])
