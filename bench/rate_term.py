@@ -72,7 +72,6 @@ def correlations(table: list[dict]) -> dict[str, float]:
 def main() -> None:
     """Writes the table."""
     argparse.ArgumentParser(description=__doc__.split("\n")[0]).parse_args()
-    torch.set_num_threads(1)  # as the commands do
     capture = replace(open_capture(data_folder() / "lumberjack"), frame_count=FRAMES)
     table = [row for weight in WEIGHTS for row in rows(capture, weight)]
     correlation = correlations(table)

@@ -110,12 +110,10 @@ def capture_of(f: Figure) -> Capture:
 
 def training(work: Path) -> Iterator[dict]:
     """A capture of a faster walk."""
-    import torch
 
     from gscodec.train.settings import train_settings
     from gscodec.train.train import train_groups
 
-    torch.set_num_threads(1)
     f = figure(**TRAINED)
     capture = capture_of(f)
     settings = train_settings("fast", sh_degree=0, gop=TRAINED["gop"])

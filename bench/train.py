@@ -289,7 +289,6 @@ def coded(
 def every_frame_alone(capture: Capture, frames: Sequence[int], settings) -> tuple[list[ParametricGroup], float]:
     """Trains a keyframe for each of `frames`; returns them as groups, with the calibration that they have learned, and
     the seconds."""
-    import torch
 
     from gscodec.render.cpu import CpuBackend
     from gscodec.train.budget import keyframe_budget
@@ -297,7 +296,6 @@ def every_frame_alone(capture: Capture, frames: Sequence[int], settings) -> tupl
     from gscodec.train.keyframe import train_keyframe
     from gscodec.train.views import Views
 
-    torch.set_num_threads(1)  # as the commands do
     settings = settings.of_capture(capture)
     groups, start = [], time.perf_counter()
     for frame in frames:

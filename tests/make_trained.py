@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from trained import CASES, DATA, EXAMPLE, FRAMES, GOP, capture, load_groups, measure, save_groups
 
 from gscodec.train.settings import train_settings
@@ -65,7 +64,6 @@ def over_seeds() -> dict:
 
 def main() -> None:
     """Writes groups.npz and recorded.json, or the parts of them that are named."""
-    torch.set_num_threads(1)
     parts = sys.argv[1:] or ["groups", "codec", "capture"]
     recorded = json.loads(RECORDED.read_text())
     if "groups" in parts:

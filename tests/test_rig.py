@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import training
 from quantized_groups import assert_same, layered_group, moving_group, predicted_group
 from scipy.spatial import cKDTree
@@ -321,7 +320,6 @@ TINY = replace(training.TINY, motion_steps=40, gaussians_max=700, initial_points
 @pytest.fixture(scope="module")
 def trained():
     """The groups of a fast walk, without its rig and with it, and the figure."""
-    torch.set_num_threads(1)
     walker = figure(1500, 5, 5, fps=6.0)
     capture = capture_of(walker)
     return [list(train_groups(capture, TINY, rig=rig)) for rig in (None, walker.rig)], walker, capture

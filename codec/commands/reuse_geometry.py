@@ -25,7 +25,7 @@ from ..model.parametric_group import ParametricGroup
 from ..progress import Bar
 from .inputs import open_frames, open_tracks
 from .options import PRESET
-from .sources import TrainOptions, limit_torch_threads
+from .sources import TrainOptions
 
 if TYPE_CHECKING:
     from ..capture import Capture
@@ -156,7 +156,6 @@ def _of_pictures(capture: Capture, settings: EncodeSettings):
     from ..train.refinement import PictureRefinement
     from ..train.settings import RecolorSettings
 
-    limit_torch_threads()
     refinement, recipe = PictureRefinement(capture, views=settings.refine), RecolorSettings()
     cameras = len(capture.indices("train"))
 

@@ -90,13 +90,6 @@ def up_axis(cameras: Sequence[Camera]) -> str:
     return ("-" if up[i] < 0 else "") + AXES[i]
 
 
-def limit_torch_threads() -> None:
-    """One thread for torch in this process: it handles small tensors, and would compete with the native kernels."""
-    import torch
-
-    torch.set_num_threads(1)
-
-
 def splat_source(path: Path, settings: EncodeSettings, options: TrainOptions, bar: Bar) -> Source:
     """Splats that others trained, or a folder that `gscodec train` has left."""
     require("scipy", "encoding")
@@ -272,7 +265,6 @@ def trained_source(
     from ..train.refinement import PictureRefinement
     from ..train.settings import coding_loss
 
-    limit_torch_threads()
     recipe = _recipe(options, settings)
     recipe = replace(recipe, keyframe_steps=round(longer * recipe.keyframe_steps))
     settings = replace(settings, loss=coding_loss(options.preset, capture))

@@ -55,9 +55,8 @@ def train_to_folder(
     from ..train.checkpoint import Checkpoint
     from ..train.settings import coding_loss, train_settings
     from ..train.train import train_groups
-    from .sources import limit_torch_threads, open_rig_of_capture
+    from .sources import open_rig_of_capture
 
-    limit_torch_threads()
     capture = open_frames(source, options.frames)
     recipe = train_settings(options.preset, quality, motion=options.motion, gop=options.gop)
     work, unfinished = folder / "work", folder / "unfinished.json"

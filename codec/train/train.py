@@ -78,9 +78,6 @@ def train_groups(
         on_progress: called after every step.
         backend: device that renders and optimises; a new CpuBackend if None.
 
-    Torch handles only small tensors here, and its threads compete with those of the native kernels: a caller gains by
-    `torch.set_num_threads(1)`, as the commands do. The number of threads changes sums in their last bits.
-
     Raises:
         CaptureError: a frame cannot be read, or no view overlaps another.
     """

@@ -53,6 +53,10 @@ class Target:
 class Views:
     """The training views of a capture and the calibration of their cameras.
 
+    All training goes through here, so this limits torch to one thread, in the whole process: it handles small tensors,
+    and its idle threads would take their cores from the native kernels. The number of threads changes sums in their
+    last bits.
+
     Args:
         backend: device of everything that is rendered or optimised against these views.
 
@@ -65,6 +69,7 @@ class Views:
     """
 
     def __init__(self, capture, settings: TrainSettings, backend: Backend):
+        torch.set_num_threads(1)
         self.capture, self.backend = capture, backend
         self.train_cameras = capture.indices("train")
         if not self.train_cameras:
