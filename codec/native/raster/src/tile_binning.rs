@@ -46,11 +46,12 @@ pub struct TileBins {
     cursors: Vec<u32>, // [chunks, tiles]
 }
 
-/// Reserves `more` entries and a quarter; doubling would cost noticeable memory.
+/// Makes place for `more` entries from `used` on, and then for a quarter besides; doubling would cost noticeable memory.
 #[inline(always)]
-fn grow(list: &mut Vec<u32>, more: usize) {
-    if list.capacity() - list.len() < more {
-        list.reserve_exact(more + list.len() / 4);
+fn grow(list: &mut Vec<u32>, used: usize, more: usize) {
+    if list.len() < used + more {
+        list.reserve_exact(used + more + used / 4 - list.len());
+        list.resize(list.capacity(), 0);
     }
 }
 
@@ -74,14 +75,12 @@ fn append(p: &Projected, tiles: &TileRect, count: &mut [u32], list: &mut Vec<u32
             end += met;
         }
     } else {
-        list.truncate(used);
-        grow(list, (x1 + 1 - x0.min(x1)) * (y1 + 1 - y0.min(y1)) + FEW);
+        grow(list, used, (x1 + 1 - x0.min(x1)) * (y1 + 1 - y0.min(y1)) + 1);
         for_tiles(p, tiles, |tile| {
             count[tile] += 1;
-            list.push((tile as u32) << 1);
+            list[end] = (tile as u32) << 1;
+            end += 1;
         });
-        end = list.len();
-        list.resize(end + FEW, 0);
     }
     if end == used {
         list[used] = NOWHERE;
@@ -195,7 +194,8 @@ impl TileBins {
         self.owned.resize_with(projected.len(), || AtomicU32::new(HIDDEN));
         let share = sorted.len().div_ceil(chunks).max(1);
         let owned = &self.owned;
-        self.lists.iter_mut().for_each(Vec::clear);
+        let filled = sorted.len().div_ceil(share);
+        self.lists.iter_mut().skip(filled).for_each(Vec::clear);
         let work = self
             .cursors
             .par_chunks_mut(tiles)
@@ -205,10 +205,7 @@ impl TileBins {
         work.for_each(|(chunk, ((count, list), keys))| {
             let mut used = 0;
             for (i, key) in keys.iter().enumerate() {
-                if list.len() < used + FEW {
-                    grow(list, 8 * FEW);
-                    list.resize(list.capacity(), 0);
-                }
+                grow(list, used, FEW);
                 if let Some(next) = keys.get(i + AHEAD) {
                     prefetch(projected, index(next));
                 }
