@@ -7,7 +7,7 @@ is that of the model before coding, `psnr_coded` that of the decoded stream; bot
 the subject where there are masks. A variant is a change of the training settings, so that each entry can be repeated by
 any caller of the training; but for V3's recipe (`baselines/v3.py`), which has a hash grid for each frame and a packing
 of its own. What moves Gaussians is compared at equal time: a variant that is faster or slower than the whole recipe is
-trained again with as many more steps a frame, or fewer.
+trained again with more steps a frame, or fewer.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ WHOLE = "whole recipe"
 LUMBERJACK, STAGE, BASKETBALL, FAST, FEW = "lumberjack", "stage", "basketball", "fast motion", "4 cameras"
 FRAMES = {LUMBERJACK: (0, 10), STAGE: (7, 15), BASKETBALL: (0, 8), FAST: (0, 12), FEW: (0, 12)}  # the ball comes at 10
 EQUAL = 0.05  # share by which times may differ
+RUNS = 3  # until they do not, at most; the nearest one counts
 
 
 @dataclass(frozen=True)
@@ -173,13 +174,29 @@ def _entries(capture: Capture, names: Sequence[str], preset: str, quality: float
     for name in names:
         variant = VARIANTS[name]
         settings = variant.change(train_settings(preset, quality=quality))
-        trained = variant.recipe(capture, settings, quality)
-        if name == WHOLE:
-            whole = trained.seconds
-        elif variant.equal_time and abs(whole / trained.seconds - 1) > EQUAL:
-            settings = _with_steps(settings, whole / trained.seconds)
-            trained = variant.recipe(capture, settings, quality)
+        settings, trained = _trained(capture, variant, settings, quality, whole if variant.equal_time else None)
+        whole = trained.seconds if name == WHOLE else whole
         yield {"variant": name, "preset": preset, **_measured(capture, trained, settings, quality)}
+
+
+def _trained(
+    capture: Capture, variant: Variant, settings: TrainSettings, quality: float, seconds: float | None
+) -> tuple[TrainSettings, Trained]:
+    """Trained with the settings; of the runs with more or fewer steps a frame the one that takes about `seconds`. The
+    keyframe's time does not depend on them: from the second run on, both are found from the last two."""
+    runs: list[tuple[float, TrainSettings, Trained]] = []
+    factor = 1.0
+    while True:
+        scaled = _with_steps(settings, factor)
+        runs.append((factor, scaled, variant.recipe(capture, scaled, quality)))
+        took = runs[-1][2].seconds
+        if seconds is None or abs(took / seconds - 1) <= EQUAL or len(runs) == RUNS:
+            break
+        before, earlier = (runs[-2][0], runs[-2][2].seconds) if len(runs) > 1 else (0.0, 0.0)
+        slope = (took - earlier) / (factor - before)
+        wanted = factor + (seconds - took) / (slope if slope > 0 else took / factor)
+        factor = min(max(wanted, factor / 4), 4 * factor)
+    return min((r[1:] for r in runs), key=lambda r: abs(r[1].seconds - (seconds or r[1].seconds)))
 
 
 def _with_steps(settings: TrainSettings, factor: float) -> TrainSettings:
