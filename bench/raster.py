@@ -24,7 +24,7 @@ import numpy as np
 from gscodec.errors import UsageError
 from gscodec.model.camera import Camera
 from gscodec.model.gaussians import PARAMETERS, Gaussians
-from gscodec.render.backend import TargetView
+from gscodec.render.backend import LossWeights, TargetView
 from gscodec.render.cpu import CpuBackend
 from gscodec.render.image import render_image, render_rgba
 from gscodec.render.optimizer import AdamSettings
@@ -90,9 +90,7 @@ def measure(scene: str, gaussians: Gaussians, cam: Camera, simd: str, threads: i
         begin, count = time.perf_counter(), 0
         while count < repeats + 2 and (count < 7 or time.perf_counter() - begin < BUDGET_S):
             start, count = time.perf_counter(), count + 1
-            result = backend.photometric_loss(
-                model.params, [TargetView(cam, rgb, mask, grey)], ssim_lambda=0.2, mask_lambda=0.1
-            )
+            result = backend.photometric_loss(model.params, [TargetView(cam, rgb, mask, grey)], LossWeights(mask=0.1))
             if adam:
                 model.step(result.grads, rates)
                 steps.append(1e3 * (time.perf_counter() - start))

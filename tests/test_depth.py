@@ -15,7 +15,7 @@ from gscodec.capture.report import describe_capture
 from gscodec.capture.sheet import contact_sheet
 from gscodec.errors import CaptureError
 from gscodec.model.gaussians import PARAMETERS
-from gscodec.render.backend import TargetView
+from gscodec.render.backend import LossWeights, TargetView
 from gscodec.render.cpu import CpuBackend
 from gscodec.render.reference import project, rasterize_reference
 from gscodec.train.depth_points import depth_points
@@ -56,7 +56,7 @@ def test_loss_of_depth_and_its_gradient():
     views = [TargetView(cam, rgb, None, BACKGROUND, target_depth=t) for t in (target, None)]
     backend, gradients = CpuBackend(), []
     for view in views:
-        r = backend.photometric_loss(named, [view], depth_lambda=1.0)
+        r = backend.photometric_loss(named, [view], LossWeights(depth=1.0))
         gradients.append([r.grads[name].clone() for name in PARAMETERS])
         if view.target_depth is not None:
             assert r.depth == pytest.approx(loss.item(), rel=1e-4)

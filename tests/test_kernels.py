@@ -8,7 +8,7 @@ torch = pytest.importorskip("torch")
 from gscodec import _native  # noqa: E402
 from gscodec.errors import UsageError  # noqa: E402
 from gscodec.model.camera import Camera  # noqa: E402
-from gscodec.render.backend import TargetView  # noqa: E402
+from gscodec.render.backend import LossWeights, TargetView  # noqa: E402
 from gscodec.render.cpu import CpuBackend  # noqa: E402
 from gscodec.render.optimizer import Adam, AdamSettings, TrajectoryAdam  # noqa: E402
 from gscodec.render.reference import image_loss_reference  # noqa: E402
@@ -228,9 +228,7 @@ def test_offset_of_a_camera_is_added_to_the_light_of_the_gaussians():
     target = (rgb, np.rint(255 * alpha).astype(np.uint8), background)
 
     def loss(gain, offset):
-        return backend.photometric_loss(
-            params, [TargetView(camera, *target, (gain, offset))], ssim_lambda=0, mask_lambda=0
-        )
+        return backend.photometric_loss(params, [TargetView(camera, *target, (gain, offset))], LossWeights(ssim=0.0))
 
     right, plain = loss(*exposure), loss([1] * 3, [0] * 3)
     assert right.loss < 0.1 * plain.loss

@@ -11,7 +11,7 @@ from gscodec.errors import LimitError, UsageError  # noqa: E402
 from gscodec.model.camera import Camera, look_at  # noqa: E402
 from gscodec.model.gaussians import PARAMETERS, Gaussians  # noqa: E402
 from gscodec.model.rotations import turned_harmonics  # noqa: E402
-from gscodec.render.backend import STATISTICS, TURNS, TargetView  # noqa: E402
+from gscodec.render.backend import STATISTICS, TURNS, LossWeights, TargetView  # noqa: E402
 from gscodec.render.cpu import CpuBackend  # noqa: E402
 from gscodec.render.image import render_image, render_rgba  # noqa: E402
 from gscodec.render.reference import image_loss_reference, rasterize_reference  # noqa: E402
@@ -140,7 +140,7 @@ def test_threads_change_no_bit():
     results = []
     for threads in (1, 2, 5):
         view = TargetView(cam, target, target[..., 0], BACKGROUND, ((1, 0.9, 1.1), (0, 0.1, 0)))
-        r = CpuBackend(threads).photometric_loss(params, [view], mask_lambda=0.1)
+        r = CpuBackend(threads).photometric_loss(params, [view], LossWeights(mask=0.1))
         results.append([r.loss, r.grad_exposure, *r.grads.values(), *(getattr(r, s) for s in STATISTICS)])
     for other in results[1:]:
         for a, b in zip(results[0], other, strict=True):
@@ -217,7 +217,7 @@ def test_step_is_the_sum_of_its_parts():
     want = torch.autograd.grad(loss, [*params, gain])
     named = {k: p.detach().float() for k, p in zip(PARAMETERS, params, strict=True)}
     view = TargetView(cam, rgb, mask, BACKGROUND, (gain.tolist(), offset.tolist()))
-    r = CpuBackend().photometric_loss(named, [view], ssim_lambda=ssim_lambda, mask_lambda=mask_lambda)
+    r = CpuBackend().photometric_loss(named, [view], LossWeights(ssim_lambda, mask_lambda))
     assert r.loss == pytest.approx(loss.item(), rel=1e-5)
     for w, (name, g) in zip(want, r.grads.items(), strict=False):
         assert (g - w).norm() <= 1e-3 * w.norm(), name
@@ -279,7 +279,9 @@ def test_turned_harmonics_are_seen_as_if_their_coefficients_were_turned():
 def test_statistics():
     cam, params = camera(), {n: p.detach().float() for n, p in zip(PARAMETERS, scene(), strict=True)}
     black = np.zeros((cam.height, cam.width, 3), np.uint8)
-    found = CpuBackend().photometric_loss(params, [TargetView(cam, black)], ssim_lambda=0.0)  # its gradient: 1 / pixels
+    found = CpuBackend().photometric_loss(
+        params, [TargetView(cam, black)], LossWeights(ssim=0.0)
+    )  # its gradient: 1 / pixels
     _, _, want = rasterize_reference(*scene(), cam)
     assert ((found.max_weight > 0) == (want > 0).numpy()).all()
     assert (found.max_weight <= 0.999).all()

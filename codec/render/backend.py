@@ -44,12 +44,25 @@ class TargetView:
 
 
 @dataclass(frozen=True)
+class LossWeights:
+    """Weights of the terms of the loss.
+
+    Attributes:
+        ssim: share of D-SSIM in the image loss. mask, depth: of what is added to it.
+    """
+
+    ssim: float = 0.2
+    mask: float = 0.0
+    depth: float = 0.0
+
+
+@dataclass(frozen=True)
 class RenderLoss:
     """Loss of a batch of views and its gradients. Arrays belong to the backend; its next call overwrites them.
 
     Attributes:
-        loss: image_loss + mask_lambda * mask + depth_lambda * depth, summed over the views.
-        image_loss: (1 - ssim_lambda) * l1 + ssim_lambda * (1 - ssim), summed over the views.
+        loss: image_loss, and the terms of mask and depth with their `LossWeights`, summed over the views.
+        image_loss: (1 - w) * l1 + w * (1 - ssim) with w = `LossWeights.ssim`, summed over the views.
         l1, mse, ssim, mask, depth: the terms; means over pixels (and channels) and views. psnr = -10 log10(mse). The
             depth term is |sum of weights * (depth - target)| / target, 0 where the target is unknown.
         pixels: of all views together.
@@ -87,26 +100,10 @@ class Backend(Protocol):
         """[H, W] f32 expected depth along the optical axis, world units, as blending weighs it; 0 where nothing is
         drawn."""
 
-    def photometric_loss(
-        self,
-        params: Params,
-        views: Sequence[TargetView],
-        *,
-        ssim_lambda: float,
-        mask_lambda: float,
-        depth_lambda: float,
-    ) -> RenderLoss:
+    def photometric_loss(self, params: Params, views: Sequence[TargetView], weights: LossWeights) -> RenderLoss:
         """Loss of Gaussians against the targets of `views`, and its gradients."""
 
-    def start_photometric_loss(
-        self,
-        params: Params,
-        views: Sequence[TargetView],
-        *,
-        ssim_lambda: float,
-        mask_lambda: float,
-        depth_lambda: float,
-    ) -> PendingLoss:
+    def start_photometric_loss(self, params: Params, views: Sequence[TargetView], weights: LossWeights) -> PendingLoss:
         """Starts `photometric_loss` of the Gaussians as they are now, beside the caller.
 
         Returns:

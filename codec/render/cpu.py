@@ -14,8 +14,10 @@ from .. import _native
 from ..errors import UsageError
 from ..model.camera import Camera
 from ..model.gaussians import PARAMETERS
-from .backend import STATISTICS, TURNS, Params, PendingLoss, PixelGradient, RenderLoss, TargetView
+from .backend import STATISTICS, TURNS, LossWeights, Params, PendingLoss, PixelGradient, RenderLoss, TargetView
 from .workspace import Workspace, call, host_array, rgb, view
+
+IMAGE_ALONE = LossWeights()
 
 
 class CpuBackend:
@@ -42,43 +44,31 @@ class CpuBackend:
         return self.workspace.depth(_arrays(params), camera)
 
     def photometric_loss(
-        self,
-        params: Params,
-        views: Sequence[TargetView],
-        *,
-        ssim_lambda: float = 0.2,
-        mask_lambda: float = 0.0,
-        depth_lambda: float = 0.0,
+        self, params: Params, views: Sequence[TargetView], weights: LossWeights = IMAGE_ALONE
     ) -> RenderLoss:
         """As of `Backend`.
 
         Raises:
             UsageError: shapes disagree, a camera has distortion, or there are no views.
         """
-        return self._photometric_loss(params, _arrays(params), views, (ssim_lambda, mask_lambda, depth_lambda))
+        return self._photometric_loss(params, _arrays(params), views, weights)
 
     def start_photometric_loss(
-        self,
-        params: Params,
-        views: Sequence[TargetView],
-        *,
-        ssim_lambda: float = 0.2,
-        mask_lambda: float = 0.0,
-        depth_lambda: float = 0.0,
+        self, params: Params, views: Sequence[TargetView], weights: LossWeights = IMAGE_ALONE
     ) -> PendingLoss:
         """As of `Backend`."""
-        arrays, lambdas = tuple(a.copy() for a in _arrays(params)), (ssim_lambda, mask_lambda, depth_lambda)
-        return self._worker.submit(self._photometric_loss, params, arrays, views, lambdas).result
+        arrays = tuple(a.copy() for a in _arrays(params))
+        return self._worker.submit(self._photometric_loss, params, arrays, views, weights).result
 
     def _photometric_loss(
-        self, params: Params, arrays: tuple[np.ndarray, ...], views: Sequence[TargetView], lambdas: tuple[float, ...]
+        self, params: Params, arrays: tuple[np.ndarray, ...], views: Sequence[TargetView], weights: LossWeights
     ) -> RenderLoss:
-        """`photometric_loss` of the `arrays`; `params`: what the gradients look like. `lambdas`: of SSIM, mask and
-        depth."""
+        """`photometric_loss` of the `arrays`; `params`: what the gradients look like."""
         if not views:
             raise UsageError("a batch has at least one view, got none")
         grads, statistics = self.workspace.gradients(arrays)
         step, native = self.workspace.native.step, [_native_view(v) for v in views]
+        lambdas = (weights.ssim, weights.mask, weights.depth)
         values, radii = call(step, arrays, native, lambdas, (grads, statistics))
         losses, exposure = np.array([v[:6] for v in values]), np.array([v[6:] for v in values])
         loss, means = float(losses[:, 0].sum()), losses[:, 1:].mean(0).tolist()

@@ -19,7 +19,7 @@ from ..capture.epipolar import epipolar_error
 from ..errors import CaptureError
 from ..model.camera import Calibration, Camera, working_distance
 from ..model.gaussians import Gaussians
-from ..render.backend import Backend, PendingLoss, RenderLoss, TargetView
+from ..render.backend import Backend, LossWeights, PendingLoss, RenderLoss, TargetView
 from ..render.sensitivity import params_of
 from .calibration import Exposure, Extrinsics
 from .settings import TrainSettings
@@ -214,7 +214,7 @@ def photometric_loss(
 ) -> RenderLoss:
     """Loss of Gaussians against one target (`Backend.photometric_loss`). Behind a target with alpha the background is
     random: with a known one, Gaussians in its colour could stand for transparency. An opaque one is to be covered."""
-    return backend.photometric_loss(params, [_target_view(target, rng)], **_lambdas(settings))
+    return backend.photometric_loss(params, [_target_view(target, rng)], _weights(settings))
 
 
 def start_photometric_loss(
@@ -223,16 +223,11 @@ def start_photometric_loss(
     """`photometric_loss` of Gaussians as they are now against all `targets`, summed, beside the caller
     (`Backend.start_photometric_loss`)."""
     views = [_target_view(t, rng) for t in targets]
-    return backend.start_photometric_loss(params, views, **_lambdas(settings))
+    return backend.start_photometric_loss(params, views, _weights(settings))
 
 
-def _lambdas(settings: TrainSettings) -> dict[str, float]:
-    """Weights of the terms of the loss."""
-    return {
-        "ssim_lambda": settings.ssim_lambda,
-        "mask_lambda": settings.mask_lambda,
-        "depth_lambda": settings.depth_lambda,
-    }
+def _weights(settings: TrainSettings) -> LossWeights:
+    return LossWeights(settings.ssim_lambda, settings.mask_lambda, settings.depth_lambda)
 
 
 def add_harmonics_prior(
