@@ -22,6 +22,7 @@ FILES = {  # what -> file, command
     "yellow_clip3.splatv": ("splatv.json", "python -m bench.run splatv"),
     "rasterizer": ("raster.json", "gscodec bench raster"),
     "tiles": ("tiles.json", "python -m bench.tiles"),
+    "training and decoding by cores": ("cores.json", "python -m bench.cores"),
     "layers": ("layers.json", "python -m bench.layers"),
     "rate term beside the bits of the coder": ("rate_term.json", "python -m bench.rate_term"),
 }

@@ -71,12 +71,15 @@ def test_table_of_stress():
         assert e["verdict"].startswith(verdict.split(",")[0]), (name, verdict)
 
 
+VARIANTS = ("whole recipe", "another seed", "nodes alone", "field alone", "V3's grid")
+
+
 def test_table_of_what_moves_the_nodes():
     found = {(e["capture"], e["variant"]): e for e in result("ablation")["entries"]}
     table = {re.split(" as | at |,", name)[0]: figures for name, *figures in rows("capture | hash grid and nodes")}
     assert set(table) == {capture for capture, _ in found}
     for name, figures in table.items():
-        of_capture = [found[name, v] for v in ("whole recipe", "another seed", "nodes alone", "field alone")]
+        of_capture = [found[name, v] for v in VARIANTS]
         assert figures == [f"{e['psnr_coded']:.2f} at {e['kb_per_frame']:.2f}" for e in of_capture], name
 
 
@@ -92,6 +95,13 @@ def test_tables_of_streams():
     for (name, *figures), found in zip(rows("splats, no training"), map(result, SPLATS), strict=True):
         values = [*(found[k] for k in keys), found["encode_seconds"] / found["frames"]]
         assert all(map(agrees, figures, values)), (name, figures, values)
+
+
+def test_table_of_cores():
+    measured = result("cores")["rows"]
+    for figures, found in zip(rows("cores | training"), measured, strict=True):
+        values = (found["cores"], found["train_s_per_frame"], found["decode_ms"])
+        assert all(map(agrees, figures, values)), (figures, values)
 
 
 def test_table_of_the_player():

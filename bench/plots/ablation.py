@@ -33,6 +33,5 @@ def ablation_chart(result: dict):
             axes.set(xlabel=f"{label}, less {math.nan if at is None else at:.2f} of the whole recipe")
             axes.tick_params(axis="y", length=0, labelleft=key == "psnr_coded")
         row[0].set_title(f"{capture}, {whole['frames']} frames, {whole['preset']}", loc="left", weight="bold")
-    text = f"test cameras; {stamp(result['entries'])}"
-    figure.text(0.995, 0.995, text, ha="right", va="top", fontsize=7, color="#888888")
+    figure.supxlabel(f"test cameras; {stamp(result['entries'])}", fontsize=7, color="#888888")
     return figure
