@@ -3,7 +3,7 @@
 usage: GSCODEC_DATA=... python -m bench.positions [NAME=SPLAT ...]   (splats besides those of the data folder)
 
 Both coders get the same set of integers, the points of Draco's quantization grid. Draco: DracoPy 2, compression level
-10, order free. Ours: the positions unit of a stream.
+10, order free. Ours: the positions units of a stream.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SCENES = {"statue": "splats/statue.ply", "playbot": "splats/playbot.ply", "fruit
 
 
 def ours(positions: np.ndarray) -> int:
-    """Bytes of the positions unit."""
+    """Bytes of the positions, of all tiles."""
     channels = {}
     for name, count in (("log_scales", 3), ("quats", 3), ("logit_opacities", 1), ("sh0", 3)):
         values = np.zeros((count, len(positions)), np.int32)
@@ -40,7 +40,7 @@ def ours(positions: np.ndarray) -> int:
         channels=channels,
     )
     _, units = _native.encode_group(group)
-    return next(u["bytes"] for u in units if u["type"] == "positions")
+    return sum(u["bytes"] for u in units if u["type"] == "positions")
 
 
 def compare(name: str, means: np.ndarray, bits: int) -> dict:
