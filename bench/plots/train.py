@@ -32,9 +32,11 @@ def train_chart(result: dict):
         for axes, (key, label) in zip(row, PANELS.items(), strict=True):
             axes.set(xlabel=label, ylabel="PSNR of the subject, dB", xscale="log")
             timed = key == "seconds_per_frame"
-            _panel(axes, [e for e in entries if e[key] and not (timed and _time_says_nothing(e))], key)
-            for full in [e for e in entries if e["recipe"] == "full" and not e[key]]:  # has no size: the line to reach
+            placed = [e for e in entries if e[key] and not (timed and _time_says_nothing(e))]
+            _panel(axes, placed, key)
+            for full in [e for e in entries if e["recipe"] == "full" and e not in placed]:  # the line to reach
                 axes.axhline(full["psnr_fg"], color=LOOK["full"][1], linestyle="--", label=LOOK["full"][0])
+                axes.set_ylim(top=max(axes.get_ylim()[1], full["psnr_fg"] + SPAN_Y))
                 axes.legend(frameon=False, fontsize=7)
         row[0].set_title(capture, loc="left", weight="bold")
     figure.supxlabel(f"test cameras; {stamp(result['entries'])}", fontsize=7, color="#888888")
