@@ -184,19 +184,18 @@ def _trained(
 ) -> tuple[TrainSettings, Trained]:
     """Trained with the settings; of the runs with more or fewer steps a frame the one that takes about `seconds`. The
     keyframe's time does not depend on them: from the second run on, both are found from the last two."""
-    runs: list[tuple[float, TrainSettings, Trained]] = []
-    factor = 1.0
-    while True:
+    runs, factor, before, earlier = [], 1.0, 0.0, 0.0
+    while len(runs) < RUNS:
         scaled = _with_steps(settings, factor)
-        runs.append((factor, scaled, variant.recipe(capture, scaled, quality)))
-        took = runs[-1][2].seconds
-        if seconds is None or abs(took / seconds - 1) <= EQUAL or len(runs) == RUNS:
-            break
-        before, earlier = (runs[-2][0], runs[-2][2].seconds) if len(runs) > 1 else (0.0, 0.0)
+        trained = variant.recipe(capture, scaled, quality)
+        took = trained.seconds
+        if seconds is None or abs(took / seconds - 1) <= EQUAL:
+            return scaled, trained
+        runs.append((scaled, trained))
         slope = (took - earlier) / (factor - before)
         wanted = factor + (seconds - took) / (slope if slope > 0 else took / factor)
-        factor = min(max(wanted, factor / 4), 4 * factor)
-    return min((r[1:] for r in runs), key=lambda r: abs(r[1].seconds - (seconds or r[1].seconds)))
+        before, earlier, factor = factor, took, min(max(wanted, factor / 4), 4 * factor)
+    return min(runs, key=lambda run: abs(run[1].seconds - seconds))
 
 
 def _with_steps(settings: TrainSettings, factor: float) -> TrainSettings:

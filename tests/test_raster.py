@@ -279,9 +279,8 @@ def test_turned_harmonics_are_seen_as_if_their_coefficients_were_turned():
 def test_statistics():
     cam, params = camera(), {n: p.detach().float() for n, p in zip(PARAMETERS, scene(), strict=True)}
     black = np.zeros((cam.height, cam.width, 3), np.uint8)
-    found = CpuBackend().photometric_loss(
-        params, [TargetView(cam, black)], LossWeights(ssim=0.0)
-    )  # its gradient: 1 / pixels
+    by_colour = LossWeights(ssim=0.0)  # its gradient: 1 / pixels
+    found = CpuBackend().photometric_loss(params, [TargetView(cam, black)], by_colour)
     _, _, want = rasterize_reference(*scene(), cam)
     assert ((found.max_weight > 0) == (want > 0).numpy()).all()
     assert (found.max_weight <= 0.999).all()
