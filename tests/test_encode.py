@@ -312,6 +312,21 @@ def test_layers_have_the_steps_of_their_sensitivity():
     assert sizes[1] < sizes[0]
 
 
+def test_a_gaussian_that_has_faded_leaves_a_predicted_group():
+    """It costs nothing to keep, but would be as opaque as the reference has it."""
+    g = blob(300)
+    faded = replace(g, logit_opacities=np.where(np.arange(300) < 20, -9, g.logit_opacities).astype(np.float32))
+    groups = [DenseGroup([g]), DenseGroup([faded], parents=np.arange(300))]
+    first, second = fit_groups(groups, random_access=60)
+    coder = GroupCoder(EncodeSettings(refine=0))
+    _, state = coder.code(None, first, coder.measure(first, 0), 50, 0)
+    coded_second, after = coder.code(state, second, coder.measure(second, 1), 50, 1)
+    kept = _native.DecodedGroup(coded_second.payload, 1, reference=state.decoded).quantized().parents
+    assert not coded_second.independent
+    assert not np.isin(state.lineage[:20], kept).any()
+    assert np.isin(after.lineage[20:][after.lineage[20:] >= 0], kept).mean() > 0.95
+
+
 def test_a_group_that_refers_to_a_damaged_one_is_named(tmp_path):
     write(turning().with_groups(changing()), tmp_path / "a.gsv")
     data = bytearray((tmp_path / "a.gsv").read_bytes())

@@ -170,6 +170,7 @@ def test_a_group_goes_on_from_what_was_fine_tuned(capture):
     group = GroupModel(tracker.graph, None, models, poses, steps_for(50, 1.0), everything, TINY)
     group.turns[1] += 0.1
     group.key.params["sh0"] += 0.2
+    group.key.params["means"] += 0.1
     group.append({n: p[:20].clone() for n, p in group.key.params.items()}, torch.arange(20))
     tracker.adopt(group)
     shown, model = group.frame(1, CpuBackend()).params, tracker.model.params

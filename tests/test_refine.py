@@ -161,6 +161,28 @@ def test_a_cleaner_capture_gets_a_finer_quality():
     assert 30 < noisy < clean - 3 < 87
 
 
+def test_what_refinement_has_chosen_is_not_undone_by_a_predicted_group():
+    """What has not changed costs nothing, but for places, which trajectories set right where that shows."""
+    truth = [blob(400, sh_count=3)]
+    cameras = [
+        replace(c, K=c.K / 8 + np.diag([0, 0, 7 / 8]), width=64, height=64, split="train") for c in codec_cameras(truth)
+    ]
+    calibration = Calibration.plain(16, 1)
+    capture = pictures_of(truth * 2, cameras, calibration.gains[0])
+    coder = GroupCoder(EncodeSettings(layers=1), refine_by_pictures=PictureRefinement(capture))
+    wrong = np.random.default_rng(1).normal(0, 0.1, truth[0].sh0.shape).astype(np.float32)
+    still = DenseGroup([replace(truth[0], sh0=truth[0].sh0 + wrong)])
+    first, second = fit_groups([still, replace(still, parents=np.arange(400))], random_access=60)
+    first, second = (replace(g, calibration=calibration) for g in (first, second))
+    coded, state = coder.code(None, first, coder.measure(first, 0), 50, 0)
+    assert any(r.any() for r in state.form.rounding.values())
+    again, _ = coder.code(state, second, coder.measure(second, 1), 50, 1)
+    changed = {u["attribute"] for u in again.units if u["type"] == "trajectories"}
+    assert not again.independent
+    assert changed <= {"means"}
+    assert len(again.payload) < 0.1 * len(coded.payload)
+
+
 def test_a_group_whose_harmonics_turn_comes_nearer_to_its_pictures():
     """The quantizer shows what a decoder does, and moves harmonics where they are coded: at rest."""
     still, wrong = blob(400, sh_count=8), np.random.default_rng(1).normal(0, 0.2, (400, 8, 3)).astype(np.float32)

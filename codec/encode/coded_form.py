@@ -1,7 +1,8 @@
 """A group in the form that is coded: axes sorted, rest pose in the middle of the motion, colours decorrelated.
 
 In: ParametricGroup. Out: CodedForm, which looks the same in every frame. What a reference has coded already keeps the
-form of the reference.
+form of the reference, and the rounding of its canonical values where refinement by pictures has chosen it: a predicted
+group then codes what has changed since, and does not undo it.
 """
 
 from __future__ import annotations
@@ -103,12 +104,24 @@ class CodedForm:
         return self.group.frame(t).take(self.index)
 
 
-def coded_form(group: ParametricGroup, lineage: np.ndarray, known: CodedForm | None = None) -> CodedForm:
-    """The form of all Gaussians of a group.
+@dataclass(frozen=True)
+class ReferenceForm:
+    """The form in which n Gaussians of a reference were coded, in the order of its integers.
 
-    Args:
-        lineage: see `CodedForm`. known: the form in which the reference was coded, in the order of its integers.
+    Attributes:
+        rest, rotations, axis_order, axis_rotation: as in `CodedForm`.
+        rounding: attribute -> [n, C] f64, what coding has added to its canonical values and stays; {}: nothing.
     """
+
+    rest: np.ndarray
+    rotations: np.ndarray
+    axis_order: np.ndarray
+    axis_rotation: np.ndarray
+    rounding: dict[str, np.ndarray]
+
+
+def coded_form(group: ParametricGroup, lineage: np.ndarray, known: ReferenceForm | None = None) -> CodedForm:
+    """The form of all Gaussians of a group; `lineage` as in `CodedForm`."""
     order, rotation = sorted_axes(group.canonical.log_scales)
     means, quats = group.moved()
     rest, rotations = _recentered(group, means, quats)
@@ -117,6 +130,9 @@ def coded_form(group: ParametricGroup, lineage: np.ndarray, known: CodedForm | N
         order[old], rotation[old] = known.axis_order[lineage[old]], known.axis_rotation[lineage[old]]
         rest[old], rotations[old] = known.rest[lineage[old]], known.rotations[lineage[old]]
     values, trajectories = appearance(group, order)
+    if known is not None:
+        for name, rounding in known.rounding.items():
+            values[name][old] += rounding[lineage[old]]
     index = np.arange(len(group.canonical))
     return CodedForm(group, index, lineage, rest, rotations, order, rotation, values, trajectories, means, quats)
 

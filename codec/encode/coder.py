@@ -7,7 +7,7 @@ groups since came from; it is returned with each group and never changed, so tha
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -19,11 +19,11 @@ from ..model.camera import Camera
 from ..model.parametric_group import ParametricGroup, checked_parents
 from ..render.sensitivity import Importance, sensitivity_cameras
 from .adaptive_rounding import AdaptiveRounding
-from .coded_form import CodedForm, coded_form
+from .coded_form import CodedForm, ReferenceForm, coded_form
 from .companding import Curve
 from .measure import measure_group
 from .quantization_plan import Known, Parameters, plan_group
-from .quantize import Quantized, ReferenceGroup, grid_of, quantize
+from .quantize import Quantized, ReferenceGroup, dequantize, grid_of, quantize
 from .refinement_views import Target, drawn_views
 from .settings import EncodeSettings
 
@@ -39,6 +39,8 @@ class RefineByPictures(Protocol):
     def pictures(self, group: ParametricGroup, first_frame: int, count: int, seed: int) -> Iterable[Target]:
         """`count` of the pictures, in the order that `seed` draws."""
 
+
+FORM = ("rest", "rotations", "axis_order", "axis_rotation")  # arrays of a `ReferenceForm`
 
 CamerasAt = Callable[[int], Sequence[Camera]]  # frame of the stream -> cameras from which the subject was captured
 
@@ -63,18 +65,14 @@ class CoderState:
     """What the next group may be predicted from.
 
     Attributes:
-        payload: of the last independent group.
-        rest: [n, 3] f64, rotations [n, 4] f32, axis_order [n, 3], axis_rotation [n, 4]: its form (`CodedForm`).
+        payload: of the last independent group. form: in which it was coded.
         trajectory_steps: attribute -> step of a value in one frame; node_step: world units.
         frames: of it and of the groups since. back: groups since, itself included.
         lineage: [N] of each Gaussian of the group before, its index among the integers of the independent group; -1.
     """
 
     payload: bytes
-    rest: np.ndarray
-    rotations: np.ndarray
-    axis_order: np.ndarray
-    axis_rotation: np.ndarray
+    form: ReferenceForm
     trajectory_steps: dict[str, float]
     node_step: float
     frames: int
@@ -93,7 +91,7 @@ class CoderState:
 
     @cached_property
     def known(self) -> Known:
-        """Parameters of the independent group, and the layer of each of its Gaussians."""
+        """What a predicted group shares with the independent group."""
         q = self.integers
         names = ("means", *q.channels)
         shifts = np.zeros((len(q.layers), len(names)), int) if q.shifts is None else q.shifts.astype(int)
@@ -107,7 +105,8 @@ class CoderState:
             self.trajectory_steps,
             self.node_step,
         )
-        return Known(parameters, np.repeat(np.arange(len(q.layers)), q.layers))
+        opacities = dequantize(q.channels["logit_opacities"], curves.get("logit_opacities"))[:, 0]
+        return Known(parameters, np.repeat(np.arange(len(q.layers)), q.layers), opacities)
 
     def after(self, group: ParametricGroup, lineage: np.ndarray) -> CoderState:
         """The state behind one more predicted group."""
@@ -115,25 +114,27 @@ class CoderState:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Everything as arrays: what a later run goes on from."""
-        plain = [f.name for f in fields(self) if f.name not in ("payload", "trajectory_steps")]
-        arrays = {n: np.asarray(getattr(self, n)) for n in plain}
-        steps = {f"trajectory_steps.{n}": np.asarray(v) for n, v in self.trajectory_steps.items()}
-        return {"payload": np.frombuffer(self.payload, np.uint8), **arrays, **steps}
+        arrays = {n: np.asarray(getattr(self, n)) for n in ("node_step", "frames", "back", "lineage")}
+        arrays |= {f"form.{n}": getattr(self.form, n) for n in FORM}
+        arrays |= {f"rounding.{n}": v for n, v in self.form.rounding.items()}
+        arrays |= {f"trajectory_steps.{n}": np.asarray(v) for n, v in self.trajectory_steps.items()}
+        return {"payload": np.frombuffer(self.payload, np.uint8), **arrays}
 
     @staticmethod
     def from_arrays(arrays: dict[str, np.ndarray]) -> CoderState | None:
         """Inverse of `to_arrays`; None where there is no state."""
         if "payload" not in arrays:
             return None
-        steps = {n.partition(".")[2]: float(v) for n, v in arrays.items() if n.startswith("trajectory_steps.")}
-        plain = ("rest", "rotations", "axis_order", "axis_rotation", "lineage")
-        numbers = {
-            "frames": int(arrays["frames"]),
-            "back": int(arrays["back"]),
-            "node_step": float(arrays["node_step"]),
-        }
-        arrays_of = {n: arrays[n] for n in plain}
-        return CoderState(payload=arrays["payload"].tobytes(), trajectory_steps=steps, **numbers, **arrays_of)
+        of = lambda kind: {n.partition(".")[2]: v for n, v in arrays.items() if n.startswith(f"{kind}.")}  # noqa: E731
+        return CoderState(
+            arrays["payload"].tobytes(),
+            ReferenceForm(**of("form"), rounding=of("rounding")),
+            {n: float(v) for n, v in of("trajectory_steps").items()},
+            float(arrays["node_step"]),
+            int(arrays["frames"]),
+            int(arrays["back"]),
+            arrays["lineage"],
+        )
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ class GroupCoder:
         if group.turned_harmonics != state.integers.turned_harmonics:
             return self._independent(state, group, importance, quality, first_frame)
         reference = ReferenceGroup(state.integers, state.decoded, state.back)
-        form = coded_form(group, lineage, state)
+        form = coded_form(group, lineage, state.form)
         own = importance.with_axes(form.axis_order)
         plan = plan_group(form, own, quality, self.settings, state.known)
         coded, _ = self._packed(quantize(form, plan, self.settings.rdo, reference), group, first_frame, reference)
@@ -194,7 +195,7 @@ class GroupCoder:
         coded, quantized = self._packed(self.quantized(group, importance, quality), group, first_frame)
         if self.settings.random_access <= len(group):
             return coded, state
-        return coded, _state_of(quantized, coded.payload)
+        return coded, _state_of(quantized, coded.payload, chosen=self.has_pictures(group))
 
     def _packed(
         self, quantized: Quantized, group: ParametricGroup, first_frame: int, reference: ReferenceGroup | None = None
@@ -229,14 +230,16 @@ class GroupCoder:
         return s.rounding.frame_views * len(group) if len(group) > 1 and len(group.canonical) <= s.plan.few else 0
 
 
-def _state_of(quantized: Quantized, payload: bytes) -> CoderState:
-    """The state behind an independent group."""
+def _state_of(quantized: Quantized, payload: bytes, *, chosen: bool) -> CoderState:
+    """The state behind an independent group; `chosen`: pictures have chosen its rounding, which is better than none."""
     form: CodedForm = quantized.form
-    parameters, frames = quantized.plan.parameters, form.frames
+    parameters, channels = quantized.plan.parameters, quantized.integers.channels
     lineage = np.full(len(form.group.canonical), -1)
     lineage[form.index] = np.arange(len(form.index))
-    own = form.rest, form.rotations, form.axis_order, form.axis_rotation
-    return CoderState(payload, *own, parameters.trajectory_steps, parameters.node_step, frames, 1, lineage)
+    values = form.values.items() if chosen else ()
+    rounding = {n: dequantize(channels[n], parameters.curves.get(n)) - v for n, v in values}
+    known = ReferenceForm(*(getattr(form, n) for n in FORM), rounding)
+    return CoderState(payload, known, parameters.trajectory_steps, parameters.node_step, form.frames, 1, lineage)
 
 
 def _lineage(group: ParametricGroup, state: CoderState | None) -> np.ndarray | None:

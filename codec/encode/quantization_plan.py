@@ -102,10 +102,12 @@ class Plan:
 
 @dataclass(frozen=True)
 class Known:
-    """Of a reference: its parameters, and the layer of each of its Gaussians."""
+    """Of a reference: its parameters, and of each of its n Gaussians the layer ([n] int) and the decoded logit of the
+    opacity ([n])."""
 
     parameters: Parameters
     layer: np.ndarray
+    opacities: np.ndarray
 
 
 def plan_group(
@@ -117,7 +119,7 @@ def plan_group(
         importance: of all Gaussians of `form`. known: of the reference, where the group is predicted.
     """
     error = error_for(quality)
-    index = _kept(form, importance, error, settings, predicted=known is not None)
+    index = _kept(form, importance, error, settings, known)
     form, importance = form.take(index), importance.take(index)
     price = rdo.bit_price(error, len(index), form.group.rate_optimized, settings.rdo)
     if known is None:
@@ -130,17 +132,22 @@ def plan_group(
 
 
 def _kept(
-    form: CodedForm, importance: Importance, error: float, settings: EncodeSettings, *, predicted: bool
+    form: CodedForm, importance: Importance, error: float, settings: EncodeSettings, known: Known | None
 ) -> np.ndarray:
-    """[n] int, Gaussians that are worth coding: survivors that show at all, births that matter."""
+    """[n] int, Gaussians that are worth coding: what matters, and survivors that show at all, since they cost nothing.
+    Those that no longer matter since they have faded would show as the reference has them: they go."""
     count, removal = len(form.rest), importance.removal
     if settings.keep_all:
         return np.arange(count)
     least = settings.plan.prune * error / max(count, 1)
-    if not predicted:
+    if known is None:
         return np.flatnonzero(removal >= least)
     needed = np.where(form.group.parents >= 0, settings.plan.rebirth * least, least)  # left out before, or new
-    return np.flatnonzero(np.where(form.lineage >= 0, removal > 0, removal >= needed))
+    old = np.flatnonzero(form.lineage >= 0)
+    logits = form.values["logit_opacities"][old, 0], known.opacities[form.lineage[old]]
+    now, before = (1 / (1 + np.exp(-x)) for x in logits)
+    needed[old] = np.where(before > settings.plan.faded * now, least, 0)
+    return np.flatnonzero((removal >= needed) & (removal > 0))
 
 
 def _parameters(

@@ -22,6 +22,7 @@ class PlanSettings:
         shift_most: doublings of a layer's step at most.
         prune: a Gaussian goes if the picture without it errs by less than this share of the error per Gaussian.
         rebirth: times `prune` that a Gaussian must matter to come back after the reference left it out.
+        faded: times as opaque as now that a survivor which no longer matters was in the reference, to be left out.
         few: Gaussians up to which there is time for `more_views`.
         views, more_views: from which sensitivity is measured; `more_views` of small groups and single frames.
     """
@@ -33,6 +34,7 @@ class PlanSettings:
     shift_most: int = 8
     prune: float = 0.3
     rebirth: float = 8.0
+    faded: float = 2.0
     few: int = 20_000
     views: int = 24
     more_views: int = 48

@@ -201,6 +201,10 @@ class NodeGraph:
         """The same nodes; Gaussians added to the copy are not added here."""
         return NodeGraph.restored(self.state(), self.settings)
 
+    def resting_at(self, means: torch.Tensor) -> NodeGraph:
+        """The same nodes for Gaussians that rest at `means` [N, 3]."""
+        return NodeGraph.restored({**self.state(), "means": means.numpy()}, self.settings)
+
     def select(self, chosen: torch.Tensor) -> None:
         """Keeps the Gaussians of `chosen` ([N] bool)."""
         self.means = self.means[chosen]

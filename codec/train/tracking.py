@@ -239,8 +239,9 @@ class Tracker:
         frame = group.frame(group.frames - 1, self.views.backend)
         new = group.origin < 0
         self.moving = torch.where(new, True, self.moving[group.origin])
-        self.graph, self.pose = group.graph.copy(), frame.pose
-        self.own = self._own(frame.params, frame.means, frame.rotations)
+        rest = group.key.params["means"]
+        self.graph, self.pose = group.graph.resting_at(rest), frame.pose
+        self.own = self._own(frame.params, *self.graph.carry(rest, frame.pose))
 
     def densify(self, frame: int, on_step: OnStep = None) -> None:
         """Adds the Gaussians that `frame` needs besides, after `advance`."""
