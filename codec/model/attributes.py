@@ -50,11 +50,11 @@ ATTRIBUTES = (
     ),
     Attribute(
         "log_scales", 2, 3, "natural log of the standard deviations, world units", companded=True,
-        nominal_step=0.25, coarsest_step=1.0, temporal_frequencies=3, learning_rate=1e-2,
+        nominal_step=0.25, coarsest_step=1.0, temporal_frequencies=3, learning_rate=8e-2,
     ),
     Attribute(
         "quats", 3, 3, "x, y, z of the unit quaternion, w = sqrt(1 - x^2 - y^2 - z^2)",
-        nominal_step=0.035, coarsest_step=0.25, temporal_frequencies=4, learning_rate=2e-3,
+        nominal_step=0.035, coarsest_step=0.25, temporal_frequencies=4, learning_rate=1.6e-2,
     ),
     Attribute(
         "logit_opacities", 4, 1, "logit of the opacity", companded=True,

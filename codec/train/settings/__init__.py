@@ -164,9 +164,9 @@ PRESETS = {
     "slow": {"keyframe_steps": 7000, "finetune_steps": 750},
 }
 PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
-    "fast": {"gradient_min": 4e-4, "contribution_min": 10.0},
-    "medium": {"gradient_min": 3e-4, "contribution_min": 8.0},
-    "slow": {"gradient_min": 1.5e-4, "contribution_min": 3.5},
+    "fast": {"gradient_min": 5.3e-4, "contribution_min": 15.0},
+    "medium": {"gradient_min": 4e-4, "contribution_min": 12.0},
+    "slow": {"gradient_min": 2e-4, "contribution_min": 5.2},
 }
 LOSS = {"fast": 0.5, "medium": 0.3, "slow": 0.3}  # decibels by which very fine steps may be better, without a quality
 LOSS_OF_ROOM = 0.5  # at least so many without masks: few views of a room are fitted far better than others see it

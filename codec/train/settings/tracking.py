@@ -61,7 +61,7 @@ class RoomSettings:
     finetune_steps: float = 4 / 3  # times those of a subject
     rigidity: float = 1 / 3  # times that of a subject
     cut_ratio: float = 5 / 3  # times that of a subject, since few views of a room fit its keyframe far too well
-    drift_ratio: float = 2.6  # times that of a subject, for the same reason
+    drift_ratio: float = 3.6  # times that of a subject, for the same reason
     harmonics_views: float = math.inf  # here more of them gain nothing for other views
     opacity_decay: float = 0.003  # of a keyframe: no mask removes what floats before the cameras
     position_noise: float = 3.0  # of a keyframe, for the same reason
@@ -147,7 +147,7 @@ class RelocalizationSettings:
 class GroupSettings:
     """Where a group ends early."""
 
-    drift_ratio: float = 2.0  # image loss over the keyframe's from which frames start anew
+    drift_ratio: float = 2.3  # image loss over the keyframe's from which frames start anew
     drift_steps: int = 2400  # of a keyframe for which that is meant: with more it fits its own pictures better
     drift_exponent: float = 0.75  # of the steps of a keyframe, in that ratio
     drift_share: float = 0.25  # of the frames that the keyframe has lasted, to be left for another one behind a drift
