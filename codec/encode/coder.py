@@ -231,7 +231,7 @@ class GroupCoder:
 
 
 def _state_of(quantized: Quantized, payload: bytes, *, chosen: bool) -> CoderState:
-    """The state behind an independent group; `chosen`: pictures have chosen its rounding, which is better than none."""
+    """The state behind an independent group; `chosen`: pictures have chosen its rounding, which stays."""
     form: CodedForm = quantized.form
     parameters, channels = quantized.plan.parameters, quantized.integers.channels
     lineage = np.full(len(form.group.canonical), -1)
