@@ -164,7 +164,7 @@ PRESETS = {
     "slow": {"keyframe_steps": 7000, "finetune_steps": 750},
 }
 PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
-    "fast": {"gradient_min": 5.3e-4, "contribution_min": 15.0},
+    "fast": {"gradient_min": 4.8e-4, "contribution_min": 13.0},
     "medium": {"gradient_min": 4e-4, "contribution_min": 12.0},
     "slow": {"gradient_min": 2e-4, "contribution_min": 5.2},
 }
