@@ -26,6 +26,12 @@ from gscodec.render.workspace import Workspace
 from gscodec.train.refinement import PictureRefinement
 
 
+def small_cameras(frames):
+    """Training cameras around the frames, of 64 x 64 pixels."""
+    small = {"width": 64, "height": 64, "split": "train"}
+    return [replace(c, K=c.K / 8 + np.diag([0, 0, 7 / 8]), **small) for c in codec_cameras(frames)]
+
+
 def test_a_refined_frame_is_nearer():
     group = DenseGroup([blob(1500, sh_count=3)])
     sequence = GaussianSequence(30.0, [group])
@@ -104,9 +110,7 @@ def pictures_of(truth, cameras, gains):
 def test_a_trained_group_comes_nearer_to_its_pictures(frames, attribute, gain):
     """What training has left wrong, too, here colours or sizes; each picture in the brightness of its camera."""
     truth = [moved(blob(600), [0, 0.05 * t, 0], [0, 0, 0]) for t in range(frames)]
-    cameras = [
-        replace(c, K=c.K / 8 + np.diag([0, 0, 7 / 8]), width=64, height=64, split="train") for c in codec_cameras(truth)
-    ]
+    cameras = small_cameras(truth)
     gains = np.geomspace(0.7, 1 / 0.7, len(cameras), dtype=np.float32)[:, None].repeat(3, 1)
     wrong = np.random.default_rng(1).normal(0, 0.15, (600, 3)).astype(np.float32)
     model = [replace(g, **{attribute: getattr(g, attribute) + wrong}) for g in truth]
@@ -146,9 +150,7 @@ def test_rotations_fit_the_sizes_after_few_pictures(views):
 def test_a_cleaner_capture_gets_a_finer_quality():
     """Without a quality, coding costs the decibels that the settings allow, against the pictures of the capture."""
     truth = [blob(400)]
-    cameras = [
-        replace(c, K=c.K / 8 + np.diag([0, 0, 7 / 8]), width=64, height=64, split="train") for c in codec_cameras(truth)
-    ]
+    cameras = small_cameras(truth)
     calibration, chosen = Calibration.plain(16, 1), []
     refine = PictureRefinement(pictures_of(truth, cameras, calibration.gains[0]))
     coder = GroupCoder(EncodeSettings(layers=1), refine_by_pictures=refine)
@@ -164,9 +166,7 @@ def test_a_cleaner_capture_gets_a_finer_quality():
 def test_what_refinement_has_chosen_is_not_undone_by_a_predicted_group():
     """What has not changed costs nothing, but for places, which trajectories set right where that shows."""
     truth = [blob(400, sh_count=3)]
-    cameras = [
-        replace(c, K=c.K / 8 + np.diag([0, 0, 7 / 8]), width=64, height=64, split="train") for c in codec_cameras(truth)
-    ]
+    cameras = small_cameras(truth)
     calibration = Calibration.plain(16, 1)
     capture = pictures_of(truth * 2, cameras, calibration.gains[0])
     coder = GroupCoder(EncodeSettings(layers=1), refine_by_pictures=PictureRefinement(capture))
@@ -193,9 +193,7 @@ def test_a_group_whose_harmonics_turn_comes_nearer_to_its_pictures():
         replace(truth, canonical=off, calibration=Calibration.plain(16, 4)),
         [truth.frame(t) for t in range(4)],
     )
-    cameras = [
-        replace(c, K=c.K / 8 + np.diag([0, 0, 7 / 8]), width=64, height=64, split="train") for c in codec_cameras(shown)
-    ]
+    cameras = small_cameras(shown)
     coder = GroupCoder(EncodeSettings(keep_all=True, layers=1))
     rounding = AdaptiveRounding(coder.quantized(group, coder.measure(group, 0), 50), coder.settings, only=("shN",))
     capture = pictures_of(shown, cameras, np.ones((16, 3), np.float32))

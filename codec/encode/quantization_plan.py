@@ -13,6 +13,7 @@ import numpy as np
 
 from ..bitstream.quantization import error_for, steps_for, subject_radius
 from ..model.attributes import GRID_BITS_MAX
+from ..model.gaussians import sigmoid
 from ..render.sensitivity import Importance, coarsest, steps_for_error
 from . import companding, rdo
 from .coded_form import CodedForm
@@ -145,7 +146,7 @@ def _kept(
     needed = np.where(form.group.parents >= 0, settings.plan.rebirth * least, least)  # left out before, or new
     old = np.flatnonzero(form.lineage >= 0)
     logits = form.values["logit_opacities"][old, 0], known.opacities[form.lineage[old]]
-    now, before = (1 / (1 + np.exp(-x)) for x in logits)
+    now, before = (sigmoid(x) for x in logits)
     needed[old] = np.where(before > settings.plan.faded * now, least, 0)
     return np.flatnonzero((removal >= needed) & (removal > 0))
 

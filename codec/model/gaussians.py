@@ -19,6 +19,11 @@ SH_COUNTS = {0: 0, 3: 1, 8: 2, 15: 3}  # K of shN -> SH degree
 GOP = 30  # frames of a group at most, unless told otherwise: a second
 
 
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    """f64, without overflow: opacities of their logits."""
+    return 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80)))
+
+
 @dataclass(frozen=True)
 class Gaussians:
     """N Gaussians of one frame.

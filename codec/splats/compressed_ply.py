@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import CaptureError
-from ..model.gaussians import SH_C0, Gaussians
+from ..model.gaussians import SH_C0, Gaussians, sigmoid
 from ..ply_table import write_table
 from .ply import join_rest, sh_count, split_rest, stack
 from .smallest_three import join_smallest_three, split_smallest_three
@@ -38,10 +38,6 @@ def is_compressed(table: dict[str, np.ndarray]) -> bool:
 def logit(p: np.ndarray) -> np.ndarray:
     p = np.clip(p, OPACITY_LIMIT, 1 - OPACITY_LIMIT)
     return np.log(p / (1 - p))
-
-
-def sigmoid(x: np.ndarray) -> np.ndarray:
-    return 1 / (1 + np.exp(-np.clip(x.astype(np.float64), -80, 80)))
 
 
 def gaussians_of_compressed(table: dict[str, np.ndarray], path: Path) -> Gaussians:

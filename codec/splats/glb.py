@@ -14,8 +14,7 @@ import numpy as np
 
 from ..atomic_write import part_file
 from ..errors import CaptureError
-from ..model.gaussians import SH_C0, Gaussians
-from .compressed_ply import sigmoid
+from ..model.gaussians import SH_C0, Gaussians, sigmoid
 
 EXTENSION = "KHR_gaussian_splatting"
 KERNEL = {

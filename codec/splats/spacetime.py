@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from ..model.gaussian_sequence import DenseGroup
-from ..model.gaussians import Gaussians
+from ..model.gaussians import Gaussians, sigmoid
 
 ALPHA_MIN = 1 / 255  # an opacity below it shows nothing (spec 14)
 FADE_MIN = 0.02  # a share of the peak opacity below it is not drawn by antimatter15/splaTV
@@ -52,7 +52,7 @@ class SpacetimeGaussians:
     def shown(self, time: float) -> np.ndarray:
         """[N] bool, whether anything of a Gaussian can be seen at `time`."""
         fade = self.fade(time)
-        return (fade >= FADE_MIN) & (fade * _opacity(self.rest.logit_opacities) >= ALPHA_MIN)
+        return (fade >= FADE_MIN) & (fade * sigmoid(self.rest.logit_opacities) >= ALPHA_MIN)
 
     def at(self, time: float) -> Gaussians:
         """All Gaussians as they are at `time`."""
@@ -62,14 +62,10 @@ class SpacetimeGaussians:
         length = np.linalg.norm(quats, axis=1, keepdims=True)
         still = length[:, 0] < 1e-9  # turned through nothing: as at rest
         quats = np.where(still[:, None], self.rest.quats, quats / np.maximum(length, 1e-9))
-        opacity = np.clip(self.fade(time) * _opacity(self.rest.logit_opacities), 1e-9, 1 - 1e-6)
+        opacity = np.clip(self.fade(time) * sigmoid(self.rest.logit_opacities), 1e-9, 1 - 1e-6)
         logits = np.log(opacity / (1 - opacity))
         means = self.rest.means + dt * (a + dt * (b + dt * c))
         return replace(self.rest, means=means, quats=quats, logit_opacities=logits).validate(f"time {time:.3f}")
-
-
-def _opacity(logits: np.ndarray) -> np.ndarray:
-    return 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80)))
 
 
 class SpacetimeFrames(Sequence):
