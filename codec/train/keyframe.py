@@ -126,7 +126,7 @@ class _Run:
         self.model, self.views, self.frame, self.settings = model, views, frame, settings
         self.steps, self.radius, self.losses = steps, radius, []
         self.rng = np.random.default_rng([settings.seed, frame])
-        few = k.dropout * min(1.0, k.dropout_views / len(views.train_cameras)) ** 2
+        few = k.dropout * min(1.0, k.dropout_views / len(views.train_cameras)) ** 4
         self.dropout = few if views.capture.has_alpha else 0.0
         self.statistics = Statistics(len(model), k.mse_min)
         self._started: _View | None = None

@@ -95,7 +95,7 @@ class TrainSettings:
     """
 
     gop: int = GOP
-    keyframe_steps: int = 2400
+    keyframe_steps: int = 1200
     motion_steps: int = 200
     finetune_steps: int = 300
     gaussians_max: int = 120_000
@@ -142,7 +142,14 @@ class TrainSettings:
         """The settings for a capture: those of a room where it has no masks."""
         if capture.has_alpha:
             return self
-        room = self.room
+        room, key = self.room, self.keyframe
+        key = replace(
+            key,
+            opacity_decay=room.opacity_decay,
+            position_noise=room.position_noise,
+            gradient_min=room.gradient_min * key.gradient_min,
+            contribution_min=room.contribution_min * key.contribution_min,
+        )
         field = self.motion_field.tracking and room.field_in_tracking
         return replace(
             self,
@@ -151,7 +158,7 @@ class TrainSettings:
             rigidity=room.rigidity * self.rigidity,
             harmonics_views=room.harmonics_views,
             cut_ratio=room.cut_ratio * self.cut_ratio,
-            keyframe=replace(self.keyframe, opacity_decay=room.opacity_decay, position_noise=room.position_noise),
+            keyframe=key,
             group=replace(self.group, drift_ratio=room.drift_ratio * self.group.drift_ratio),
             graph=replace(self.graph, nodes=round(room.nodes * self.graph.nodes)),
             motion_field=replace(self.motion_field, tracking=field),
@@ -159,14 +166,14 @@ class TrainSettings:
 
 
 PRESETS = {
-    "fast": {"keyframe_steps": 1400, "motion_steps": 130, "finetune_steps": 170},
+    "fast": {"keyframe_steps": 700, "motion_steps": 130, "finetune_steps": 170},
     "medium": {},
-    "slow": {"keyframe_steps": 7000, "finetune_steps": 750},
+    "slow": {"keyframe_steps": 3500, "finetune_steps": 750},
 }
 PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
-    "fast": {"gradient_min": 4.8e-4, "contribution_min": 13.0},
-    "medium": {"gradient_min": 4e-4, "contribution_min": 12.0},
-    "slow": {"gradient_min": 2e-4, "contribution_min": 5.2},
+    "fast": {"gradient_min": 4e-4, "contribution_min": 10.0},
+    "medium": {"gradient_min": 3e-4, "contribution_min": 8.0},
+    "slow": {"gradient_min": 1.5e-4, "contribution_min": 3.5},
 }
 LOSS = {"fast": 0.5, "medium": 0.3, "slow": 0.3}  # decibels by which very fine steps may be better, without a quality
 LOSS_OF_ROOM = 0.5  # at least so many without masks: few views of a room are fitted far better than others see it

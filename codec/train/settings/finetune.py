@@ -24,13 +24,13 @@ class FinetuneSettings:
     frequencies_frames: int = FREQUENCIES_OF  # frames that `frequencies` is for
     free_min: float = 0.5  # quantization steps: a residual from the start, so that a resting Gaussian stays free
     dead_zone: float = 0.1  # quantization steps more than half of one, below which a coefficient is not coded
-    coefficient_rate: float = 0.05  # quantization steps
+    coefficient_rate: float = 0.1  # quantization steps
     log_scale_start: float = -1.0  # log of a Laplace scale, quantization steps
     log_scale_rate: float = 0.02
     coefficient_adam: AdamSettings = field(default_factory=lambda: AdamSettings(eps=1e-8))
     node_rotation_rate: float = 2e-3  # radians; 0: the nodes move as they were tracked
     node_translation_rate: float = 3e-4  # radii
-    canonical_means_rate: float = 1.6e-4  # radii
+    canonical_means_rate: float = 3.2e-4  # radii
     canonical_rate_share: float = 1.0  # of the keyframe's rates, for all other canonical attributes
     canonical_bit_weight: float = 4.0  # of a canonical bit, in bits of residuals
     canonical_noise: bool = True  # uniform noise in place of quantization, on canonical attributes

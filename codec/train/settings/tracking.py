@@ -63,6 +63,8 @@ class RoomSettings:
     cut_ratio: float = 5 / 3  # times that of a subject, since few views of a room fit its keyframe far too well
     drift_ratio: float = 3.6  # times that of a subject, for the same reason
     harmonics_views: float = math.inf  # here more of them gain nothing for other views
+    gradient_min: float = 1.5  # times that of a subject: few views gain more by a Gaussian than others do
+    contribution_min: float = 2.0  # times that of a subject, for the same reason
     opacity_decay: float = 0.003  # of a keyframe: no mask removes what floats before the cameras
     position_noise: float = 3.0  # of a keyframe, for the same reason
     field_in_tracking: bool = False  # it drags what stands still with what moves beside it
@@ -148,7 +150,7 @@ class GroupSettings:
     """Where a group ends early."""
 
     drift_ratio: float = 2.3  # image loss over the keyframe's from which frames start anew
-    drift_steps: int = 2400  # of a keyframe for which that is meant: with more it fits its own pictures better
+    drift_steps: int = 1200  # of a keyframe for which that is meant: with more it fits its own pictures better
     drift_exponent: float = 0.75  # of the steps of a keyframe, in that ratio
     drift_share: float = 0.25  # of the frames that the keyframe has lasted, to be left for another one behind a drift
     cut_loss_floor: float = 0.002  # loss: clean images fit far better than they need to, and no frame is cut for it
