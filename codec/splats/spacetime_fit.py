@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import UsageError
 from ..model.gaussian_sequence import GaussianSequence
-from ..model.gaussians import Gaussians
+from ..model.gaussians import Gaussians, sigmoid
 from .spacetime import FADE_MIN, SpacetimeGaussians
 
 VALUES_MAX = 60_000_000  # Gaussians times frames that are fitted at once, 56 bytes each
@@ -48,7 +48,7 @@ def fit_spacetime(sequence: GaussianSequence, identities: Sequence[np.ndarray]) 
         )
     tracks = _tracks(sequence, identities, count)
     times = np.arange(sequence.frame_count) / sequence.frame_count
-    opacity = 1 / (1 + np.exp(-np.clip(tracks.frames.logit_opacities, -30, 30).astype(np.float64)))
+    opacity = sigmoid(tracks.frames.logit_opacities)
     weights = np.where(tracks.shown, np.maximum(opacity, 1e-3), 0.0)  # [T, N]
     peaks, centers, widths = _fade(opacity, weights, tracks.shown, times)
     dt = times[:, None] - centers
