@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 RECIPES = ("gscodec", "alone", "full", "v3")
 FULL = {"keyframe_steps": 12_000, "gaussians_max": 156_250}  # of any picture; a keyframe may have 125,000 of them
-FULL_PRICES = {"gradient_min": 1e-4, "contribution_min": 1.0}
+FULL_PRICE = 2e-5
 V3_PACKING = {"qp": 25, "raw": True}  # its default qp, and the better of its two scripts
 V3_GOP = 20  # frames in a group of V3
 KEYS = ("psnr", "psnr_fg", "psnr_corrected", "ssim", "vmaf", "gaussians", "kb_per_frame", "flicker")
@@ -213,7 +213,7 @@ def _alone(capture: Capture, frames: range, settings, encodings) -> Iterator[tup
 
 
 def _full(capture: Capture, frames: range, settings, _) -> Iterator[tuple]:
-    keyframe, budget = replace(settings.keyframe, **FULL_PRICES), replace(settings.budget, steps_most=1.0)
+    keyframe, budget = replace(settings.keyframe, price=FULL_PRICE), replace(settings.budget, steps_most=1.0)
     settings = replace(settings, **FULL, keyframe=keyframe, budget=budget)
     alone, seconds = every_frame_alone(capture, frames, settings)
     yield "full", seconds, None, shown(alone)

@@ -130,7 +130,7 @@ def test_fine_tuning_removes_and_adds_gaussians(capture, monkeypatch):
     append, select = GroupModel.append, GroupModel.select
     monkeypatch.setattr(GroupModel, "append", lambda g, c, p: (changes.append(len(p)), append(g, c, p))[1])
     monkeypatch.setattr(GroupModel, "select", lambda g, k: (changes.append(-int((~k).sum())), select(g, k))[1])
-    eager = dataclasses.replace(TINY.keyframe, gradient_min=1e-6, contribution_min=8.0)
+    eager = dataclasses.replace(TINY.keyframe, gradient_unit=1e-6, price=0.02)
     settings = dataclasses.replace(TINY, finetune_steps=40, gaussians_max=2000, keyframe=eager)
     first, second = train_groups(capture, settings)
     assert changes[0] > 0 > changes[1], "some were added, some removed"

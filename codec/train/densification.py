@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from ..capture import blend
-from .keyframe import Statistics, random_offset
+from .keyframe import Statistics, price, random_offset
 from .model import NAMES, Model, from_points
 from .plane_sweep import sweep
 from .settings import DensificationSettings, PlaneSweepSettings, TrainSettings
@@ -56,7 +56,7 @@ def spawn(
     stats, k = _optimize(spawned, model, frame, views, settings, rng, on_step), settings.keyframe
     opacities = torch.sigmoid(torch.cat([m.params["logit_opacities"] for m in (model, spawned)]))
     keep = (opacities > k.prune_opacity) & (stats.max_weight > k.prune_weight)
-    keep = (keep & (stats.contribution(opacities) >= k.contribution_min))[len(model) :]
+    keep = (keep & (stats.contribution(opacities) >= price(len(opacities), k)))[len(model) :]
     if keep.sum() < s.spawn_min:
         return None
     spawned.select(keep)

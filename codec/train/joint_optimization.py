@@ -20,7 +20,7 @@ import torch
 from ..render.backend import PendingLoss
 from ..render.optimizer import Adam, TrajectoryAdam
 from .finetune import Frame, GroupModel
-from .keyframe import Statistics, dropout_share, split_or_clone, without_some
+from .keyframe import Statistics, dropout_share, gradient_min, price, split_or_clone, without_some
 from .motion_field import MotionField
 from .settings import TrainSettings
 from .views import Target, Views, add_harmonics_prior, start_photometric_loss
@@ -110,13 +110,13 @@ class _Finetuner:
             return
         opacities = torch.sigmoid(group.key.params["logit_opacities"])
         contribution = stats.contribution(opacities) / self._drawn_share()  # to the views that could show it
-        keep = contribution >= min(k.contribution_min, torch.quantile(contribution, k.thinning).item())
+        keep = contribution >= min(price(len(contribution), k), torch.quantile(contribution, k.thinning).item())
         keep &= stats.max_weight > k.prune_weight
         keep[: group.known] = True
         gradient = stats.mean_screen_gradient() * keep
         room = min(int(self.settings.finetune.growth * len(keep)), self.settings.gaussians_max - int(keep.sum()))
         chosen = torch.topk(gradient, max(0, min(room, len(gradient)))).indices
-        chosen = chosen[(gradient[chosen] > k.gradient_min) & (chosen >= group.known)]
+        chosen = chosen[(gradient[chosen] > gradient_min(len(keep), k)) & (chosen >= group.known)]
         children = split_or_clone(group.key, chosen, self.rng, k)
         group.append(children, chosen)
         self.coefficients.append(len(chosen))

@@ -58,14 +58,14 @@ class Statistics:
         self.views += views
 
     def contribution(self, opacities: torch.Tensor) -> torch.Tensor:
-        """Increase of the error without each Gaussian, [N], in shares of the error per Gaussian; `opacities`: [N].
+        """Increase of the error without each Gaussian, [N], in shares of the error; `opacities`: [N].
 
         The pixel gradients of the absolute error are signs. Where training has converged they are as good as random,
         and the squared gradient by a parameter is the squared change of the image by it (Hutchinson's estimator of a
         diagonal). The logit of an opacity changes the image by (1 - opacity) times what the whole Gaussian does.
         """
         views = max(self.views, 1)
-        return self.squared_opacity_gradient * len(opacities) / views / (1 - opacities).clamp(min=1e-3).square()
+        return self.squared_opacity_gradient / views / (1 - opacities).clamp(min=1e-3).square()
 
     def mean_screen_gradient(self) -> torch.Tensor:
         """[N], over the views that showed the Gaussian."""
@@ -246,6 +246,16 @@ def _visible(model: Model, stats: Statistics, settings: KeyframeSettings) -> tor
     return opaque & ((stats.max_weight > settings.prune_weight) | (stats.seen == 0))
 
 
+def price(count: int, settings: KeyframeSettings) -> float:
+    """Share of the error that each of `count` Gaussians must take away."""
+    return max(settings.price, 1 / max(count, 1))
+
+
+def gradient_min(count: int, settings: KeyframeSettings) -> float:
+    """Screen gradient from which one of `count` Gaussians is split or cloned, halves of the image."""
+    return settings.gradient_unit * math.sqrt(price(count, settings) * count)
+
+
 @torch.no_grad()
 def prune(model: Model, stats: Statistics, settings: KeyframeSettings, *, thin: bool = False) -> None:
     """Removes Gaussians that are not visible; with `thin`, also those with a small contribution."""
@@ -253,7 +263,7 @@ def prune(model: Model, stats: Statistics, settings: KeyframeSettings, *, thin: 
     if thin:
         contribution = stats.contribution(torch.sigmoid(model.params["logit_opacities"]))
         bound = torch.quantile(contribution, settings.thinning).item()
-        keep &= contribution >= min(settings.contribution_min, bound)
+        keep &= contribution >= min(price(len(model), settings), bound)
     if keep.any():
         model.select(keep)
 
@@ -267,7 +277,7 @@ def densify(model: Model, stats: Statistics, most: int, rng: np.random.Generator
     gradient[~keep] = 0
     room = max(0, min(int(settings.growth * len(model)), most - int(keep.sum())))
     chosen = torch.topk(gradient, min(room, len(gradient))).indices
-    chosen = chosen[gradient[chosen] > settings.gradient_min]
+    chosen = chosen[gradient[chosen] > gradient_min(len(model), settings)]
     children = split_or_clone(model, chosen, rng, settings)
     if keep.any():
         model.select(keep)

@@ -147,8 +147,7 @@ class TrainSettings:
             key,
             opacity_decay=room.opacity_decay,
             position_noise=room.position_noise,
-            gradient_min=room.gradient_min * key.gradient_min,
-            contribution_min=room.contribution_min * key.contribution_min,
+            price=room.price * key.price,
         )
         field = self.motion_field.tracking and room.field_in_tracking
         return replace(
@@ -170,11 +169,7 @@ PRESETS = {
     "medium": {},
     "slow": {"keyframe_steps": 3500, "finetune_steps": 750},
 }
-PRICES = {  # preset -> settings of the keyframe: what a Gaussian must be worth
-    "fast": {"gradient_min": 4e-4, "contribution_min": 10.0},
-    "medium": {"gradient_min": 3e-4, "contribution_min": 8.0},
-    "slow": {"gradient_min": 1.5e-4, "contribution_min": 3.5},
-}
+PRICES = {"fast": 8e-4, "medium": 5.3e-4, "slow": 1e-4}  # share of the error that a Gaussian must take away
 LOSS = {"fast": 0.5, "medium": 0.3, "slow": 0.3}  # decibels by which very fine steps may be better, without a quality
 LOSS_OF_ROOM = 0.5  # at least so many without masks: few views of a room are fitted far better than others see it
 
@@ -206,5 +201,5 @@ def train_settings(preset: str, quality: float | None = None, *, motion: str = "
         raise UsageError(f"--motion {motion} does not exist, expected one of {', '.join(MOTIONS)}")
     if quality is not None:
         changes["quality"] = quality
-    recipe = {"keyframe": KeyframeSettings(**PRICES[preset]), "motion_field": MOTIONS[motion]}
+    recipe = {"keyframe": KeyframeSettings(price=PRICES[preset]), "motion_field": MOTIONS[motion]}
     return TrainSettings(**{**PRESETS[preset], **recipe, **changes})

@@ -109,8 +109,17 @@ class BudgetSettings:
 
 @dataclass(frozen=True)
 class KeyframeSettings:
-    """Optimisation, densification and pruning of a keyframe (Kerbl et al. 2023, shortened)."""
+    """Optimisation, densification and pruning of a keyframe (Kerbl et al. 2023, shortened).
 
+    Attributes:
+        price: share of the error that a Gaussian must take away: decibels for its bits, the same in every scene. Only
+            where there are so few that this is less than the mean of all, it is that mean.
+        gradient_unit: screen gradient, in halves of the image, from which a Gaussian is split or cloned where the mean
+            one takes away just its price; it grows with the root of how much dearer a Gaussian is than the mean one.
+    """
+
+    price: float = 5.3e-4
+    gradient_unit: float = 1.06e-4
     rates: LearningRates = field(default_factory=keyframe_rates)
     means_rate_end: float = 1.6e-5  # radii, at the last step
     rate_decay: float = 0.3  # all other rates at the last step, times those at the first
@@ -122,13 +131,11 @@ class KeyframeSettings:
     coarse_side: float = 192.0  # pixels, of the longer side of the first pictures
     densify_every: int = 50  # steps between rounds of densification or pruning, at least
     densify_share: float = 0.025  # of the steps, between such rounds
-    gradient_min: float = 2e-4  # screen gradient from which a Gaussian is split or cloned, halves of the image
     densify_from: float = 0.1  # share of the steps
     densify_until: float = 0.6  # share of the steps
     thin_until: float = 0.8  # share of the steps; after it the image recovers from what was removed
     growth: float = 0.12  # share of the Gaussians that one round may add
     thinning: float = 0.25  # share of the Gaussians that one round may remove for their small contribution
-    contribution_min: float = 5.0  # increase of the error without a Gaussian, in shares of the error per Gaussian
     mse_min: float = 1e-8  # mean squared error of an image below which shares of it mean nothing
     harmonics_gain_min: float = 0.02  # a coefficient of SH stays if the error grows by this share without it
     prune_opacity: float = 0.02  # a Gaussian below it is removed
