@@ -20,7 +20,7 @@ import torch
 from ..render.backend import PendingLoss
 from ..render.optimizer import Adam, TrajectoryAdam
 from .finetune import Frame, GroupModel
-from .keyframe import Statistics, dropout_share, gradient_min, price, split_or_clone, without_some
+from .keyframe import Statistics, gradient_min, price, split_or_clone
 from .motion_field import MotionField
 from .settings import TrainSettings
 from .views import Target, Views, add_harmonics_prior, start_photometric_loss
@@ -32,7 +32,6 @@ class _Finetuner:
     def __init__(self, group: GroupModel, views: Views, frames: range, settings: TrainSettings, radius: float):
         self.group, self.views, self.frames, self.settings = group, views, frames, settings
         self.rng = np.random.default_rng([settings.seed, frames[0], 2])
-        self.dropout = settings.finetune.dropout * dropout_share(views, settings.keyframe)
         self.generator = torch.Generator().manual_seed(settings.seed)
         f, backend = settings.finetune, views.backend
         self.coefficients = TrajectoryAdam(backend, f.coefficient_adam)
@@ -57,8 +56,7 @@ class _Finetuner:
         takes the step along those before; returns the mean loss of a view of late."""
         frame, backend = self.group.frame(t, self.views.backend, self.noise), self.views.backend
         targets = [self.views.draw(self.frames[t]) for _ in range(self.settings.finetune.views)]
-        params = without_some(frame.params, self.dropout, self.rng)
-        pending = start_photometric_loss(params, targets, self.settings, self.rng, backend)
+        pending = start_photometric_loss(frame.params, targets, self.settings, self.rng, backend)
         self.finish()
         self.started = t, frame, targets, pending, decay
         return self.loss / self.settings.finetune.views

@@ -126,7 +126,8 @@ class _Run:
         self.model, self.views, self.frame, self.settings = model, views, frame, settings
         self.steps, self.radius, self.losses = steps, radius, []
         self.rng = np.random.default_rng([settings.seed, frame])
-        self.dropout = dropout_share(views, k)
+        few = k.dropout * min(1.0, k.dropout_views / len(views.train_cameras)) ** 4
+        self.dropout = few if views.capture.has_alpha else 0.0
         self.statistics = Statistics(len(model), k.mse_min)
         self._started: _View | None = None
         model.start_optimizer(views.backend, settings.adam, views.scale_max)
@@ -136,7 +137,7 @@ class _Run:
         """Starts one view, and meanwhile takes the step along the one before."""
         s, views = self.settings, self.views
         target = views.draw(self.frame, picture_scale(step / self.steps, views.largest_side, s.keyframe))
-        params = without_some(self.model.params, self.dropout * step / self.steps, self.rng)
+        params = _without_some(self.model.params, self.dropout * step / self.steps, self.rng)
         pending = start_photometric_loss(params, [target], s, self.rng, views.backend)
         self.finish()
         self._started = _View(step, target, pending)
@@ -194,13 +195,7 @@ def move_at_random(params: dict[str, torch.Tensor], share: float, rng: np.random
     params["means"].addcmul_(random_offset(params, rng), share * transparency.pow(NOISE_POWER)[:, None])
 
 
-def dropout_share(views: Views, settings: KeyframeSettings) -> float:
-    """Share of the Gaussians that a step leaves out where keyframes have converged."""
-    few = min(1.0, settings.dropout_views / len(views.train_cameras)) ** 4
-    return settings.dropout * few if views.capture.has_alpha else 0.0
-
-
-def without_some(params: dict[str, torch.Tensor], share: float, rng: np.random.Generator) -> dict[str, torch.Tensor]:
+def _without_some(params: dict[str, torch.Tensor], share: float, rng: np.random.Generator) -> dict[str, torch.Tensor]:
     """The Gaussians of one step, a random share of them left out, so that what holds only from where a training camera
     stands falls apart (DropGaussian, Park et al. 2025)."""
     if not share:

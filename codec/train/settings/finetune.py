@@ -35,7 +35,6 @@ class FinetuneSettings:
     canonical_bit_weight: float = 4.0  # of a canonical bit, in bits of residuals
     canonical_noise: bool = True  # uniform noise in place of quantization, on canonical attributes
     rate_decay: float = 0.05  # rates at the last step, times those at the first
-    dropout: float = 0.5  # of the share of the Gaussians that the last step of a keyframe leaves out
     topology_at: float = 0.3  # share of the steps at which Gaussians are removed and added
     topology_views: int = 4  # times every camera must have been drawn before
     views: int = 2  # of a frame, in one step: what a step costs besides is shared
