@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 RECIPES = ("gscodec", "alone", "full", "v3")
 FULL = {"keyframe_steps": 12_000, "gaussians_max": 156_250}  # of any picture; a keyframe may have 125,000 of them
-FULL_PRICE = 2e-5
+FULL_PRICE = 2e-5  # `KeyframeSettings.price`
 V3_PACKING = {"qp": 25, "raw": True}  # its default qp, and the better of its two scripts
 V3_GOP = 20  # frames in a group of V3
 KEYS = ("psnr", "psnr_fg", "psnr_corrected", "ssim", "vmaf", "gaussians", "kb_per_frame", "flicker")

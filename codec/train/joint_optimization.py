@@ -20,7 +20,7 @@ import torch
 from ..render.backend import PendingLoss
 from ..render.optimizer import Adam, TrajectoryAdam
 from .finetune import Frame, GroupModel
-from .keyframe import Statistics, gradient_min, price, split_or_clone
+from .keyframe import Statistics, contributes, gradient_min, split_or_clone
 from .motion_field import MotionField
 from .settings import TrainSettings
 from .views import Target, Views, add_harmonics_prior, start_photometric_loss
@@ -108,8 +108,7 @@ class _Finetuner:
             return
         opacities = torch.sigmoid(group.key.params["logit_opacities"])
         contribution = stats.contribution(opacities) / self._drawn_share()  # to the views that could show it
-        keep = contribution >= min(price(len(contribution), k), torch.quantile(contribution, k.thinning).item())
-        keep &= stats.max_weight > k.prune_weight
+        keep = contributes(contribution, k) & (stats.max_weight > k.prune_weight)
         keep[: group.known] = True
         gradient = stats.mean_screen_gradient() * keep
         room = min(int(self.settings.finetune.growth * len(keep)), self.settings.gaussians_max - int(keep.sum()))

@@ -246,6 +246,12 @@ def price(count: int, settings: KeyframeSettings) -> float:
     return max(settings.price, 1 / max(count, 1))
 
 
+def contributes(contribution: torch.Tensor, settings: KeyframeSettings) -> torch.Tensor:
+    """[N] bool: Gaussians that stay by their contribution; one round may remove a share of them (`thinning`)."""
+    most = torch.quantile(contribution, settings.thinning).item()
+    return contribution >= min(price(len(contribution), settings), most)
+
+
 def gradient_min(count: int, settings: KeyframeSettings) -> float:
     """Screen gradient from which one of `count` Gaussians is split or cloned, halves of the image."""
     return settings.gradient_unit * math.sqrt(price(count, settings) * count)
@@ -256,9 +262,7 @@ def prune(model: Model, stats: Statistics, settings: KeyframeSettings, *, thin: 
     """Removes Gaussians that are not visible; with `thin`, also those with a small contribution."""
     keep = _visible(model, stats, settings)
     if thin:
-        contribution = stats.contribution(torch.sigmoid(model.params["logit_opacities"]))
-        bound = torch.quantile(contribution, settings.thinning).item()
-        keep &= contribution >= min(price(len(model), settings), bound)
+        keep &= contributes(stats.contribution(torch.sigmoid(model.params["logit_opacities"])), settings)
     if keep.any():
         model.select(keep)
 

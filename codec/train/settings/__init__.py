@@ -142,13 +142,7 @@ class TrainSettings:
         """The settings for a capture: those of a room where it has no masks."""
         if capture.has_alpha:
             return self
-        room, key = self.room, self.keyframe
-        key = replace(
-            key,
-            opacity_decay=room.opacity_decay,
-            position_noise=room.position_noise,
-            price=room.price * key.price,
-        )
+        room = self.room
         field = self.motion_field.tracking and room.field_in_tracking
         return replace(
             self,
@@ -157,7 +151,12 @@ class TrainSettings:
             rigidity=room.rigidity * self.rigidity,
             harmonics_views=room.harmonics_views,
             cut_ratio=room.cut_ratio * self.cut_ratio,
-            keyframe=key,
+            keyframe=replace(
+                self.keyframe,
+                price=room.price * self.keyframe.price,
+                opacity_decay=room.opacity_decay,
+                position_noise=room.position_noise,
+            ),
             group=replace(self.group, drift_ratio=room.drift_ratio * self.group.drift_ratio),
             graph=replace(self.graph, nodes=round(room.nodes * self.graph.nodes)),
             motion_field=replace(self.motion_field, tracking=field),
@@ -169,7 +168,7 @@ PRESETS = {
     "medium": {},
     "slow": {"keyframe_steps": 3500, "finetune_steps": 750},
 }
-PRICES = {"fast": 8e-4, "medium": 5.3e-4, "slow": 1e-4}  # share of the error that a Gaussian must take away
+PRICES = {"fast": 8e-4, "medium": KeyframeSettings.price, "slow": 1e-4}  # `KeyframeSettings.price`
 LOSS = {"fast": 0.5, "medium": 0.3, "slow": 0.3}  # decibels by which very fine steps may be better, without a quality
 LOSS_OF_ROOM = 0.5  # at least so many without masks: few views of a room are fitted far better than others see it
 
