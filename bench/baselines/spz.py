@@ -13,8 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gscodec.model.gaussians import SH_COUNTS, Gaussians
-from gscodec.splats.compressed_ply import logit
+from gscodec.model.gaussians import SH_COUNTS, Gaussians, logit
 from gscodec.splats.smallest_three import join_smallest_three
 
 from .splat_transform import convert

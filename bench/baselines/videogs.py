@@ -13,8 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gscodec.model.gaussians import Gaussians, sigmoid
-from gscodec.splats.compressed_ply import logit
+from gscodec.model.gaussians import Gaussians, logit, sigmoid
 
 from .ffmpeg import X264, decode_videos, encode_videos
 

@@ -16,12 +16,19 @@ from ..errors import CaptureError
 
 SH_C0 = 0.28209479177387814  # Y_00; colour = 0.5 + SH_C0 * sh0 (3D Gaussian Splatting, Kerbl et al. 2023)
 SH_COUNTS = {0: 0, 3: 1, 8: 2, 15: 3}  # K of shN -> SH degree
+OPACITY_LIMIT = 1e-6  # distance of opacities from 0 and 1
 GOP = 30  # frames of a group at most, unless told otherwise: a second
 
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:
     """f64, without overflow: opacities of their logits."""
     return 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80)))
+
+
+def logit(opacities: np.ndarray | float) -> np.ndarray:
+    """Inverse of `sigmoid`; 0 and 1, whose logits are not finite, count as `OPACITY_LIMIT` away from them."""
+    p = np.clip(opacities, OPACITY_LIMIT, 1 - OPACITY_LIMIT)
+    return np.log(p / (1 - p))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import CaptureError
-from ..model.gaussians import SH_C0, Gaussians, sigmoid
+from ..model.gaussians import SH_C0, Gaussians, logit, sigmoid
 from ..ply_table import write_table
 from .ply import join_rest, sh_count, split_rest, stack
 from .smallest_three import join_smallest_three, split_smallest_three
@@ -27,17 +27,11 @@ RANGES = {
     "color": [f"{m}_{a}" for m in ("min", "max") for a in "rgb"],
 }
 SCALE_LIMIT = 20.0  # log scales are clipped to +- this: one outlier would take the precision of its whole chunk
-OPACITY_LIMIT = 1e-6  # distance of decoded opacities from 0 and 1, whose logits are not finite
 
 
 def is_compressed(table: dict[str, np.ndarray]) -> bool:
     """Whether an element table has this layout."""
     return "chunk" in table and "vertex" in table and WORDS[0] in (table["vertex"].dtype.names or ())
-
-
-def logit(p: np.ndarray) -> np.ndarray:
-    p = np.clip(p, OPACITY_LIMIT, 1 - OPACITY_LIMIT)
-    return np.log(p / (1 - p))
 
 
 def gaussians_of_compressed(table: dict[str, np.ndarray], path: Path) -> Gaussians:

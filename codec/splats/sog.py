@@ -24,9 +24,8 @@ import numpy as np
 
 from ..atomic_write import part_file
 from ..errors import CaptureError, require
-from ..model.gaussians import SH_COUNTS, Gaussians, sigmoid
+from ..model.gaussians import SH_COUNTS, Gaussians, logit, sigmoid
 from .codebook import codebook, palette
-from .compressed_ply import logit
 from .smallest_three import join_smallest_three, split_smallest_three
 
 PALETTE_WIDTH = 64  # SH palette entries per row of its map

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from ..model.gaussian_sequence import DenseGroup
-from ..model.gaussians import Gaussians, sigmoid
+from ..model.gaussians import Gaussians, logit, sigmoid
 
 ALPHA_MIN = 1 / 255  # an opacity below it shows nothing (spec 14)
 FADE_MIN = 0.02  # a share of the peak opacity below it is not drawn by antimatter15/splaTV
@@ -62,8 +62,7 @@ class SpacetimeGaussians:
         length = np.linalg.norm(quats, axis=1, keepdims=True)
         still = length[:, 0] < 1e-9  # turned through nothing: as at rest
         quats = np.where(still[:, None], self.rest.quats, quats / np.maximum(length, 1e-9))
-        opacity = np.clip(self.fade(time) * sigmoid(self.rest.logit_opacities), 1e-9, 1 - 1e-6)
-        logits = np.log(opacity / (1 - opacity))
+        logits = logit(self.fade(time) * sigmoid(self.rest.logit_opacities))
         means = self.rest.means + dt * (a + dt * (b + dt * c))
         return replace(self.rest, means=means, quats=quats, logit_opacities=logits).validate(f"time {time:.3f}")
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import UsageError
 from ..model.gaussian_sequence import GaussianSequence
-from ..model.gaussians import Gaussians, sigmoid
+from ..model.gaussians import Gaussians, logit, sigmoid
 from .spacetime import FADE_MIN, SpacetimeGaussians
 
 VALUES_MAX = 60_000_000  # Gaussians times frames that are fitted at once, 56 bytes each
@@ -60,7 +60,7 @@ def fit_spacetime(sequence: GaussianSequence, identities: Sequence[np.ndarray]) 
         means=motion[0],
         quats=turning[0],
         log_scales=mean(tracks.frames.log_scales),
-        logit_opacities=np.log(peaks / (1 - peaks)),
+        logit_opacities=logit(peaks),
         sh0=mean(tracks.frames.sh0),
         shN=np.zeros((count, 0, 3), np.float32),
     )

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import CaptureError
-from ..model.gaussians import SH_C0, Gaussians
-from .compressed_ply import logit
+from ..model.gaussians import SH_C0, Gaussians, logit
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 SCALE_MIN = 1e-9  # a scale of 0 has no logarithm

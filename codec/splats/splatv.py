@@ -19,7 +19,7 @@ import numpy as np
 from ..atomic_write import part_file
 from ..errors import CaptureError
 from ..model.camera import Camera, cameras_around
-from ..model.gaussians import SH_C0, Gaussians
+from ..model.gaussians import SH_C0, Gaussians, logit
 from .spacetime import SpacetimeGaussians
 
 MAGIC = 0x674B
@@ -68,12 +68,11 @@ def read_splatv(path: Path) -> SpacetimeGaussians:
     if not drawn.any():
         raise CaptureError(f"{path}: none of its {count} Gaussians has a finite position and an orientation")
     p = {n: v[drawn] for n, v in parts.items()}
-    opacity = np.clip(p["rgba"][:, 3] / 255, 1e-6, 1 - 1e-6)
     rest = Gaussians(
         means=p["means"],
         quats=p["quats"],
         log_scales=np.log(np.maximum(p["scales"], SCALE_MIN)),
-        logit_opacities=np.log(opacity / (1 - opacity)),
+        logit_opacities=logit(p["rgba"][:, 3] / 255),
         sh0=(p["rgba"][:, :3] / 255 - 0.5) / SH_C0,
         shN=np.zeros((len(p["means"]), 0, 3), np.float32),
     )

@@ -22,8 +22,7 @@ import numpy as np
 
 from ..atomic_write import part_file
 from ..errors import CaptureError, require
-from ..model.gaussians import SH_COUNTS, Gaussians, sigmoid
-from .compressed_ply import logit
+from ..model.gaussians import SH_COUNTS, Gaussians, logit, sigmoid
 from .smallest_three import join_smallest_three, split_smallest_three
 
 MAGIC = b"NGSP"

@@ -24,8 +24,7 @@ import numpy as np
 from ..capture.video import Video
 from ..errors import CaptureError, require
 from ..model.gaussian_sequence import DenseGroup
-from ..model.gaussians import SH_COUNTS, Gaussians
-from .compressed_ply import logit
+from ..model.gaussians import SH_COUNTS, Gaussians, logit
 from .ply import split_rest
 
 INFO, RANGES, RANGES_FLAT = "group_info.json", "viewer_min_max.json", "min_max.json"

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from ..capture import blend
+from ..model.gaussians import logit
 from .keyframe import Statistics, price, random_offset
 from .model import NAMES, Model, from_points
 from .plane_sweep import sweep
@@ -120,5 +121,5 @@ def _children(
     params["means"] += random_offset(params, rng)
     params["log_scales"] -= np.log(settings.keyframe.split_shrink)
     opacity = settings.densification.child_opacity
-    params["logit_opacities"][:] = float(np.log(opacity / (1 - opacity)))
+    params["logit_opacities"][:] = float(logit(opacity))
     return params

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from .. import _native
-from ..model.gaussians import PARAMETERS, SH_C0, Gaussians
+from ..model.gaussians import PARAMETERS, SH_C0, Gaussians, logit
 from ..model.rotations import turned_harmonics
 from ..render.backend import Backend
 from ..render.optimizer import Adam, AdamSettings
@@ -108,7 +108,7 @@ def from_points(points: np.ndarray, colors: np.ndarray, *, opacity: float) -> Mo
             "means": tensor(points),
             "quats": tensor(quats),
             "log_scales": tensor(np.log(0.5 * spacing)[:, None].repeat(3, 1)),
-            "logit_opacities": torch.full((n,), float(np.log(opacity / (1 - opacity)))),
+            "logit_opacities": torch.full((n,), float(logit(opacity))),
             "sh0": tensor((colors - 0.5) / SH_C0),
             "shN": torch.zeros(n, 0, 3),
         }
