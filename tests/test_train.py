@@ -25,7 +25,7 @@ def capture():
     return capture_of(turning(300, frames=5))
 
 
-def test_light_that_comes_on_starts_anew():
+def test_light_that_comes_on_starts_a_group():
     dark = blob(200)
     lit = dataclasses.replace(dark, sh0=dark.sh0 + 0.6)
     of_frames = lambda *frames: capture_of(GaussianSequence(25.0, [DenseGroup([g]) for g in frames]))  # noqa: E731
@@ -34,7 +34,7 @@ def test_light_that_comes_on_starts_anew():
     first, second = train_groups(capture, settings)
     assert (len(first), first.ended, len(second)) == (5, "change", 2)
     np.testing.assert_array_equal(first.frame(0).sh0, first.frame(4).sh0)
-    assert second.parents is None
+    assert second.parents is not None, "what is lit is still there"
     (alone,) = train_groups(of_frames(lit, lit), settings)
     assert psnr_of(second.frame(1), capture, 6) > psnr_of(alone.frame(1), capture, 6) - 1.0
 

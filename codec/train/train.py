@@ -66,8 +66,8 @@ def train_groups(
 
     A group continues the Gaussians of the one before (`parents`). It ends early before a frame whose image loss is
     `cut_ratio` times that of the tracked frame before, or `drift_ratio` times that of the keyframe (unless few frames
-    are left), and before one in which a large fraction of the Gaussians begins to change; then the next group starts
-    with a keyframe. Frames without a subject, until a camera sees something, are a group without Gaussians. Every
+    are left); then the next group starts with a keyframe. It also ends before one in which a large fraction of the
+    Gaussians begins to change. Frames without a subject, until a camera sees something, are a group without Gaussians. Every
     segment of `random_access` frames starts with a keyframe: a segment depends on no frames but its own.
 
     Args:
@@ -152,7 +152,7 @@ class _Run:
             track.add(self.subject.tracker)
             ended = self._track(frames[1:], stop, track)
         subject, done = self.subject, frames[: len(track.models)]
-        if ended:
+        if ended in ("cut", "drift"):
             self.subject = None
         if len(done) == 1 and parents is None:
             subject.canonical = track.models[0]
@@ -185,7 +185,7 @@ class _Run:
 
     def _track(self, frames: range, stop: int, track: _TrackedFrames) -> str:
         """Tracks `frames` up to the end of the group and adds them to `track`; returns why that came early
-        (`ParametricGroup.ended`); then the next group needs a keyframe.
+        (`ParametricGroup.ended`).
 
         The group ends where a large fraction of resting Gaussians changes at once: with few temporal frequencies, a
         light that is switched on would show in all frames of the group, and what was frozen without it shows it badly.
@@ -219,9 +219,9 @@ class _Run:
             nominal, g = steps_for(quality, subject.radius), track.models[t].gaussians()
             subject.steps = measured_steps(g, quality, nominal, cameras, backend=self.views.backend)
         graph, steps = subject.tracker.graph, subject.steps
-        settings, f = self.settings, self.settings.finetune
+        settings = self.settings
         faster = 1 + float(np.mean(track.searched))  # what moves fast changes its light and shape as fast
-        f = replace(f, frequencies={n: round(faster * count) for n, count in f.frequencies.items()})
+        f = settings.finetune.with_frequencies(faster)
         settings = replace(settings, finetune=f, finetune_steps=round(faster * settings.finetune_steps))
         model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), settings)
         self.progress.total += views_to_draw(model, settings) - self.settings.finetune_steps * len(frames)

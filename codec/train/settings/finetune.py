@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 from ...model.attributes import BY_NAME, FREQUENCIES_OF
 from ...model.gaussians import Gaussians
@@ -43,6 +43,10 @@ class FinetuneSettings:
     rate_every: int = 8  # steps: the rate term has every coefficient, an image few; its weight grows by as much
     canonical_rate_every: int = 24  # steps for which the gradient of the canonical bits, and their noise, are held
     loss_smoothing: float = 0.05  # share of one step in the running mean of the loss
+
+    def with_frequencies(self, times: float) -> FinetuneSettings:
+        """The same with so many times the frequencies."""
+        return replace(self, frequencies={n: round(times * count) for n, count in self.frequencies.items()})
 
 
 @dataclass(frozen=True)
