@@ -67,8 +67,8 @@ def train_groups(
     A group continues the Gaussians of the one before (`parents`). It ends early before a frame whose image loss is
     `cut_ratio` times that of the tracked frame before, or `drift_ratio` times that of the keyframe (unless few frames
     are left); then the next group starts with a keyframe. It also ends before one in which a large fraction of the
-    Gaussians begins to change. Frames without a subject, until a camera sees something, are a group without Gaussians. Every
-    segment of `random_access` frames starts with a keyframe: a segment depends on no frames but its own.
+    Gaussians begins to change. Frames without a subject, until a camera sees something, are a group without Gaussians.
+    Every segment of `random_access` frames starts with a keyframe: a segment depends on no frames but its own.
 
     Args:
         first_frame: where an earlier run stopped, the first frame of a group.
