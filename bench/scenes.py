@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gscodec.model.camera import NEAR, Camera, look_at
-from gscodec.model.gaussians import Gaussians
+from gscodec.model.gaussians import Gaussians, logit
 from gscodec.render.movie import orbit_camera
 
 from .data import existing
@@ -36,7 +36,7 @@ def capsule(n: int, seed: int = 0) -> Gaussians:
     points[on_side] = ring[on_side]
     scales = 0.6 * np.sqrt((side + caps) / n) * rng.uniform(0.5, 1.5, (n, 3))
     opacity = rng.uniform(0.15, 0.95, n)
-    arrays = (points, rng.normal(size=(n, 4)), np.log(scales), np.log(opacity / (1 - opacity)), rng.normal(size=(n, 3)))
+    arrays = (points, rng.normal(size=(n, 4)), np.log(scales), logit(opacity), rng.normal(size=(n, 3)))
     return Gaussians(*(a.astype(np.float32) for a in arrays), np.zeros((n, 0, 3), np.float32)).validate("capsule")
 
 

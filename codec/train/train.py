@@ -185,7 +185,7 @@ class _Run:
 
     def _track(self, frames: range, stop: int, track: _TrackedFrames) -> str:
         """Tracks `frames` up to the end of the group and adds them to `track`; returns why that came early
-        (`ParametricGroup.ended`).
+        (`ParametricGroup.ended`). Behind a cut and a drift the next group needs a keyframe.
 
         The group ends where a large fraction of resting Gaussians changes at once: with few temporal frequencies, a
         light that is switched on would show in all frames of the group, and what was frozen without it shows it badly.
@@ -219,10 +219,9 @@ class _Run:
             nominal, g = steps_for(quality, subject.radius), track.models[t].gaussians()
             subject.steps = measured_steps(g, quality, nominal, cameras, backend=self.views.backend)
         graph, steps = subject.tracker.graph, subject.steps
-        settings = self.settings
         faster = 1 + float(np.mean(track.searched))  # what moves fast changes its light and shape as fast
-        f = settings.finetune.with_frequencies(faster)
-        settings = replace(settings, finetune=f, finetune_steps=round(faster * settings.finetune_steps))
+        f = self.settings.finetune.with_frequencies(faster)
+        settings = replace(self.settings, finetune=f, finetune_steps=round(faster * self.settings.finetune_steps))
         model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), settings)
         self.progress.total += views_to_draw(model, settings) - self.settings.finetune_steps * len(frames)
         on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
