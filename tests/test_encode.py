@@ -25,7 +25,7 @@ from gscodec.errors import BitstreamError, CaptureError, UsageError
 from gscodec.fit import fit_groups
 from gscodec.model.camera import Camera, look_at
 from gscodec.model.gaussian_sequence import DenseGroup
-from gscodec.model.gaussians import Gaussians
+from gscodec.model.gaussians import Gaussians, concatenate
 from gscodec.model.parametric_group import NodeMotion, ParametricGroup
 from gscodec.model.rotations import quat_conjugate, quat_multiply
 from gscodec.model.temporal_transform import dct_basis
@@ -201,6 +201,22 @@ def test_what_lives_in_one_frame_of_a_room_is_measured_there():
     cameras = [Camera(str(i), K, look_at(eye, (0, 0, 0), (0, 1, 0)), 64, 64) for i, eye in enumerate(eyes)]
     removal = measure_group(ParametricGroup(frames, g, None, {}, lifetimes), cameras, PlanSettings()).removal
     assert removal[len(shell) :].reshape(frames, each).max(1).min() > 1e-2 * removal[len(shell) :].max()
+
+
+def test_what_lives_in_one_frame_matters_if_any_camera_sees_it():
+    """Cameras look away from each other, and each newcomer is before one of them: two views a frame are too few."""
+    frames, each, rng = 12, 2, np.random.default_rng(0)
+    away = np.array([[1, 0, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1.0]])
+    K = np.array([[60, 0, 32], [0, 60, 32], [0, 0, 1.0]])
+    cameras = [Camera(str(i), K, look_at(0.2 * d, d, (0, 1, 0)), 64, 64) for i, d in enumerate(away)]
+    before = away[rng.integers(0, len(away), frames * each)] + rng.normal(scale=0.05, size=(frames * each, 3))
+    old = blob(200)
+    new = replace(old.take(np.zeros(len(before), int)), means=(1.5 * before).astype(np.float32))
+    t = np.arange(len(before)) // each
+    lifetimes = np.concatenate([np.tile([0, frames], (len(old), 1)), np.stack([t, t + 1], 1)]).astype(np.int32)
+    group = ParametricGroup(frames, concatenate([old, new]), None, {}, lifetimes)
+    removal = measure_group(group, cameras, PlanSettings()).removal[len(old) :]
+    assert removal.min() > 0.01 * removal.max()
 
 
 def test_a_trainers_nodes_carry_newcomers_from_where_these_rest():

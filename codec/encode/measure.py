@@ -10,17 +10,19 @@ from ..model.attributes import ATTRIBUTES
 from ..model.camera import Camera
 from ..model.gaussians import Gaussians, living
 from ..model.parametric_group import ParametricGroup
-from ..render.sensitivity import Importance, measure
+from ..render.sensitivity import Importance, measure, of_width, sensitivity_cameras
 from .settings import PlanSettings
 
 HIDDEN = -30.0  # logit opacity that no view shows
+SHORT_LIFE = 0.5  # of the frames of a group; what lives shorter is seen by few of the views
+SMALL = 128  # pixels, width of the pictures that say whether it matters
 GOLDEN = (5**0.5 - 1) / 2  # steps of this share of a range visit it evenly, in an order of no other sequence of views
 
 
 def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanSettings) -> Importance:
     """Importance of the N Gaussians, from the first, the middle and the last frame. Where Gaussians come and go, every
-    frame that shows some is seen, in a capture by one of its cameras and by another one: what lives in one frame shows
-    in few views.
+    frame that shows some is seen, in a capture by one of its cameras and by another one. That is too little to say that
+    what lives in few frames does not matter: those frames are seen by all cameras, in small pictures.
 
     Args:
         cameras: from which the subject was captured, if it was.
@@ -33,13 +35,27 @@ def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanS
     few = [group.frame(t) for t in sorted({0, frames // 2, frames - 1})]
     around = np.concatenate([f.means for f in few])
     views = settings.more_views if frames == 1 or len(g) <= settings.few else settings.views
-    if group.lifetimes is not None:
-        each = 2 if cameras else 1
-        times = _living_frames(group.lifetimes, frames)
-        times = [times[i] for i in _spread(len(times), max(views, each * len(times)) // each)]
-        some = [cameras[i] for i in _spread(len(cameras), len(times))] if cameras else []
-        return measure(lambda i: _shown(group, times[i % len(times)]), around, some, each * len(times))
-    return measure(lambda i: few[i % len(few)], around, cameras, views)
+    if group.lifetimes is None:
+        return measure(lambda i: few[i % len(few)], sensitivity_cameras(around, cameras, views))
+    each = 2 if cameras else 1
+    times = _living_frames(group.lifetimes, frames)
+    times = [times[i] for i in _spread(len(times), max(views, each * len(times)) // each)]
+    some = [cameras[i] for i in _spread(len(cameras), len(times))] if cameras else []
+    placed = sensitivity_cameras(around, some, each * len(times))
+    found = measure(lambda i: _shown(group, times[i % len(times)]), placed)
+    return replace(found, removal=np.maximum(found.removal, _short_lived_removal(group, cameras)))
+
+
+def _short_lived_removal(group: ParametricGroup, cameras: list[Camera]) -> np.ndarray:
+    """[N] f64, `Importance.removal` of what lives in few frames, from all `cameras` in each of them; 0 for the rest."""
+    lived = np.diff(group.lifetimes, axis=1)[:, 0]
+    short = (lived > 0) & (lived < SHORT_LIFE * group.frame_count)
+    times = [t for t in range(group.frame_count) if living(group.lifetimes[short], t).any()]
+    if not times or not cameras:
+        return np.zeros(len(short))
+    small = [of_width(c, SMALL) for c in cameras]
+    removal = measure(lambda i: _shown(group, times[i // len(small)]), small * len(times)).removal
+    return np.where(short, removal * len(times) / group.frame_count, 0)
 
 
 def _spread(items: int, count: int) -> list[int]:

@@ -66,30 +66,25 @@ def sensitivity_cameras(means: np.ndarray, given: list[Camera] = (), count: int 
             scene.
     """
     taken = [given[i] for i in np.linspace(0, len(given) - 1, min(len(given), count // 2)).round().astype(int)]
-    fitted = [c.resized(SIZE, max(1, round(SIZE * c.height / c.width))) for c in taken]
+    fitted = [of_width(c, SIZE) for c in taken]
     return fitted + cameras_around(means, count - len(taken), name="sensitivity", turn=1.3)
 
 
-def measure(
-    shown: Callable[[int], Gaussians],
-    means: np.ndarray,
-    cameras: list[Camera] = (),
-    views: int = VIEWS,
-    *,
-    backend: Backend | None = None,
-) -> Importance:
+def of_width(camera: Camera, width: int) -> Camera:
+    """The camera with pictures of `width` pixels."""
+    return camera.resized(width, max(1, round(width * camera.height / camera.width)))
+
+
+def measure(shown: Callable[[int], Gaussians], cameras: list[Camera], *, backend: Backend | None = None) -> Importance:
     """Sensitivity over several frames of the same N >= 1 Gaussians.
 
     Args:
         shown: view -> the Gaussians that it shows.
-        means: [M, 3] positions in all frames, around which the views stand.
-        cameras: of the capture.
-        views: rendered, all frames together.
+        cameras: one for each view, all frames together.
         backend: a new CpuBackend if None.
     """
     signs = np.random.default_rng(0)
     backend = backend or CpuBackend()
-    cameras = sensitivity_cameras(means, cameras, views)
     total, removal = {}, 0.0
     for i, camera in enumerate(cameras):
         g = shown(i)
@@ -189,7 +184,7 @@ def measured_steps(
     """
     if not len(g):
         return nominal
-    measured = measure(lambda _: g, g.means, cameras, backend=backend)
+    measured = measure(lambda _: g, sensitivity_cameras(g.means, cameras), backend=backend)
     weights, values = measured.weights | {"quats": measured.scene_rotations}, channel_values(g)
     steps = steps_for_error(weights, {n: values[n] for n in weights}, error_for(quality), subject_radius(g.means))
     for n in (n for n in steps if BY_NAME[n].decorrelated):
