@@ -46,6 +46,7 @@ class _Finetuner:
         self.node_rates = {"turn": f.node_rotation_rate, "shift": f.node_translation_rate * radius}
         self.loss = 0.0  # of a step, running mean
         self.steps = 0
+        self.short_lived = self._short_lived()
         self._draw_canonical()
         self.statistics = Statistics(len(group.key), settings.keyframe.mse_min)
         self.started: tuple[int, Frame, list[Target], PendingLoss, float] | None = None  # as `step` says
@@ -91,12 +92,16 @@ class _Finetuner:
             self._draw_canonical()
         self.steps += 1
         weight = s.finetune.canonical_bit_weight * self._bit_weight()
+        short, slower = self.short_lived
+        before = {n: p[short] for n, p in group.key.params.items()}
         for n, g in grads.items():
             if weight and n in self.by_rate:
                 g = g.add(self.by_rate[n], alpha=weight)
             g[: group.known] = 0
             grads[n] = g
         group.key.step(grads, {n: r * decay for n, r in self.canonical_rates.items()})
+        for n, p in group.key.params.items():
+            p[short] = before[n].lerp(p[short], slower.view(-1, *[1] * (p.dim() - 1)))
 
     def change_topology(self) -> None:
         """Removes new Gaussians that all frames together do without, and gives a second one to those whose screen
@@ -122,6 +127,7 @@ class _Finetuner:
             group.select(keep)
             self.coefficients.select(keep.numpy())
         self.statistics = Statistics(len(group.key), k.mse_min)
+        self.short_lived = self._short_lived()
         self._draw_canonical()
 
     def _drawn_share(self) -> torch.Tensor:
@@ -129,6 +135,13 @@ class _Finetuner:
         often = torch.bincount(torch.tensor(_round_of_frames(self.group.frames))).float()
         until = torch.cat([torch.zeros(1), often.cumsum(0)])
         return (until[self.group.end] - until[self.group.start]) / until[-1]
+
+    def _short_lived(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """[K] index of the Gaussians that not all frames show, and [K] factors of their steps: Adam goes on for
+        1 / sqrt(share) steps behind each gradient of what a share of the frames shows, and a size doubled at once."""
+        share = self._drawn_share()
+        short = torch.nonzero(share < 1)[:, 0]
+        return short, share[short].sqrt()
 
     def _draw_canonical(self) -> None:
         """The noise and the bits of the canonical Gaussians, held for some steps."""
