@@ -23,7 +23,7 @@ from gscodec.render.cpu import CpuBackend
 from gscodec.train.deformation_graph import NodeGraph, Pose
 from gscodec.train.entropy_model import CanonicalRate, laplace_bits
 from gscodec.train.finetune import GroupModel
-from gscodec.train.joint_optimization import finetune
+from gscodec.train.joint_optimization import _Finetuner, finetune
 from gscodec.train.model import from_gaussians, harmonics_turned
 from gscodec.train.tracking import Tracker
 from gscodec.train.train import train_groups
@@ -137,6 +137,25 @@ def test_fine_tuning_removes_and_adds_gaussians(capture, monkeypatch):
     assert len(second.parents) == len(second.canonical) >= len(first.canonical) + min(second.parents.min(), 0)
     assert psnr_of(first.frame(2), capture, 2) > 22
     assert psnr_of(second.frame(1), capture, 4) > 21
+
+
+def test_what_one_frame_shows_takes_one_step_for_each_gradient(capture):
+    """Adam alone goes on for some five steps behind a gradient in one of 22 steps."""
+    key, frames, rounds = from_gaussians(blob(60)), 20, 5
+    everything = torch.ones(60, dtype=torch.bool)
+    graph = NodeGraph.of(key.params["means"], torch.ones(60), 1.0, everything, dataclasses.replace(TINY.graph, nodes=8))
+    group = GroupModel(graph, None, [key] * frames, [Pose.rest(graph)] * frames, steps_for(50, 1.0), everything, TINY)
+    group.start[:20], group.end[:20] = 4, 5
+    run = _Finetuner(group, Views(capture, TINY, CpuBackend()), range(frames), TINY, radius=1.0)
+    before = group.key.params["log_scales"].clone()
+    for step in range(rounds * (frames + 2)):
+        shown = torch.arange(60) >= (0 if step % (frames + 2) == 4 else 20)
+        grads = {n: torch.zeros_like(p) for n, p in group.key.params.items()}
+        grads["log_scales"] -= shown[:, None].float()
+        run._step_canonical(grads, 1.0)
+    moved = (group.key.params["log_scales"] - before).mean(1) / run.canonical_rates["log_scales"]
+    assert moved[20:].min() == pytest.approx(rounds * (frames + 2), rel=0.05)
+    assert 0.5 * rounds < moved[:20].mean() < 1.5 * rounds
 
 
 @pytest.mark.parametrize("drift", [0.2, 0.0])
