@@ -39,7 +39,7 @@ def test_a_longer_group_has_more_temporal_frequencies():
     key = from_gaussians(blob(50))
     everything = torch.ones(50, dtype=torch.bool)
     graph = NodeGraph.of(key.params["means"], torch.ones(50), 1.0, everything, dataclasses.replace(TINY.graph, nodes=8))
-    for frames, means, colours in ((4, 4, 4), (20, 20, 12), (30, 30, 18), (31, 31, 19)):
+    for frames, means, colours in ((4, 4, 4), (20, 10, 6), (30, 15, 9), (31, 16, 10)):
         poses = [Pose.rest(graph)] * frames
         group = GroupModel(graph, None, [key] * frames, poses, steps_for(50, 1.0), everything, TINY)
         assert len(group.coefficients["means"]) == means

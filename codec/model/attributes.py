@@ -46,23 +46,23 @@ class Attribute:
 ATTRIBUTES = (
     Attribute(
         "means", 1, 3, "x, y, z; canonical on the grid",
-        nominal_step=0.001, coarsest_step=0.02, temporal_frequencies=20, learning_rate=1.6e-3,
+        nominal_step=0.001, coarsest_step=0.02, temporal_frequencies=10, learning_rate=1.6e-3,
     ),
     Attribute(
         "log_scales", 2, 3, "natural log of the standard deviations, world units", companded=True,
-        nominal_step=0.25, coarsest_step=1.0, temporal_frequencies=6, learning_rate=8e-2,
+        nominal_step=0.25, coarsest_step=1.0, temporal_frequencies=3, learning_rate=8e-2,
     ),
     Attribute(
         "quats", 3, 3, "x, y, z of the unit quaternion, w = sqrt(1 - x^2 - y^2 - z^2)",
-        nominal_step=0.035, coarsest_step=0.25, temporal_frequencies=8, learning_rate=1.6e-2,
+        nominal_step=0.035, coarsest_step=0.25, temporal_frequencies=4, learning_rate=1.6e-2,
     ),
     Attribute(
         "logit_opacities", 4, 1, "logit of the opacity", companded=True,
-        nominal_step=0.63, coarsest_step=2.0, temporal_frequencies=6, learning_rate=3e-2,
+        nominal_step=0.63, coarsest_step=2.0, temporal_frequencies=3, learning_rate=3e-2,
     ),
     Attribute(
         "sh0", 5, 3, "Y, Co, Cg of the Y_00 coefficient", decorrelated=True,
-        nominal_step=0.125, coarsest_step=1.0, temporal_frequencies=12, learning_rate=5e-3,
+        nominal_step=0.125, coarsest_step=1.0, temporal_frequencies=6, learning_rate=5e-3,
     ),
     Attribute(
         "shN", 6, 3, "Y, Co, Cg per coefficient of the higher bands", decorrelated=True,

@@ -219,9 +219,12 @@ class _Run:
             nominal, g = steps_for(quality, subject.radius), track.models[t].gaussians()
             subject.steps = measured_steps(g, quality, nominal, cameras, backend=self.views.backend)
         graph, steps = subject.tracker.graph, subject.steps
-        faster = 1 + float(np.mean(track.searched))  # what moves fast changes its light and shape as fast
-        f = self.settings.finetune.with_frequencies(faster)
-        settings = replace(self.settings, finetune=f, finetune_steps=round(faster * self.settings.finetune_steps))
+        fast, f = float(np.mean(track.searched)), self.settings.finetune  # it changes its light and shape as fast
+        settings = replace(
+            self.settings,
+            finetune=f.with_frequencies(1 + f.fast_frequencies * fast),
+            finetune_steps=round((1 + fast) * self.settings.finetune_steps),
+        )
         model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), settings)
         self.progress.total += views_to_draw(model, settings) - self.settings.finetune_steps * len(frames)
         on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")

@@ -157,6 +157,7 @@ class TrainSettings:
                 opacity_decay=room.opacity_decay,
                 position_noise=room.position_noise,
             ),
+            finetune=self.finetune.with_frequencies(room.frequencies),
             group=replace(self.group, drift_ratio=room.drift_ratio * self.group.drift_ratio),
             graph=replace(self.graph, nodes=round(room.nodes * self.graph.nodes)),
             motion_field=replace(self.motion_field, tracking=field),

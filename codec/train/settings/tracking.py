@@ -59,6 +59,7 @@ class RoomSettings:
     nodes: float = 2.5  # times those of a subject: much of what seems to move is what lies behind it
     motion_steps: float = 0.5  # times those of a subject: fine-tuning finds more in nearly the same time
     finetune_steps: float = 2.0  # times those of a subject
+    frequencies: float = 2.0  # times those of a subject: no search tells that something small moves fast
     rigidity: float = 1 / 3  # times that of a subject
     cut_ratio: float = 5 / 3  # times that of a subject, since few views of a room fit its keyframe far too well
     drift_ratio: float = 3.6  # times that of a subject, for the same reason
