@@ -137,11 +137,11 @@ class _Finetuner:
         return (until[self.group.end] - until[self.group.start]) / until[-1]
 
     def _short_lived(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """[K] index of the Gaussians that not all frames show, and [K] factors of their steps: Adam goes on for
-        1 / sqrt(share) steps behind each gradient of what a share of the frames shows, and a size doubled at once."""
-        share = self._drawn_share()
-        short = torch.nonzero(share < 1)[:, 0]
-        return short, share[short].sqrt()
+        """[K] index of the Gaussians that few frames show, and [K] factors of their steps: behind each gradient of what
+        a share of the frames shows Adam goes on for 1 / sqrt(share) steps, and a size doubled for one picture."""
+        factor = self._drawn_share() / self.settings.finetune.short_life
+        short = torch.nonzero(factor < 1)[:, 0]
+        return short, factor[short]
 
     def _draw_canonical(self) -> None:
         """The noise and the bits of the canonical Gaussians, held for some steps."""

@@ -38,6 +38,7 @@ class FinetuneSettings:
     rate_decay: float = 0.05  # rates at the last step, times those at the first
     topology_at: float = 0.3  # share of the steps at which Gaussians are removed and added
     topology_views: int = 4  # times every camera must have been drawn before
+    short_life: float = 0.2  # share of the frames; a Gaussian that lives shorter takes steps smaller in proportion
     views: int = 2  # of a frame, in one step: what a step costs besides is shared
     frames_min: int = 20  # a shorter group behind a keyframe has the steps of so many
     growth: float = 0.1  # share of the Gaussians that may be added then
