@@ -10,7 +10,7 @@ from ..model.attributes import ATTRIBUTES
 from ..model.camera import Camera
 from ..model.gaussians import Gaussians, living
 from ..model.parametric_group import ParametricGroup
-from ..render.sensitivity import Importance, measure, of_width, sensitivity_cameras
+from ..render.sensitivity import Importance, measure, measure_removal, of_width, sensitivity_cameras
 from .settings import PlanSettings
 
 HIDDEN = -30.0  # logit opacity that no view shows
@@ -38,7 +38,7 @@ def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanS
     if group.lifetimes is None:
         return measure(lambda i: few[i % len(few)], sensitivity_cameras(around, cameras, views))
     each = 2 if cameras else 1
-    times = _living_frames(group.lifetimes, frames)
+    times = _living_frames(group.lifetimes, frames) or list(range(frames))
     times = [times[i] for i in _spread(len(times), max(views, each * len(times)) // each)]
     some = [cameras[i] for i in _spread(len(cameras), len(times))] if cameras else []
     placed = sensitivity_cameras(around, some, each * len(times))
@@ -50,11 +50,11 @@ def _short_lived_removal(group: ParametricGroup, cameras: list[Camera]) -> np.nd
     """[N] f64, `Importance.removal` of what lives in few frames, from all `cameras` in each of them; 0 for the rest."""
     lived = np.diff(group.lifetimes, axis=1)[:, 0]
     short = (lived > 0) & (lived < SHORT_LIFE * group.frame_count)
-    times = [t for t in range(group.frame_count) if living(group.lifetimes[short], t).any()]
+    times = _living_frames(group.lifetimes[short], group.frame_count)
     if not times or not cameras:
         return np.zeros(len(short))
     small = [of_width(c, SMALL) for c in cameras]
-    removal = measure(lambda i: _shown(group, times[i // len(small)]), small * len(times)).removal
+    removal = measure_removal(lambda i: _shown(group, times[i // len(small)]), small * len(times))
     return np.where(short, removal * len(times) / group.frame_count, 0)
 
 
@@ -65,9 +65,8 @@ def _spread(items: int, count: int) -> list[int]:
 
 
 def _living_frames(lifetimes: np.ndarray, frames: int) -> list[int]:
-    """Frames that show something; all of them if none does."""
-    shown = [t for t in range(frames) if living(lifetimes, t).any()]
-    return shown or list(range(frames))
+    """Frames in which something lives."""
+    return [t for t in range(frames) if living(lifetimes, t).any()]
 
 
 def _shown(group: ParametricGroup, t: int) -> Gaussians:

@@ -10,7 +10,7 @@ are not those by which `gscodec eval` judges.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +25,7 @@ from .backend import TURNS, Backend
 from .cpu import CpuBackend
 
 VIEWS, SIZE = 24, 512
+MEASURED = (*BY_NAME, "scene_rotations")
 GREY = (0.5, 0.5, 0.5)
 
 
@@ -83,20 +84,38 @@ def measure(shown: Callable[[int], Gaussians], cameras: list[Camera], *, backend
         cameras: one for each view, all frames together.
         backend: a new CpuBackend if None.
     """
-    signs = np.random.default_rng(0)
-    backend = backend or CpuBackend()
     total, removal = {}, 0.0
+    for g, share, by in _probed(shown, cameras, backend or CpuBackend()):
+        for name, d in by.items():
+            total[name] = total.get(name, 0) + share * d * d
+        removal += share * _squared_removal(g, by)
+    total = {n: w.astype(np.float64) for n, w in total.items()}
+    return Importance(total, total.pop("scene_rotations"), removal)
+
+
+def measure_removal(shown: Callable[[int], Gaussians], cameras: list[Camera]) -> np.ndarray:
+    """`Importance.removal` alone, [N] f64; `shown` and `cameras` as of `measure`."""
+    views = _probed(shown, cameras, CpuBackend(), ("logit_opacities",))
+    return sum(share * _squared_removal(g, by) for g, share, by in views)
+
+
+def _probed(
+    shown: Callable[[int], Gaussians], cameras: list[Camera], backend: Backend, names: Iterable[str] = MEASURED
+) -> Iterator[tuple[Gaussians, float, dict[str, np.ndarray]]]:
+    """For each view its Gaussians, the weight of their squared derivatives in the mean, and the derivatives `names` of
+    random signs."""
+    signs = np.random.default_rng(0)
     for i, camera in enumerate(cameras):
         g = shown(i)
         probe = (2.0 * signs.integers(0, 2, (camera.height, camera.width, 3)) - 1).astype(np.float32)
-        share = 1 / (len(cameras) * probe.size)
-        for name, d in derivatives(backend, g, camera, lambda _, probe=probe: probe).items():
-            total[name] = total.get(name, 0) + share * d * d
-            if name == "logit_opacities":
-                transparency = np.maximum(1 / (1 + np.exp(g.logit_opacities)), 1e-6)
-                removal += share * (d[:, 0] / transparency) ** 2
-    total = {n: w.astype(np.float64) for n, w in total.items()}
-    return Importance(total, total.pop("scene_rotations"), removal)
+        by = derivatives(backend, g, camera, lambda _, probe=probe: probe, names)
+        yield g, 1 / (len(cameras) * probe.size), by
+
+
+def _squared_removal(g: Gaussians, by: dict[str, np.ndarray]) -> np.ndarray:
+    """[N], squared change of the picture without each Gaussian."""
+    transparency = np.maximum(1 / (1 + np.exp(g.logit_opacities)), 1e-6)
+    return (by["logit_opacities"][:, 0] / transparency) ** 2
 
 
 def params_of(g: Gaussians, turns: np.ndarray | None = None) -> dict[str, np.ndarray]:
@@ -115,7 +134,7 @@ def derivatives(
     g: Gaussians,
     camera: Camera,
     by_picture: Callable[[np.ndarray], np.ndarray],
-    names: Iterable[str] = (*BY_NAME, "scene_rotations"),
+    names: Iterable[str] = MEASURED,
     background: tuple[float, ...] = GREY,
     turns: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
