@@ -223,7 +223,7 @@ class _Run:
         settings = replace(
             self.settings,
             finetune=f.with_frequencies(1 + f.fast_frequencies * fast),
-            finetune_steps=round((1 + fast) * self.settings.finetune_steps),
+            finetune_steps=round((1 + f.fast_steps * fast) * self.settings.finetune_steps),
         )
         model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), settings)
         self.progress.total += views_to_draw(model, settings) - self.settings.finetune_steps * len(frames)
