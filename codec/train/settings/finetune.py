@@ -23,7 +23,7 @@ class FinetuneSettings:
     frequencies: dict[str, int] = field(default_factory=temporal_frequencies)
     frequencies_frames: int = FREQUENCIES_OF  # frames that `frequencies` is for
     fast_frequencies: float = 3.0  # times as many besides, where all frames were searched for (`Tracker.searched`)
-    fast_steps: float = 5.0  # times as many steps besides, there: far fewer than a keyframe for each frame would have
+    fast_steps: float = 5.0  # times as many steps besides, there, since more of each frame is its own
     free_min: float = 0.5  # quantization steps: a residual from the start, so that a resting Gaussian stays free
     dead_zone: float = 0.1  # quantization steps more than half of one, below which a coefficient is not coded
     coefficient_rate: float = 0.1  # quantization steps
