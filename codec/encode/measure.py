@@ -10,12 +10,12 @@ from ..model.attributes import ATTRIBUTES
 from ..model.camera import Camera
 from ..model.gaussians import Gaussians, living
 from ..model.parametric_group import ParametricGroup
-from ..render.sensitivity import Importance, measure, measure_removal, of_width, sensitivity_cameras
+from ..render.sensitivity import Importance, measure, of_width, sensitivity_cameras
 from .settings import PlanSettings
 
 HIDDEN = -30.0  # logit opacity that no view shows
 SHORT_LIFE = 0.5  # of the frames of a group; what lives shorter is seen by few of the views
-SMALL = 128  # pixels, width of the pictures that say whether it matters
+SMALL = 128  # pixels, width of the pictures that say what it matters
 GOLDEN = (5**0.5 - 1) / 2  # steps of this share of a range visit it evenly, in an order of no other sequence of views
 
 
@@ -42,20 +42,19 @@ def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanS
     times = [times[i] for i in _spread(len(times), max(views, each * len(times)) // each)]
     some = [cameras[i] for i in _spread(len(cameras), len(times))] if cameras else []
     placed = sensitivity_cameras(around, some, each * len(times))
-    found = measure(lambda i: _shown(group, times[i % len(times)]), placed)
-    return replace(found, removal=np.maximum(found.removal, _short_lived_removal(group, cameras)))
+    return _with_short_lived(measure(lambda i: _shown(group, times[i % len(times)]), placed), group, cameras)
 
 
-def _short_lived_removal(group: ParametricGroup, cameras: list[Camera]) -> np.ndarray:
-    """[N] f64, `Importance.removal` of what lives in few frames, from all `cameras` in each of them; 0 for the rest."""
+def _with_short_lived(found: Importance, group: ParametricGroup, cameras: list[Camera]) -> Importance:
+    """The importance `found`, of what lives in few frames at least that which all `cameras` see of it there."""
     lived = np.diff(group.lifetimes, axis=1)[:, 0]
-    short = (lived > 0) & (lived < SHORT_LIFE * group.frame_count)
+    short = np.nonzero((lived > 0) & (lived < SHORT_LIFE * group.frame_count))[0]
     times = _living_frames(group.lifetimes[short], group.frame_count)
     if not times or not cameras:
-        return np.zeros(len(short))
+        return found
     small = [of_width(c, SMALL) for c in cameras]
-    removal = measure_removal(lambda i: _shown(group, times[i // len(small)]), small * len(times))
-    return np.where(short, removal * len(times) / group.frame_count, 0)
+    seen = measure(lambda i: _shown(group, times[i // len(small)]), small * len(times))
+    return found.at_least(short, seen.take(short), len(times) / group.frame_count)
 
 
 def _spread(items: int, count: int) -> list[int]:

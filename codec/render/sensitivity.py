@@ -10,7 +10,7 @@ are not those by which `gscodec eval` judges.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,6 +53,19 @@ class Importance:
         """The same with other sensitivities of some attributes."""
         return replace(self, weights=self.weights | weights)
 
+    def at_least(self, index: np.ndarray, other: Importance, share: float) -> Importance:
+        """The same; of the Gaussians `index` at least `share` times `other`, which is of them alone."""
+
+        def raised(mine: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+            out = mine.copy()
+            out[index] = np.maximum(mine[index], share * theirs)
+            return out
+
+        weights = {n: raised(w, other.weights[n]) for n, w in self.weights.items()}
+        return Importance(
+            weights, raised(self.scene_rotations, other.scene_rotations), raised(self.removal, other.removal)
+        )
+
     def with_axes(self, order: np.ndarray) -> Importance:
         """The same for Gaussians whose own axes are in `order` ([N, 3] int)."""
         own = {n: np.take_along_axis(self.weights[n], order, 1) for n in ("log_scales", "quats")}
@@ -84,38 +97,17 @@ def measure(shown: Callable[[int], Gaussians], cameras: list[Camera], *, backend
         cameras: one for each view, all frames together.
         backend: a new CpuBackend if None.
     """
-    total, removal = {}, 0.0
-    for g, share, by in _probed(shown, cameras, backend or CpuBackend()):
-        for name, d in by.items():
-            total[name] = total.get(name, 0) + share * d * d
-        removal += share * _squared_removal(g, by)
-    total = {n: w.astype(np.float64) for n, w in total.items()}
-    return Importance(total, total.pop("scene_rotations"), removal)
-
-
-def measure_removal(shown: Callable[[int], Gaussians], cameras: list[Camera]) -> np.ndarray:
-    """`Importance.removal` alone, [N] f64; `shown` and `cameras` as of `measure`."""
-    views = _probed(shown, cameras, CpuBackend(), ("logit_opacities",))
-    return sum(share * _squared_removal(g, by) for g, share, by in views)
-
-
-def _probed(
-    shown: Callable[[int], Gaussians], cameras: list[Camera], backend: Backend, names: Iterable[str] = MEASURED
-) -> Iterator[tuple[Gaussians, float, dict[str, np.ndarray]]]:
-    """For each view its Gaussians, the weight of their squared derivatives in the mean, and the derivatives `names` of
-    random signs."""
-    signs = np.random.default_rng(0)
+    backend, signs, total, removal = backend or CpuBackend(), np.random.default_rng(0), {}, 0.0
     for i, camera in enumerate(cameras):
         g = shown(i)
         probe = (2.0 * signs.integers(0, 2, (camera.height, camera.width, 3)) - 1).astype(np.float32)
-        by = derivatives(backend, g, camera, lambda _, probe=probe: probe, names)
-        yield g, 1 / (len(cameras) * probe.size), by
-
-
-def _squared_removal(g: Gaussians, by: dict[str, np.ndarray]) -> np.ndarray:
-    """[N], squared change of the picture without each Gaussian."""
-    transparency = np.maximum(1 / (1 + np.exp(g.logit_opacities)), 1e-6)
-    return (by["logit_opacities"][:, 0] / transparency) ** 2
+        by, share = derivatives(backend, g, camera, lambda _, probe=probe: probe), 1 / (len(cameras) * probe.size)
+        for name, d in by.items():
+            total[name] = total.get(name, 0) + share * d * d
+        transparency = np.maximum(1 / (1 + np.exp(g.logit_opacities)), 1e-6)
+        removal += share * (by["logit_opacities"][:, 0] / transparency) ** 2
+    total = {n: w.astype(np.float64) for n, w in total.items()}
+    return Importance(total, total.pop("scene_rotations"), removal)
 
 
 def params_of(g: Gaussians, turns: np.ndarray | None = None) -> dict[str, np.ndarray]:
