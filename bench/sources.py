@@ -47,6 +47,11 @@ def _rows() -> Iterator[tuple[str, ...]]:
         ("rd.json", "other codecs", "gscodec bench rd"),
         ("ablation.json", "losses and tools", "gscodec bench ablation"),
         ("stress.json", "stress", "gscodec bench stress"),
+        (
+            "fast_motion.json",
+            "fast motion, 12 frames",
+            'gscodec bench stress --case "fast motion" --frames 12 --out FILE',
+        ),
         ("gop.json", "length of groups", "python -m bench.gop"),
         ("rig.json", "a rig", "python -m bench.rig"),
         ("fuzz.json", "fuzzing", "python -m bench.fuzz"),
