@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -48,13 +49,14 @@ def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanS
 def _with_short_lived(found: Importance, group: ParametricGroup, cameras: list[Camera]) -> Importance:
     """The importance `found`, of what lives in few frames at least that which all `cameras` see of it there."""
     lived = np.diff(group.lifetimes, axis=1)[:, 0]
-    short = np.nonzero((lived > 0) & (lived < SHORT_LIFE * group.frame_count))[0]
+    short = (lived > 0) & (lived < SHORT_LIFE * group.frame_count)
     times = _living_frames(group.lifetimes[short], group.frame_count)
     if not times or not cameras:
         return found
     small = [of_width(c, SMALL) for c in cameras]
-    seen = measure(lambda i: _shown(group, times[i // len(small)]), small * len(times))
-    return found.at_least(short, seen.take(short), len(times) / group.frame_count)
+    shown = lru_cache(maxsize=1)(lambda t: _shown(group, t))  # one frame for all cameras
+    seen = measure(lambda i: shown(times[i // len(small)]), small * len(times))
+    return found.at_least(seen, len(times) / group.frame_count, short)
 
 
 def _spread(items: int, count: int) -> list[int]:

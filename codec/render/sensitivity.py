@@ -25,7 +25,6 @@ from .backend import TURNS, Backend
 from .cpu import CpuBackend
 
 VIEWS, SIZE = 24, 512
-MEASURED = (*BY_NAME, "scene_rotations")
 GREY = (0.5, 0.5, 0.5)
 
 
@@ -53,18 +52,13 @@ class Importance:
         """The same with other sensitivities of some attributes."""
         return replace(self, weights=self.weights | weights)
 
-    def at_least(self, index: np.ndarray, other: Importance, share: float) -> Importance:
-        """The same; of the Gaussians `index` at least `share` times `other`, which is of them alone."""
-
-        def raised(mine: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-            out = mine.copy()
-            out[index] = np.maximum(mine[index], share * theirs)
-            return out
-
-        weights = {n: raised(w, other.weights[n]) for n, w in self.weights.items()}
-        return Importance(
-            weights, raised(self.scene_rotations, other.scene_rotations), raised(self.removal, other.removal)
-        )
+    def at_least(self, other: Importance, share: float, among: np.ndarray) -> Importance:
+        """The same, but of the Gaussians `among` ([N] bool) at least `share` of `other`."""
+        some = among[:, None]
+        weights = {n: np.where(some, np.maximum(w, share * other.weights[n]), w) for n, w in self.weights.items()}
+        turns = np.where(some, np.maximum(self.scene_rotations, share * other.scene_rotations), self.scene_rotations)
+        removal = np.where(among, np.maximum(self.removal, share * other.removal), self.removal)
+        return Importance(weights, turns, removal)
 
     def with_axes(self, order: np.ndarray) -> Importance:
         """The same for Gaussians whose own axes are in `order` ([N, 3] int)."""
@@ -97,15 +91,18 @@ def measure(shown: Callable[[int], Gaussians], cameras: list[Camera], *, backend
         cameras: one for each view, all frames together.
         backend: a new CpuBackend if None.
     """
-    backend, signs, total, removal = backend or CpuBackend(), np.random.default_rng(0), {}, 0.0
+    signs = np.random.default_rng(0)
+    backend = backend or CpuBackend()
+    total, removal = {}, 0.0
     for i, camera in enumerate(cameras):
         g = shown(i)
         probe = (2.0 * signs.integers(0, 2, (camera.height, camera.width, 3)) - 1).astype(np.float32)
-        by, share = derivatives(backend, g, camera, lambda _, probe=probe: probe), 1 / (len(cameras) * probe.size)
-        for name, d in by.items():
+        share = 1 / (len(cameras) * probe.size)
+        for name, d in derivatives(backend, g, camera, lambda _, probe=probe: probe).items():
             total[name] = total.get(name, 0) + share * d * d
-        transparency = np.maximum(1 / (1 + np.exp(g.logit_opacities)), 1e-6)
-        removal += share * (by["logit_opacities"][:, 0] / transparency) ** 2
+            if name == "logit_opacities":
+                transparency = np.maximum(1 / (1 + np.exp(g.logit_opacities)), 1e-6)
+                removal += share * (d[:, 0] / transparency) ** 2
     total = {n: w.astype(np.float64) for n, w in total.items()}
     return Importance(total, total.pop("scene_rotations"), removal)
 
@@ -126,7 +123,7 @@ def derivatives(
     g: Gaussians,
     camera: Camera,
     by_picture: Callable[[np.ndarray], np.ndarray],
-    names: Iterable[str] = MEASURED,
+    names: Iterable[str] = (*BY_NAME, "scene_rotations"),
     background: tuple[float, ...] = GREY,
     turns: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:

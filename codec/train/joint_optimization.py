@@ -46,9 +46,7 @@ class _Finetuner:
         self.node_rates = {"turn": f.node_rotation_rate, "shift": f.node_translation_rate * radius}
         self.loss = 0.0  # of a step, running mean
         self.steps = 0
-        self.short_lived = self._short_lived()
-        self._draw_canonical()
-        self.statistics = Statistics(len(group.key), settings.keyframe.mse_min)
+        self._look_at_gaussians()
         self.started: tuple[int, Frame, list[Target], PendingLoss, float] | None = None  # as `step` says
         self.bits = sum(self._step_coefficients(0, None, 0.0, 0.0))
 
@@ -126,7 +124,11 @@ class _Finetuner:
         if keep.any():
             group.select(keep)
             self.coefficients.select(keep.numpy())
-        self.statistics = Statistics(len(group.key), k.mse_min)
+        self._look_at_gaussians()
+
+    def _look_at_gaussians(self) -> None:
+        """What depends on which Gaussians there are, from here on."""
+        self.statistics = Statistics(len(self.group.key), self.settings.keyframe.mse_min)
         self.short_lived = self._short_lived()
         self._draw_canonical()
 
