@@ -55,7 +55,7 @@ def ours(capture: Capture, settings: TrainSettings, quality: float) -> Trained:
     """gscodec's training and coding."""
     groups, seconds = train.sequence(capture, settings)
     code = lambda: train.coded(capture, groups, settings, EncodeSettings(quality))[:2]  # noqa: E731
-    return Trained(train.shown(groups), [len(g) for g in groups], seconds, code)
+    return Trained(train.shown(groups), [len(g) for g in groups], sum(seconds), code)
 
 
 def v3(capture: Capture, settings: TrainSettings, _: float) -> Trained:

@@ -56,7 +56,7 @@ def measure(gop: int, lengths: list[int], preset: str, data: Path) -> Iterator[d
             "preset": preset,
             "gop": gop,
             "random_access": random_access,
-            "seconds_per_frame": round((trained + seconds) / len(decoded), 2),
+            "seconds_per_frame": round((sum(trained) + seconds) / len(decoded), 2),
             "psnr_of_model": round(model["psnr_fg"], 3),
             "psnr": round(result["psnr_fg"], 3),
             "psnr_of_first_group": round(float(psnr[: starts[1]].mean()), 3),

@@ -115,7 +115,7 @@ def compare(capture: Capture, **budget) -> dict:
         "gaussians_most": max(map(len, models)),
         "gaussians_allowed": settings.gaussians_max,
         "kb_per_frame": size / 1000 / len(models),
-        "seconds_per_frame": seconds / len(models),
+        "seconds_per_frame": sum(seconds) / len(models),
         "groups": [len(g) for g in groups],
         "keyframes": keyframes,
         "identity": keyframes == len(models),

@@ -44,6 +44,7 @@ V3_PACKING = {"qp": 25, "raw": True}  # its default qp, and the better of its tw
 V3_GOP = 20  # frames in a group of V3
 KEYS = ("psnr", "psnr_fg", "psnr_corrected", "ssim", "vmaf", "gaussians", "kb_per_frame", "flicker")
 WORK = Path("build/bench")  # where moving splats are kept
+PORTRAIT = Rig(width=1080, height=1440)
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,9 @@ class Case:
         frames: the first frames that are used; None: all.
         splat: a static splat of the data folder instead, which `animate_splat` moves and `drawn.py` draws.
         vmaf: it is measured too.
+        rig: that draws it.
         rounds: times that its frames follow each other: a walk that ends where it began.
+        back: every second round goes backwards: a motion that does not end where it began.
     """
 
     folder: str
@@ -66,7 +69,9 @@ class Case:
     frames: int | None = None
     splat: str | None = None
     vmaf: bool = False
+    rig: Rig = PORTRAIT
     rounds: int = 1
+    back: bool = False
 
     def open(self, data: Path) -> Capture:
         """The capture.
@@ -76,15 +81,15 @@ class Case:
         """
         from gscodec.capture import open_capture
 
-        if self.splat:
-            rig = Rig(width=1080, height=1440)
-            return animated_capture(Path(data) / self.splat, WORK, self.frames, rig).scaled(self.scale)
         folder = Path(data) / self.folder
-        if not folder.is_dir():
+        if self.splat:
+            capture = animated_capture(Path(data) / self.splat, WORK, self.frames, self.rig)
+        elif folder.is_dir():
+            capture = open_capture(folder).frames(0, self.frames)
+        else:
             raise UsageError(f"{folder} does not exist")
-        capture = open_capture(folder).frames(0, self.frames).scaled(self.scale)
-        capture = capture if not self.test else held_out(capture, self.test)
-        return capture if self.rounds == 1 else repeated(capture, self.rounds)
+        capture = held_out(capture, self.test) if self.test else capture
+        return repeated(capture.scaled(self.scale), self.rounds, back=self.back)
 
 
 CASES = {
@@ -94,17 +99,26 @@ CASES = {
     "stage": Case("stage"),
     "basketball": Case("basketball", frames=60),
     "statue-drawn": Case("", splat="splats/statue.ply", frames=40, vmaf=True),
+    "statue-hd-150": Case(  # 150 frames of 1920 x 1080
+        "", splat="splats/statue.ply", frames=30, rig=Rig(train=10, val=0, width=1920, height=1080), rounds=5, back=True
+    ),
     "pose2sim": Case("pose2sim", test=("cam04",), scale=0.25, frames=10),
 }
 
 
-def repeated(capture: Capture, rounds: int) -> Capture:
-    """The frames of a capture so many times, one after the other."""
-    at = lambda t: capture.first_frame + t % capture.frame_count  # noqa: E731
+def repeated(capture: Capture, rounds: int, *, back: bool = False) -> Capture:
+    """The frames of a capture so many times, one after the other; `back`: every second time from the last to the
+    first."""
+    count = capture.frame_count
+
+    def at(t: int) -> int:
+        turn, frame = divmod(t, count)
+        return capture.first_frame + (count - 1 - frame if back and turn % 2 else frame)
+
     return replace(
         capture,
         first_frame=0,
-        frame_count=rounds * capture.frame_count,
+        frame_count=rounds * count,
         read=lambda camera, t: capture.read(camera, at(t)),
         poses=capture.poses and (lambda camera, t: capture.poses(camera, at(t))),
     )
@@ -187,8 +201,10 @@ def _ours(capture: Capture, frames: range, settings, encodings) -> Iterator[tupl
     if frames.step != 1:
         raise UsageError("gscodec follows what moves: it needs every frame, expected a range without a step")
     own = part(capture, frames)
-    groups, trained = sequence(own, settings)
-    yield "model", trained, None, shown(groups)
+    groups, seconds_of_group = sequence(own, settings)
+    trained = sum(seconds_of_group)
+    found = {"seconds_of_group": [round(s, 1) for s in seconds_of_group], "peak_gib": _peak_gib()}
+    yield "model", trained, None, shown(groups), found
     for encoding in encodings:
         size, decoded, seconds, report = coded(own, groups, settings, encoding)
         share, bits = still_share(groups[0], report.quality, training_cameras(own, len(groups[0]) // 2))
@@ -241,12 +257,22 @@ def v3_coded(models: list[Gaussians]) -> tuple[int, list[Gaussians]]:
     return size, decoded
 
 
-def sequence(capture: Capture, settings) -> tuple[list[ParametricGroup], float]:
-    """Trains the capture; returns the groups and the seconds."""
+def sequence(capture: Capture, settings) -> tuple[list[ParametricGroup], list[float]]:
+    """Trains the capture; returns the groups and the seconds of each."""
     from gscodec.train.train import train_groups
 
-    start = time.perf_counter()
-    return list(train_groups(capture, settings)), time.perf_counter() - start
+    groups, seconds, start = [], [], time.perf_counter()
+    for group in train_groups(capture, settings):
+        groups.append(group)
+        seconds.append(time.perf_counter() - start - sum(seconds))
+    return groups, seconds
+
+
+def _peak_gib() -> float:
+    """The most memory that this process has used so far, GiB."""
+    import resource  # not on Windows
+
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2)
 
 
 def shown(groups: list[ParametricGroup]) -> list[Gaussians]:
