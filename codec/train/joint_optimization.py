@@ -239,7 +239,7 @@ def finetune(
 def views_to_draw(group: GroupModel, settings: TrainSettings) -> int:
     """Views for the fine-tuning of a group; a short one behind a keyframe has those of `frames_min` frames."""
     least = 0 if group.known else settings.finetune.frames_min
-    return settings.finetune_steps * max(group.frames, least)
+    return round(settings.finetune_steps * max(group.frames, least))
 
 
 def _round_of_frames(frames: int) -> list[int]:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 def search(tracker: Tracker, frame: int) -> Pose | None:
     """The pose of `tracker`, in the frame before `frame`, with the step that fits `frame` best; None: constant velocity
     fits well enough, or nothing fits better."""
-    if not tracker.moving.any():  # all that moved has been found to be gone
+    if not tracker.moving.any() or not tracker.views.show(frame):  # all that moved is gone
         return None
     s, pose = tracker.settings.motion_search, None
     for parts in (1, s.parts):

@@ -219,12 +219,7 @@ class _Run:
             nominal, g = steps_for(quality, subject.radius), track.models[t].gaussians()
             subject.steps = measured_steps(g, quality, nominal, cameras, backend=self.views.backend)
         graph, steps = subject.tracker.graph, subject.steps
-        fast, f = float(np.mean(track.searched)), self.settings.finetune  # it changes its light and shape as fast
-        settings = replace(
-            self.settings,
-            finetune=f.with_frequencies(1 + f.fast_frequencies * fast),
-            finetune_steps=round((1 + f.fast_steps * fast) * self.settings.finetune_steps),
-        )
+        settings = self.settings.of_fast_motion(len(frames), float(np.mean(track.searched)))
         model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), settings)
         self.progress.total += views_to_draw(model, settings) - self.settings.finetune_steps * len(frames)
         on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")

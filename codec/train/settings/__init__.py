@@ -163,6 +163,21 @@ class TrainSettings:
             motion_field=replace(self.motion_field, tracking=field),
         )
 
+    def of_fast_motion(self, frames: int, share: float) -> TrainSettings:
+        """The settings of a group of so many frames, of which a search has found this share: they change their light
+        and shape as fast. What a search finds is many quantization steps off, and coefficients are faster; but Adam
+        goes on along the gradient of a frame until that frame comes again. With more steps a frame fewer frames have
+        enough of them.
+        """
+        f = self.finetune
+        steps = 1 + f.fast_steps * share
+        finetune = replace(
+            f.with_frequencies(1 + f.fast_frequencies * share),
+            coefficient_rate=(1 + f.fast_rate * share / frames) * f.coefficient_rate,
+            frames_min=f.frames_min / steps,
+        )
+        return replace(self, finetune=finetune, finetune_steps=round(steps * self.finetune_steps))
+
 
 PRESETS = {
     "fast": {"keyframe_steps": 700, "motion_steps": 130, "finetune_steps": 170},

@@ -23,7 +23,8 @@ class FinetuneSettings:
     frequencies: dict[str, int] = field(default_factory=temporal_frequencies)
     frequencies_frames: int = FREQUENCIES_OF  # frames that `frequencies` is for
     fast_frequencies: float = 3.0  # times as many besides, where all frames were searched for (`Tracker.searched`)
-    fast_steps: float = 5.0  # times as many steps besides, there, since more of each frame is its own
+    fast_rate: float = 20.0  # so many times, over the frames of the group, as fast coefficients besides, there
+    fast_steps: float = 4.0  # times as many steps a frame besides, there, since more of each frame is its own
     free_min: float = 0.5  # quantization steps: a residual from the start, so that a resting Gaussian stays free
     dead_zone: float = 0.1  # quantization steps more than half of one, below which a coefficient is not coded
     coefficient_rate: float = 0.1  # quantization steps
@@ -41,7 +42,7 @@ class FinetuneSettings:
     topology_views: int = 4  # times every camera must have been drawn before
     short_life: float = 0.2  # share of the frames; a Gaussian that lives shorter takes steps smaller in proportion
     views: int = 2  # of a frame, in one step: what a step costs besides is shared
-    frames_min: int = 20  # a shorter group behind a keyframe has the steps of so many
+    frames_min: float = 20.0  # a shorter group behind a keyframe has the steps of so many
     growth: float = 0.1  # share of the Gaussians that may be added then
     rate_every: int = 8  # steps: the rate term has every coefficient, an image few; its weight grows by as much
     canonical_rate_every: int = 24  # steps for which the gradient of the canonical bits, and their noise, are held
