@@ -25,6 +25,14 @@ def machine() -> dict:
     return {"cpu": model, "cores": os.cpu_count(), "system": platform.system(), "python": platform.python_version()}
 
 
+def peak_gib() -> float | None:
+    """The most memory that this process has used so far, GiB; None where the system does not tell."""
+    status = Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.exists() else []
+    kib = [int(line.split()[1]) for line in lines if line.startswith("VmHWM")]
+    return round(kib[0] / 2**20, 2) if kib else None
+
+
 def commit() -> str:
     """Short hash of the checkout, "+" if it has changes besides results and charts; empty outside of one."""
     git = lambda *a: subprocess.run(["git", *a], cwd=ROOT, capture_output=True, text=True).stdout.strip()  # noqa: E731

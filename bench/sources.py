@@ -41,6 +41,8 @@ def _rows() -> Iterator[tuple[str, ...]]:
         what = f"{e['capture']}, {e['preset']}, {e['recipe']}" + (quality and f", quality {quality}")
         recipe = e["recipe"].removesuffix("-coded").replace("model", "gscodec")
         command = f"gscodec bench train --capture {e['capture']} --preset {e['preset']} --recipe {recipe}"
+        first, stop, step = e["frames"]
+        command += f" --frames {first}:{stop}:{step}" if step > 1 else ""
         command += quality and f" --also {quality}"
         yield what, "train.json", f"`{command}`", _commits([e]), f"{e['measured'].get('busy_beside', '-')}"
     for file, what, command in (

@@ -31,7 +31,7 @@ from gscodec.model.gaussians import Gaussians
 from gscodec.model.parametric_group import ParametricGroup
 
 from .drawn import Rig, animated_capture
-from .machine import update_entries
+from .machine import peak_gib, update_entries
 from .still import still_share
 
 if TYPE_CHECKING:
@@ -203,7 +203,7 @@ def _ours(capture: Capture, frames: range, settings, encodings) -> Iterator[tupl
     own = part(capture, frames)
     groups, seconds_of_group = sequence(own, settings)
     trained = sum(seconds_of_group)
-    found = {"seconds_of_group": [round(s, 1) for s in seconds_of_group], "peak_gib": _peak_gib()}
+    found = {"seconds_of_group": [round(s, 1) for s in seconds_of_group], "peak_gib": peak_gib()}
     yield "model", trained, None, shown(groups), found
     for encoding in encodings:
         size, decoded, seconds, report = coded(own, groups, settings, encoding)
@@ -266,13 +266,6 @@ def sequence(capture: Capture, settings) -> tuple[list[ParametricGroup], list[fl
         groups.append(group)
         seconds.append(time.perf_counter() - start - sum(seconds))
     return groups, seconds
-
-
-def _peak_gib() -> float:
-    """The most memory that this process has used so far, GiB."""
-    import resource  # not on Windows
-
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2)
 
 
 def shown(groups: list[ParametricGroup]) -> list[Gaussians]:
