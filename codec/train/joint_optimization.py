@@ -22,7 +22,7 @@ from ..render.optimizer import Adam, TrajectoryAdam
 from .finetune import Frame, GroupModel
 from .keyframe import Statistics, contributes, gradient_min, split_or_clone
 from .motion_field import MotionField
-from .settings import TrainSettings
+from .settings import FinetuneSettings, TrainSettings
 from .views import Target, Views, add_harmonics_prior, start_photometric_loss
 
 
@@ -214,32 +214,50 @@ def finetune(
     *,
     radius: float,
     on_step: Callable[[int, float], None] | None = None,
-) -> None:
+) -> bool:
     """Optimises the coefficients of `group`, its nodes and its new canonical Gaussians over all `frames`, in place.
 
     Args:
         radius: of the moving Gaussians, world units.
         on_step: called with (step, loss) for each view of a step.
+
+    Returns:
+        False: rates were too high for these frames, the model has fallen apart and is of no use.
     """
     steps = -(-views_to_draw(group, settings) // settings.finetune.views)
     run = _Finetuner(group, views, frames, settings, radius)
     order: list[int] = []
+    bound, first_round = np.inf, len(_round_of_frames(len(frames)))
     larger = settings.finetune.views**0.5  # rates, since the gradient of several views has less noise
     for step in range(steps):
         order = order or run.rng.permutation(_round_of_frames(len(frames))).tolist()
+        if step == first_round:
+            bound = settings.finetune.apart * run.loss
         if step == round(settings.finetune.topology_at * steps):
+            if run.loss > bound:
+                break
             run.change_topology()
-        loss = run.step(order.pop(), larger * settings.finetune.rate_decay ** (step / steps))
+        loss = run.step(order.pop(), larger * _rate(step / steps, settings.finetune))
         for _ in range(settings.finetune.views if on_step else 0):
             on_step(step, loss)
     run.finish()
+    if run.loss > bound:
+        views.exposure.forget(frames)
+        return False
     views.exposure.go_on(frames[-1])
+    return True
 
 
 def views_to_draw(group: GroupModel, settings: TrainSettings) -> int:
     """Views for the fine-tuning of a group; a short one behind a keyframe has those of `frames_min` frames."""
     least = 0 if group.known else settings.finetune.frames_min
     return round(settings.finetune_steps * max(group.frames, least))
+
+
+def _rate(done: float, settings: FinetuneSettings) -> float:
+    """Share of the learning rates where this share of the steps is done."""
+    rising = min(1.0, done / settings.warmup) if settings.warmup else 1.0
+    return rising * settings.rate_decay**done
 
 
 def _round_of_frames(frames: int) -> list[int]:

@@ -170,11 +170,15 @@ class TrainSettings:
         enough of them.
         """
         f = self.finetune
-        steps = 1 + f.fast_steps * share
+        steps, canonical = 1 + f.fast_steps * share, 1 + f.fast_canonical * share
         finetune = replace(
             f.with_frequencies(1 + f.fast_frequencies * share),
             coefficient_rate=(1 + f.fast_rate * share / frames) * f.coefficient_rate,
+            canonical_means_rate=canonical * f.canonical_means_rate,
+            canonical_rate_share=canonical * f.canonical_rate_share,
             frames_min=f.frames_min / steps,
+            warmup=f.fast_warmup * share,
+            apart=f.fast_apart,
         )
         return replace(self, finetune=finetune, finetune_steps=round(steps * self.finetune_steps))
 
