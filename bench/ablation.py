@@ -101,6 +101,9 @@ VARIANTS = {
     "no mask term": Variant(run_with(mask_lambda=0.0), (LUMBERJACK,)),
     "no rigidity": Variant(run_with(rigidity=0.0)),
     "nodes alone": Variant(run_with(motion_field=MOTIONS["nodes"]), tuple(FRAMES), equal_time=True),
+    "nodes alone, another seed": Variant(
+        run_with(motion_field=MOTIONS["nodes"], seed=1), tuple(FRAMES), equal_time=True
+    ),
     "field alone": Variant(  # the nodes have no variables of their own
         lambda s: stage_with("finetune", node_rotation_rate=0.0, node_translation_rate=0.0)(
             stage_with("tracking", node_rotation_rate=0.0, node_translation_rate=0.0)(s)
