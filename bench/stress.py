@@ -42,7 +42,7 @@ BUDGETS = {  # case -> changes of the budget
     },
     "real room": {"gaussians_max": 20_000, "initial_points": 10_000},
 }
-ALONE_MOST = 10  # frames of a case that are trained alone
+ALONE_MOST = 12  # frames of a case that are trained alone: all of a short one
 FACTORS = (1, 2, 4, 8)  # of the steps of a frame alone, until it has converged
 CONVERGED_DB = 0.1
 ALLOWED_DB, ALLOWED_FRAME_DB = 1.0, 2.5
