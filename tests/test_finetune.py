@@ -231,3 +231,20 @@ def test_a_group_that_falls_apart_has_the_usual_rates(capture, monkeypatch):
     group = next(train_groups(capture, dataclasses.replace(TINY, finetune=wild)))
     assert tries == [False, True]
     assert min(psnr_of(group.frame(t), capture, t) for t in range(len(group))) > 30
+
+
+def test_trajectories_do_not_outgrow_the_bound_on_sizes():
+    capture = capture_of(turning(300, frames=3), masks=False)
+    views = Views(capture, TINY, CpuBackend())
+    key = from_gaussians(turning(300, frames=3).frame(0))
+    tracker = Tracker.start(key, views, TINY, 0.01, range(3))
+    everything = torch.ones(300, dtype=torch.bool)
+    group = GroupModel(
+        tracker.graph, None, [tracker.model] * 3, [tracker.pose] * 3, steps_for(50, 1.0), everything, TINY
+    )
+    group.coefficients["log_scales"][0, :20] = 100.0
+    group.coefficients["log_scales"][1, :20] = 30.0
+    finetune(group, views, range(3), TINY, radius=1.0)
+    for t in range(3):
+        params = group.frame(t, CpuBackend()).params
+        assert (params["log_scales"] <= views.size_bound.log_scales(params["means"]) + 0.1).all()

@@ -71,10 +71,10 @@ def test_far_shell_is_opaque_and_far():
 def test_nothing_around_a_scene_without_masks_grows_up_to_the_cameras():
     capture = capture_of(GaussianSequence(25.0, [DenseGroup([blob(50)])]), masks=False)
     views, model = Views(capture, TINY, CpuBackend()), from_gaussians(blob(50))
-    model.start_optimizer(CpuBackend(), TINY.adam, views.scale_max)
+    model.start_optimizer(CpuBackend(), TINY.adam, views.size_bound)
     model.step({"log_scales": torch.full((50, 3), -1.0)}, {"log_scales": 100.0})
-    nearest = min(np.linalg.norm(c.center) for c in capture.cameras)
-    assert model.params["log_scales"].exp().max() < nearest
+    nearest = min(np.linalg.norm(c.center - model.params["means"].numpy(), axis=1).min() for c in capture.cameras)
+    assert model.params["log_scales"].exp().max() < nearest / 3
 
 
 def test_depth_of_a_sweep_lies_between_its_planes():

@@ -78,7 +78,8 @@ class Changes:
         return ~self.behind(frame, masks, means, [np.ones(len(means), bool)] * len(masks))
 
     def behind(self, frame: int, masks: list[np.ndarray], means: np.ndarray, visible: list[np.ndarray]) -> np.ndarray:
-        """Gaussians behind the pixels of `masks`, [N] bool: enough of the cameras that see them have them there.
+        """Gaussians behind the pixels of `masks`, [N] bool: enough of the cameras that see them have them there, and
+        they are not too far away to be what has changed (`ChangeDetectionSettings.far`).
 
         Args:
             masks: [h, w] bool of each training camera, as of `advance`.
@@ -93,7 +94,8 @@ class Changes:
             on = np.flatnonzero(sees & (depth > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height))
             seen[on] += 1
             hit[on] += mask[y[on], x[on]]
-        return (hit > 0) & (hit >= self.settings.seen_share * seen)
+        near = self.views.distance(means) <= self.settings.far * self.views.working_distance
+        return near & (hit > 0) & (hit >= self.settings.seen_share * seen)
 
     def _dilated(self, mask: np.ndarray) -> np.ndarray:
         """[h, w] bool with a margin around it."""

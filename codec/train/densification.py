@@ -71,7 +71,7 @@ def _optimize(
     """Optimises `spawned` among the `others`, which stay; returns the statistics of all in the second half."""
     steps, k, known = settings.densification.steps, settings.keyframe, len(others)
     radius, stats = float(others.params["means"].std(0).norm()), Statistics(known + len(spawned), k.mse_min)
-    spawned.start_optimizer(views.backend, settings.adam, views.scale_max)
+    spawned.start_optimizer(views.backend, settings.adam, views.size_bound)
     for step in range(steps):
         together = {n: torch.cat([others.params[n], spawned.params[n]]) for n in NAMES}
         result = photometric_loss(together, views.draw(frame), settings, rng, views.backend)

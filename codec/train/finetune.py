@@ -21,7 +21,7 @@ from ..model.temporal_transform import dct_basis
 from ..render.backend import TURNS, Backend
 from .deformation_graph import NodeGraph, Pose
 from .entropy_model import CanonicalRate
-from .model import NAMES, REMOVED_LOGIT, Model, harmonics_turned, quat_product
+from .model import NAMES, REMOVED_LOGIT, Model, SizeBound, harmonics_turned, quat_product
 from .motion_field import MotionField
 from .settings import TrainSettings
 
@@ -234,6 +234,17 @@ class GroupModel:
         if self._turned:
             params[TURNS] = rotations
         return Frame(params, pose, turn, means, p["means"], rotations, residual, inner, p["quats"], shown)
+
+    def limit_sizes(self, t: int, frame: Frame, bound: SizeBound | None) -> None:
+        """Brings the trajectories of Gaussians that are larger than `bound` in `frame`, which is that at `t`, back to
+        it."""
+        if bound is None or "log_scales" not in self.coefficients:
+            return
+        excess = (frame.params["log_scales"] - bound.log_scales(frame.params["means"])).clamp(min=0)
+        large = torch.nonzero(excess.any(1))[:, 0].numpy()
+        if len(large):
+            at = self.at("log_scales", t)
+            self.coefficients["log_scales"][:, large] -= (at / (at @ at))[:, None, None] * excess.numpy()[large]
 
     def gradients(self, frame: Frame, grads: dict[str, torch.Tensor]) -> tuple[dict, dict, torch.Tensor]:
         """From the gradients by what is rendered: those by the residuals, attribute -> [N, C], 0 for Gaussians that are

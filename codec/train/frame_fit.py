@@ -48,7 +48,9 @@ class FrameFit:
             nodes, seed = tracker.graph.nodes, tracker.settings.seed
             self._field = MotionField(nodes, tracker.radius, 1, f, seed, backend, s.node_adam)
         self.own = Model(tracker.own.params)
-        self.own.start_optimizer(backend, tracker.settings.adam, tracker.views.scale_max)
+        self.own.start_optimizer(backend, tracker.settings.adam)
+        bound = tracker.views.size_bound
+        self._largest = None if bound is None else bound.log_scales(tracker.model.params["means"])
         self.statistics = Statistics(len(self.own), tracker.settings.keyframe.mse_min)
 
     def _pose(self) -> Pose:
@@ -83,6 +85,8 @@ class FrameFit:
         if not self._all_move:
             free = {n: g * self._moving.view(-1, *[1] * (g.dim() - 1)) for n, g in grads.items()}
         self.own.step(free, s.rates.scaled(t.radius, decay * (s.slow_rates if slow else 1.0)))
+        if self._largest is not None:
+            self.own.limit_sizes(self._largest)
         return result.image_loss
 
     def _step_nodes(self, pose: Pose, by_carried: tuple, rigidity: float, decay: float) -> None:

@@ -37,7 +37,7 @@ class _Finetuner:
         f, backend = settings.finetune, views.backend
         self.coefficients = TrajectoryAdam(backend, f.coefficient_adam)
         self.scales, self.nodes = Adam(backend, f.coefficient_adam), Adam(backend, f.coefficient_adam)
-        group.key.start_optimizer(backend, settings.adam, views.scale_max)
+        group.key.start_optimizer(backend, settings.adam, views.size_bound)
         if settings.motion_field.finetune:
             m, adam = settings.motion_field, f.coefficient_adam
             group.field = MotionField(group.graph.nodes, radius, group.frames, m, settings.seed, backend, adam)
@@ -80,8 +80,14 @@ class _Finetuner:
             self.bits = sum(self._step_coefficients(t, residuals, weight, decay))
         else:
             self._step_coefficients(t, residuals, 0.0, decay)
+        group.limit_sizes(t, frame, self.views.size_bound)
         if self.canonical_rates:
             self._step_canonical(canonical, decay)
+
+    def limit_sizes(self) -> None:
+        """No Gaussian is larger than the views allow in any frame, up to what its temporal frequencies can say."""
+        for t in range(self.group.frames):
+            self.group.limit_sizes(t, self.group.frame(t, self.views.backend), self.views.size_bound)
 
     def _step_canonical(self, grads: dict[str, torch.Tensor], decay: float) -> None:
         """One step of the new canonical Gaussians along the gradients of the image and of the rate term, as that was at
@@ -245,6 +251,7 @@ def finetune(
     if _above(run.loss, bound):
         views.exposure.forget(frames)
         return False
+    run.limit_sizes()
     views.exposure.go_on(frames[-1])
     return True
 

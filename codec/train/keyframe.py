@@ -130,7 +130,7 @@ class _Run:
         self.dropout = few if views.capture.has_alpha else 0.0
         self.statistics = Statistics(len(model), k.mse_min)
         self._started: _View | None = None
-        model.start_optimizer(views.backend, settings.adam, views.scale_max)
+        model.start_optimizer(views.backend, settings.adam, views.size_bound)
         views.reset_calibration(frame, model.params["means"].numpy().mean(0, dtype=np.float64), radius)
 
     def step(self, step: int) -> None:
@@ -158,6 +158,8 @@ class _Run:
         add_harmonics_prior(result.grads, model.params, views, self.settings)
         if k.opacity_decay:
             add_opacity_decay(result.grads, model.params, k.opacity_decay)
+        if k.scale_decay:
+            add_scale_decay(result.grads, model.params, k.scale_decay / views.working_distance)
         means_decay = (k.means_rate_end / k.rates["means"]) ** progress
         means_rate = self.radius * k.rates["means"] * means_decay
         model.step(result.grads, {**k.rates.scaled(self.radius, decay), "means": means_rate})
@@ -186,6 +188,11 @@ def add_opacity_decay(grads: dict[str, torch.Tensor], params: dict[str, torch.Te
     """Adds to the gradients those of the mean opacity times `weight`."""
     opacities = torch.sigmoid(params["logit_opacities"])
     grads["logit_opacities"].add_(opacities * (1 - opacities), alpha=weight / len(opacities))
+
+
+def add_scale_decay(grads: dict[str, torch.Tensor], params: dict[str, torch.Tensor], weight: float) -> None:
+    """Adds to the gradients those of the mean scale, world units, times `weight`."""
+    grads["log_scales"].add_(torch.exp(params["log_scales"]), alpha=weight / params["log_scales"].numel())
 
 
 def move_at_random(params: dict[str, torch.Tensor], share: float, rng: np.random.Generator) -> None:

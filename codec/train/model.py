@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,13 +18,32 @@ NAMES = PARAMETERS
 REMOVED_LOGIT = -20.0  # logit of the opacity of a Gaussian that is removed, or not there yet
 
 
+@dataclass(frozen=True)
+class SizeBound:
+    """Largest scale of a Gaussian by its place (`SizeSettings`).
+
+    Attributes:
+        center: [3], world units.
+        near: distance from it below which the bound falls no more, world units. share: of the distance.
+    """
+
+    center: torch.Tensor
+    near: float
+    share: float
+
+    def log_scales(self, means: torch.Tensor) -> torch.Tensor:
+        """[N, 1] natural logs of the largest scales at `means` [N, 3]."""
+        distance = (means - self.center).norm(dim=1, keepdim=True)
+        return torch.log(self.share * distance.clamp(min=self.near))
+
+
 class Model:
     """N Gaussians as tensors (`params[name]`, f32) and, once `start_optimizer` is called, their optimiser."""
 
     def __init__(self, params: dict[str, torch.Tensor]):
         self.params = {n: params[n].detach().clone().float().contiguous() for n in NAMES}
         self._adam: Adam | None = None
-        self._log_scale_max = math.inf
+        self._bound: SizeBound | None = None
 
     def __len__(self) -> int:
         return len(self.params["means"])
@@ -33,15 +53,19 @@ class Model:
         """Degree of the spherical harmonics."""
         return math.isqrt(self.params["shN"].shape[1] + 1) - 1
 
-    def start_optimizer(self, backend: Backend, settings: AdamSettings, scale_max: float = math.inf) -> None:
-        """A new Adam for a new stage or frame, with zero moments; no Gaussian grows beyond `scale_max`, world units."""
-        self._adam, self._log_scale_max = Adam(backend, settings), math.log(scale_max)
+    def start_optimizer(self, backend: Backend, settings: AdamSettings, bound: SizeBound | None = None) -> None:
+        """A new Adam for a new stage or frame, with zero moments; no Gaussian grows beyond `bound`."""
+        self._adam, self._bound = Adam(backend, settings), bound
 
     def step(self, grads: dict[str, torch.Tensor], rates: dict[str, float]) -> None:
         """One step of the optimiser on the attributes in `rates`."""
         self._adam.step(self.params, grads, rates)
-        if math.isfinite(self._log_scale_max):
-            self.params["log_scales"].clamp_(max=self._log_scale_max)
+        if self._bound is not None:
+            self.limit_sizes(self._bound.log_scales(self.params["means"]))
+
+    def limit_sizes(self, log_scales: torch.Tensor) -> None:
+        """Makes Gaussians as small as `log_scales` [N, 1]."""
+        self.params["log_scales"] = torch.minimum(self.params["log_scales"], log_scales)
 
     def select(self, index: torch.Tensor) -> None:
         """Keeps the Gaussians at `index` ([M] int or [N] bool)."""

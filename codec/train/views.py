@@ -6,10 +6,10 @@ mask term needs only a margin of it.
 
 from __future__ import annotations
 
-import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -17,11 +17,12 @@ import torch
 from ..capture import View, cropped
 from ..capture.epipolar import epipolar_error
 from ..errors import CaptureError
-from ..model.camera import Calibration, Camera, working_distance
+from ..model.camera import Calibration, Camera, meeting_point, working_distance
 from ..model.gaussians import Gaussians
 from ..render.backend import Backend, LossWeights, PendingLoss, RenderLoss, TargetView
 from ..render.sensitivity import params_of
 from .calibration import Exposure, Extrinsics
+from .model import SizeBound
 from .settings import TrainSettings
 
 GREY = (0.5, 0.5, 0.5)  # background of images that are compared
@@ -79,7 +80,7 @@ class Views:
         self._seed, self._cache_bytes = settings.seed, settings.cache_bytes
         self._poses_learn = settings.calibration.refine_poses
         self._pose_error_min = settings.calibration.pose_error_min
-        self._scale_max = settings.far_shell.scale_max
+        self._sizes = settings.sizes
         self._cache: OrderedDict[tuple, View | Target] = OrderedDict()
         self._bytes = 0
         self._order: dict[int, list[int]] = {}
@@ -90,12 +91,29 @@ class Views:
         """Of the pictures, pixels."""
         return max(max(self.capture.cameras[i].width, self.capture.cameras[i].height) for i in self.train_cameras)
 
-    @property
-    def scale_max(self) -> float:
-        """Largest scale of a Gaussian, world units (`FarShellSettings`); infinite where there are masks."""
+    @cached_property
+    def working_distance(self) -> float:
+        """Of the training cameras (`camera.working_distance`), world units."""
+        return working_distance([self.capture.cameras[i] for i in self.train_cameras])
+
+    @cached_property
+    def meeting_point(self) -> np.ndarray:
+        """Of the optical axes of the training cameras (`camera.meeting_point`), [3] f64."""
+        return meeting_point([self.capture.cameras[i] for i in self.train_cameras])
+
+    def distance(self, means: np.ndarray) -> np.ndarray:
+        """[N] distances of `means` [N, 3] from there; 0 where there are masks, and nothing is far."""
         if self.capture.has_alpha:
-            return math.inf
-        return self._scale_max * working_distance([self.capture.cameras[i] for i in self.train_cameras])
+            return np.zeros(len(means))
+        return np.linalg.norm(means - self.meeting_point, axis=1)
+
+    @cached_property
+    def size_bound(self) -> SizeBound | None:
+        """Of every Gaussian; None where there are masks."""
+        if self.capture.has_alpha:
+            return None
+        center, near = torch.from_numpy(self.meeting_point).float(), self._sizes.near * self.working_distance
+        return SizeBound(center, near, self._sizes.share)
 
     def view(self, camera: int, frame: int) -> View:
         """Image of camera `camera` at `frame` as the capture gives it."""

@@ -21,6 +21,7 @@ from .keyframe import (
     InitializationSettings,
     KeyframeSettings,
     PlaneSweepSettings,
+    SizeSettings,
     VisualHullSettings,
 )
 from .learning_rates import LearningRates
@@ -59,6 +60,7 @@ __all__ = [
     "RefinementSettings",
     "RelocalizationSettings",
     "RoomSettings",
+    "SizeSettings",
     "TrackingSettings",
     "TrainSettings",
     "VisualHullSettings",
@@ -118,6 +120,7 @@ class TrainSettings:
     visual_hull: VisualHullSettings = field(default_factory=VisualHullSettings)
     plane_sweep: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
     far_shell: FarShellSettings = field(default_factory=FarShellSettings)
+    sizes: SizeSettings = field(default_factory=SizeSettings)
     calibration: CameraCalibrationSettings = field(default_factory=CameraCalibrationSettings)
     budget: BudgetSettings = field(default_factory=BudgetSettings)
     keyframe: KeyframeSettings = field(default_factory=KeyframeSettings)
@@ -156,6 +159,7 @@ class TrainSettings:
                 price=room.price * self.keyframe.price,
                 opacity_decay=room.opacity_decay,
                 position_noise=room.position_noise,
+                scale_decay=room.scale_decay,
             ),
             finetune=self.finetune.with_frequencies(room.frequencies),
             group=replace(self.group, drift_ratio=room.drift_ratio * self.group.drift_ratio),

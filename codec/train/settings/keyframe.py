@@ -76,7 +76,15 @@ class FarShellSettings:
     opacity: float = 0.95
     width: float = 1.5  # times that of a Gaussian at a point on a surface: they overlap without gaps
     thickness: float = 0.1  # times the width
-    scale_max: float = 0.75  # of any Gaussian, times that distance: what covers the far would grow up to the cameras
+
+
+@dataclass(frozen=True)
+class SizeSettings:
+    """Bound on the size of every Gaussian where there are no masks: what no picture contradicts, black before black,
+    would grow into the views between the cameras."""
+
+    share: float = 0.1875  # largest scale, of the distance from where the optical axes meet
+    near: float = 0.4  # times the distance of the cameras from there: nearer Gaussians count as there
 
 
 @dataclass(frozen=True)
@@ -141,6 +149,7 @@ class KeyframeSettings:
     prune_opacity: float = 0.02  # a Gaussian below it is removed
     prune_weight: float = 0.02  # largest blending weight in any view; a Gaussian below it is hidden and removed
     opacity_decay: float = 0.0  # weight of the mean opacity in the loss
+    scale_decay: float = 0.0  # weight of the mean scale in the loss, in units of the distance of the cameras
     position_noise: float = 0.0  # of its spread: first move of a transparent Gaussian, decays as the rate of means
     split_shrink: float = 1.6  # by which the scales of a Gaussian are divided when it is split
     split_offset: float = 0.7  # of a random offset drawn from the Gaussian, for both halves

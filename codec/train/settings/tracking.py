@@ -17,6 +17,7 @@ class ChangeDetectionSettings:
     threshold: float = 6.0  # grey levels, after a mean over 3 x 3: above the noise of sensors; -1: everything changes
     margin: float = 0.02  # of the width, around a change: parts without texture move with it
     seen_share: float = 0.5  # of the cameras that see a Gaussian must see a change there
+    far: float = 3.0  # times the distance of the cameras from where their axes meet: what is farther stands still
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ class RoomSettings:
     price: float = 2.0  # of a Gaussian, times that of a subject: few views gain more by one than others do
     opacity_decay: float = 0.003  # of a keyframe: no mask removes what floats before the cameras
     position_noise: float = 3.0  # of a keyframe, for the same reason
+    scale_decay: float = 0.13  # of a keyframe: where no picture says how far something reaches, it does not
     field_in_tracking: bool = False  # it drags what stands still with what moves beside it
 
 
