@@ -238,7 +238,7 @@ class GroupModel:
     def limit_sizes(self, t: int, frame: Frame, bound: SizeBound | None) -> None:
         """Brings the trajectories of Gaussians that are larger than `bound` in `frame`, which is that at `t`, back to
         it."""
-        if bound is None or "log_scales" not in self.coefficients:
+        if bound is None:
             return
         excess = (frame.params["log_scales"] - bound.log_scales(frame.params["means"])).clamp(min=0)
         large = torch.nonzero(excess.any(1))[:, 0].numpy()

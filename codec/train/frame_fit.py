@@ -49,8 +49,9 @@ class FrameFit:
             self._field = MotionField(nodes, tracker.radius, 1, f, seed, backend, s.node_adam)
         self.own = Model(tracker.own.params)
         self.own.start_optimizer(backend, tracker.settings.adam)
-        bound = tracker.views.size_bound
-        self._largest = None if bound is None else bound.log_scales(tracker.model.params["means"])
+        self._largest = None  # [N, 1], natural logs of the largest scales, where there is a bound
+        if (bound := tracker.views.size_bound) is not None:
+            self._largest = bound.log_scales(tracker.carried(tracker.own, tracker.pose)[0]["means"])
         self.statistics = Statistics(len(self.own), tracker.settings.keyframe.mse_min)
 
     def _pose(self) -> Pose:

@@ -86,6 +86,8 @@ class _Finetuner:
 
     def limit_sizes(self) -> None:
         """No Gaussian is larger than the views allow in any frame, up to what its temporal frequencies can say."""
+        if self.views.size_bound is None:
+            return
         for t in range(self.group.frames):
             self.group.limit_sizes(t, self.group.frame(t, self.views.backend), self.views.size_bound)
 
