@@ -9,7 +9,6 @@ import pytest
 from synthetic import blob, turning
 from training import TINY, capture_of, psnr_of
 
-from gscodec.capture import View
 from gscodec.errors import CaptureError, UsageError
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.train.budget import keyframe_budget, with_frame_budget
@@ -55,6 +54,17 @@ def test_the_first_frame_that_is_fitted_may_lose_more_than_the_next(capture, mon
     assert (len(first), first.ended) == (2, "cut")
 
 
+def test_what_comes_into_the_pictures_has_a_keyframe():
+    """A figure that walks in: what the first frame shows of it is too little to grow from."""
+    whole = blob(300)
+    part = whole.take(whole.means[:, 0] > 0.7)
+    frames = [DenseGroup([g]) for g in (part, part, whole, whole)]
+    group = dataclasses.replace(TINY.group, cut_loss_floor=10.0)  # whatever is lost, nothing is cut for it
+    settings = dataclasses.replace(TINY, gop=8, group=group)
+    first, second = train_groups(capture_of(GaussianSequence(25.0, frames)), settings)
+    assert (len(first), first.ended, len(second), second.parents) == (2, "more", 2, None)
+
+
 @pytest.mark.parametrize(("last", "lengths"), [(6, [3, 3]), (7, [3, 2, 2])])
 def test_few_frames_that_drift_pay_for_no_keyframe(last, lengths, monkeypatch):
     """From frame 5 on. Of six frames one is left, less than a quarter of the five that the keyframe has lasted."""
@@ -77,8 +87,7 @@ def test_larger_pictures_have_longer_keyframes_whose_fit_frames_need_not_reach()
     """The same for a keyframe that a preset trains longer; small pictures change neither its fit nor the bound."""
 
     def bound_and_steps(side, preset="medium"):
-        picture = View(np.zeros((side, side, 3), np.uint8), np.full((side, side), 255, np.uint8))
-        views, settings = SimpleNamespace(train_cameras=[0], view=lambda *_: picture), train_settings(preset)
+        views, settings = SimpleNamespace(covered=lambda _: [side * side]), train_settings(preset)
         frames = with_frame_budget(settings, views, 0)
         return frames.group.drift_ratio, keyframe_budget(views, 0, settings).steps, frames.motion_steps
 

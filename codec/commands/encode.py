@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 ENDED = {  # ParametricGroup.ended
     "cut": "it cannot be tracked",
     "drift": "tracking had come too far from the keyframe",
+    "more": "much comes into the pictures that the keyframe did not show",
     "change": "much that stood still begins to change",
     "empty": "nothing was seen until then",
 }

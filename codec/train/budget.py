@@ -31,7 +31,7 @@ class Budget:
 
 def keyframe_budget(views: Views, frame: int, settings: TrainSettings) -> Budget:
     """The budget of the keyframe `frame`."""
-    b, covered = settings.budget, _covered(views, frame)
+    b, covered = settings.budget, float(np.mean(views.covered(frame)))
     points = settings.initial_points or int(np.clip(b.points_share * covered, b.points_min, b.points_max))
     return Budget(points, round(_larger(covered, b) * _smaller(covered, b) * settings.keyframe_steps))
 
@@ -39,7 +39,7 @@ def keyframe_budget(views: Views, frame: int, settings: TrainSettings) -> Budget
 def with_frame_budget(settings: TrainSettings, views: Views, frame: int) -> TrainSettings:
     """Settings with the steps of a tracked frame: a large picture has fewer, since each costs more, and all frames of a
     group together refine its Gaussians. And with the bound of drift behind a keyframe of so many steps."""
-    covered, g = _covered(views, frame), settings.group
+    covered, g = float(np.mean(views.covered(frame))), settings.group
     larger = _larger(covered, settings.budget)
     fit = max(1.0, larger * settings.keyframe_steps / g.drift_steps) ** g.drift_exponent
     group, share = replace(g, drift_ratio=fit * g.drift_ratio), _smaller(covered, settings.budget) / larger
@@ -57,10 +57,3 @@ def _larger(covered: float, settings: BudgetSettings) -> float:
 def _smaller(covered: float, settings: BudgetSettings) -> float:
     """The same for pictures so small that a step costs hardly less; 1 where they show nothing."""
     return float(np.clip(settings.small_pixels / covered, 1.0, settings.steps_most)) if covered else 1.0
-
-
-def _covered(views: Views, frame: int) -> float:
-    """Mean number of pixels of a picture that show the scene: all of them where there are no masks."""
-    pictures = [views.view(camera, frame) for camera in views.train_cameras]
-    counts = [v.rgb.shape[0] * v.rgb.shape[1] if v.alpha is None else np.count_nonzero(v.alpha) for v in pictures]
-    return float(np.mean(counts or [0]))

@@ -66,8 +66,9 @@ def train_groups(
 
     A group continues the Gaussians of the one before (`parents`). It ends early before a frame whose image loss is
     `cut_ratio` times that of the tracked frame before, or `drift_ratio` times that of the keyframe (unless few frames
-    are left); then the next group starts with a keyframe. It also ends before one in which a large fraction of the
-    Gaussians begins to change. Frames without a subject, until a camera sees something, are a group without Gaussians.
+    are left), or which shows `shown_ratio` times as much as the keyframe; then the next group starts with a keyframe.
+    It also ends before one in which a large fraction of the Gaussians begins to change. Frames without a subject, until
+    a camera sees something, are a group without Gaussians.
     Every segment of `random_access` frames starts with a keyframe: a segment depends on no frames but its own.
 
     Args:
@@ -152,7 +153,7 @@ class _Run:
             track.add(self.subject.tracker)
             ended = self._track(frames[1:], stop, track)
         subject, done = self.subject, frames[: len(track.models)]
-        if ended in ("cut", "drift"):
+        if ended not in ("", "change"):
             self.subject = None
         if len(done) == 1 and parents is None:
             subject.canonical = track.models[0]
@@ -185,7 +186,7 @@ class _Run:
 
     def _track(self, frames: range, stop: int, track: _TrackedFrames) -> str:
         """Tracks `frames` up to the end of the group and adds them to `track`; returns why that came early
-        (`ParametricGroup.ended`). Behind a cut and a drift the next group needs a keyframe.
+        (`ParametricGroup.ended`). Behind all reasons but "change" the next group needs a keyframe.
 
         The group ends where a large fraction of resting Gaussians changes at once: with few temporal frequencies, a
         light that is switched on would show in all frames of the group, and what was frozen without it shows it badly.
@@ -193,7 +194,10 @@ class _Run:
         not pay for another one.
         """
         subject, g = self.subject, self.settings.group
+        shown = g.shown_ratio * np.median(self.views.covered(subject.first))
         for frame in frames:
+            if np.median(self.views.covered(frame)) > shown:
+                return "more"
             long_enough = len(track.models) >= g.changed_frames_min
             if long_enough and subject.tracker.changed_fraction(frame, track.moved()) > g.changed_fraction_max:
                 return "change"

@@ -124,6 +124,11 @@ class Views:
         seen = (self.view(camera, frame).alpha for camera in self.train_cameras)
         return any(alpha is None or alpha.any() for alpha in seen)
 
+    def covered(self, frame: int) -> list[int]:
+        """Pixels of each training camera's picture that show the scene: all of them where there are no masks."""
+        pictures = [self.view(camera, frame) for camera in self.train_cameras]
+        return [v.rgb.shape[0] * v.rgb.shape[1] if v.alpha is None else np.count_nonzero(v.alpha) for v in pictures]
+
     def target(self, camera: int, frame: int, scale: float = 1.0) -> Target:
         """View of camera `camera` at `frame`, cropped to the subject; `scale` (at most 1) times its size."""
 

@@ -156,5 +156,6 @@ class GroupSettings:
     drift_exponent: float = 0.75  # of the steps of a keyframe, in that ratio
     drift_share: float = 0.25  # of the frames that the keyframe has lasted, to be left for another one behind a drift
     cut_loss_floor: float = 0.002  # loss: clean images fit far better than they need to, and no frame is cut for it
+    shown_ratio: float = 2.0  # pixels of the scene over those of the keyframe, in half of the views: it lacks too much
     changed_fraction_max: float = 0.1  # of the Gaussians, that begin to change in one frame
     changed_frames_min: int = 4  # frames that a group has before `changed_fraction_max` may end it
