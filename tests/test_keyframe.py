@@ -281,13 +281,24 @@ def test_prior_of_harmonics_falls_with_the_square_of_many_cameras(cameras, pictu
     torch.testing.assert_close(grads["shN"], share * TINY.harmonics_lambda * shN / 50)
 
 
-def test_opacity_decay_has_the_gradient_of_the_mean_opacity():
-    params = from_gaussians(blob(50)).params
+def test_opacity_decay_has_the_gradient_of_the_mean_weighted_opacity():
+    params, weights = from_gaussians(blob(50)).params, torch.linspace(0, 2, 50)
     logits = params["logit_opacities"].clone().requires_grad_()
-    (0.3 * torch.sigmoid(logits).mean()).backward()
+    (weights * torch.sigmoid(logits)).mean().backward()
     grads = {"logit_opacities": torch.zeros(50)}
-    add_opacity_decay(grads, params, 0.3)
+    add_opacity_decay(grads, params, weights)
     torch.testing.assert_close(grads["logit_opacities"], logits.grad)
+
+
+def test_nearness_counts_what_the_nearest_camera_could_draw_in_a_wider_picture():
+    """Two cameras face each other at 3 units from the middle; pictures reach 0.4 of the depth to each side."""
+    capture = capture_of(GaussianSequence(25.0, [DenseGroup([blob(10)])]), masks=False)
+    K = np.array([[80.0, 0, 32], [0, 80.0, 32], [0, 0, 1]])
+    cameras = [Camera(f"{x}", K, look_at((x, 0, 0), np.zeros(3), (0, 0, 1)), 64, 64, near=0.5) for x in (-3.0, 3.0)]
+    views = Views(dataclasses.replace(capture, cameras=cameras), TINY, CpuBackend())
+    points = [(0, 0, 0), (1.5, 0, 0), (-2.0, 0, 0.7), (-2.0, 0, 0.9), (2.6, 0, 0), (9, 0, 0), (0, 9, 0)]
+    near = views.nearness(np.array(points), 0, 2.0)
+    np.testing.assert_allclose(near, [1, 2, 3, 3 / 5, 3 / 5.6, 3 / 12, 0])
 
 
 def test_only_what_shows_nothing_moves_at_random():

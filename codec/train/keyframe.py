@@ -4,8 +4,9 @@ The recipe of 3D Gaussian Splatting (Kerbl et al. 2023), shortened: of the Gauss
 small ones are cloned and large ones split, and Gaussians with a small contribution to all views are pruned. Spherical
 harmonics are added on the way, and removed again where they lower the error by less than their bits cost. Without
 masks opacities decay and transparent Gaussians move at random (3DGS-MCMC, Kheradmand et al. 2024): few views of a room
-do not contradict what floats before the cameras. While one view is rendered, the step along the one before is taken: a
-gradient is one step old.
+do not contradict what floats before the cameras. The nearer to a camera, the faster is the decay: what is black before
+black errs in no picture, and hides the subject from between the cameras. While one view is rendered, the step along the
+one before is taken: a gradient is one step old.
 """
 
 from __future__ import annotations
@@ -130,6 +131,7 @@ class _Run:
         self.dropout = few if views.capture.has_alpha else 0.0
         self.statistics = Statistics(len(model), k.mse_min)
         self._started: _View | None = None
+        self._opacity_decay = self._decay_of_opacities()
         model.start_optimizer(views.backend, settings.adam, views.size_bound)
         views.reset_calibration(frame, model.params["means"].numpy().mean(0, dtype=np.float64), radius)
 
@@ -157,7 +159,7 @@ class _Run:
             views.extrinsics.learn(view.target.index, model.params, result.grads, decay)
         add_harmonics_prior(result.grads, model.params, views, self.settings)
         if k.opacity_decay:
-            add_opacity_decay(result.grads, model.params, k.opacity_decay)
+            add_opacity_decay(result.grads, model.params, self._opacity_decay)
         if k.scale_decay:
             add_scale_decay(result.grads, model.params, k.scale_decay / views.working_distance)
         means_decay = (k.means_rate_end / k.rates["means"]) ** progress
@@ -182,12 +184,23 @@ class _Run:
         elif step >= k.densify_until * self.steps:
             prune(self.model, self.statistics, k, thin=step < k.thin_until * self.steps)
         self.statistics = Statistics(len(self.model), k.mse_min)
+        self._opacity_decay = self._decay_of_opacities()
+
+    def _decay_of_opacities(self) -> torch.Tensor:
+        """Weight of each opacity in the loss, [N], times N."""
+        k, means = self.settings.keyframe, self.model.params["means"]
+        if not k.opacity_decay:
+            return torch.zeros(len(means))
+        near = self.views.nearness(means.numpy(), self.frame, k.near_margin)
+        return torch.from_numpy(k.opacity_decay * near**k.near_power).float()
 
 
-def add_opacity_decay(grads: dict[str, torch.Tensor], params: dict[str, torch.Tensor], weight: float) -> None:
-    """Adds to the gradients those of the mean opacity times `weight`."""
+def add_opacity_decay(
+    grads: dict[str, torch.Tensor], params: dict[str, torch.Tensor], weights: float | torch.Tensor
+) -> None:
+    """Adds to the gradients those of the mean of all opacities times their `weights` ([N], or one for all)."""
     opacities = torch.sigmoid(params["logit_opacities"])
-    grads["logit_opacities"].add_(opacities * (1 - opacities), alpha=weight / len(opacities))
+    grads["logit_opacities"].add_(weights * opacities * (1 - opacities), alpha=1 / len(opacities))
 
 
 def add_scale_decay(grads: dict[str, torch.Tensor], params: dict[str, torch.Tensor], weight: float) -> None:

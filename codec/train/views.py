@@ -24,6 +24,7 @@ from ..render.sensitivity import params_of
 from .calibration import Exposure, Extrinsics
 from .model import SizeBound
 from .settings import TrainSettings
+from .visual_hull import project
 
 GREY = (0.5, 0.5, 0.5)  # background of images that are compared
 
@@ -106,6 +107,18 @@ class Views:
         if self.capture.has_alpha:
             return np.zeros(len(means))
         return np.linalg.norm(means - self.meeting_point, axis=1)
+
+    def nearness(self, means: np.ndarray, frame: int, margin: float) -> np.ndarray:
+        """[N], working distance over the depth of each of `means` [N, 3] in the nearest training camera that could draw
+        it if its picture were `margin` times as wide and high; 0: there is none."""
+        nearest = np.zeros(len(means))
+        for index in self.train_cameras:
+            camera = self.camera(index, frame)
+            p, depth = project(camera, means)
+            size = np.array([camera.width, camera.height])
+            before = (depth > camera.near) & (np.abs(p - size / 2) < margin * size / 2).all(1)
+            np.maximum(nearest, self.working_distance / np.where(before, depth, np.inf), out=nearest)
+        return nearest
 
     @cached_property
     def size_bound(self) -> SizeBound | None:
