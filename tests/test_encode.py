@@ -24,8 +24,8 @@ from gscodec.encode.writer import StreamWriter
 from gscodec.errors import BitstreamError, CaptureError, UsageError
 from gscodec.fit import fit_groups
 from gscodec.model.camera import Camera, look_at
-from gscodec.model.gaussian_sequence import DenseGroup
-from gscodec.model.gaussians import Gaussians, concatenate
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.model.gaussians import SH_C0, Gaussians, concatenate
 from gscodec.model.parametric_group import NodeMotion, ParametricGroup
 from gscodec.model.rotations import quat_conjugate, quat_multiply
 from gscodec.model.temporal_transform import dct_basis
@@ -327,6 +327,18 @@ def test_layers_have_the_steps_of_their_sensitivity():
     assert (q.positions % 2 ** shifts["means"][layer, None] == 0).all()
     sizes = [len(coded(group, 80, keep_all=True, layers=n)[0].payload) for n in (1, 3)]
     assert sizes[1] < sizes[0]
+
+
+def test_black_stays_black(tmp_path):
+    """The rasterizer cuts colours off there, so that the picture has no derivative by them."""
+    g = blob(1000)
+    black = np.arange(1000) % 2 == 0
+    colors = np.where(black[:, None], -0.5 / SH_C0 - 1e-6, g.sh0).astype(np.float32)
+    sequence = GaussianSequence(25.0, [DenseGroup([replace(g, sh0=colors)])])
+    write(sequence, tmp_path / "out.gsv")
+    decoded = open_stream(tmp_path / "out.gsv").frame(0)
+    now = 0.5 + SH_C0 * decoded.sh0[black[nearest(decoded, g)]]
+    assert np.quantile(now, 0.99) < 0.02
 
 
 def test_a_gaussian_that_has_faded_leaves_a_predicted_group():

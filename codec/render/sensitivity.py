@@ -20,12 +20,13 @@ from ..bitstream.color import STEP_WEIGHTS, TO_RGB
 from ..bitstream.quantization import Steps, error_for, subject_radius
 from ..model.attributes import BY_NAME
 from ..model.camera import Camera, cameras_around
-from ..model.gaussians import PARAMETERS, Gaussians
+from ..model.gaussians import PARAMETERS, SH_C0, Gaussians
 from .backend import TURNS, Backend
 from .cpu import CpuBackend
 
 VIEWS, SIZE = 24, 512
 GREY = (0.5, 0.5, 0.5)
+DARKEST = 1e-3  # colour, in 0..1, of which the derivative is taken for black
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def measure(shown: Callable[[int], Gaussians], cameras: list[Camera], *, backend
     backend = backend or CpuBackend()
     total, removal = {}, 0.0
     for i, camera in enumerate(cameras):
-        g = shown(i)
+        g = _above_black(shown(i))
         probe = (2.0 * signs.integers(0, 2, (camera.height, camera.width, 3)) - 1).astype(np.float32)
         share = 1 / (len(cameras) * probe.size)
         for name, d in derivatives(backend, g, camera, lambda _, probe=probe: probe).items():
@@ -105,6 +106,12 @@ def measure(shown: Callable[[int], Gaussians], cameras: list[Camera], *, backend
                 removal += share * (d[:, 0] / transparency) ** 2
     total = {n: w.astype(np.float64) for n, w in total.items()}
     return Importance(total, total.pop("scene_rotations"), removal)
+
+
+def _above_black(g: Gaussians) -> Gaussians:
+    """`g` with its darkest colours a little brighter: at black the rasterizer cuts off, and the derivative says nothing
+    of a step up."""
+    return replace(g, sh0=np.maximum(g.sh0, np.float32((DARKEST - 0.5) / SH_C0)))
 
 
 def params_of(g: Gaussians, turns: np.ndarray | None = None) -> dict[str, np.ndarray]:

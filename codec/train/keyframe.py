@@ -160,8 +160,6 @@ class _Run:
         add_harmonics_prior(result.grads, model.params, views, self.settings)
         if k.opacity_decay:
             add_opacity_decay(result.grads, model.params, self._opacity_decay)
-        if k.scale_decay:
-            add_scale_decay(result.grads, model.params, k.scale_decay / views.working_distance)
         means_decay = (k.means_rate_end / k.rates["means"]) ** progress
         means_rate = self.radius * k.rates["means"] * means_decay
         model.step(result.grads, {**k.rates.scaled(self.radius, decay), "means": means_rate})
@@ -201,11 +199,6 @@ def add_opacity_decay(
     """Adds to the gradients those of the mean of all opacities times their `weights` ([N], or one for all)."""
     opacities = torch.sigmoid(params["logit_opacities"])
     grads["logit_opacities"].add_(weights * opacities * (1 - opacities), alpha=1 / len(opacities))
-
-
-def add_scale_decay(grads: dict[str, torch.Tensor], params: dict[str, torch.Tensor], weight: float) -> None:
-    """Adds to the gradients those of the mean scale, world units, times `weight`."""
-    grads["log_scales"].add_(torch.exp(params["log_scales"]), alpha=weight / params["log_scales"].numel())
 
 
 def move_at_random(params: dict[str, torch.Tensor], share: float, rng: np.random.Generator) -> None:

@@ -159,7 +159,6 @@ class TrainSettings:
                 price=room.price * self.keyframe.price,
                 opacity_decay=room.opacity_decay,
                 position_noise=room.position_noise,
-                scale_decay=room.scale_decay,
             ),
             finetune=self.finetune.with_frequencies(room.frequencies),
             group=replace(self.group, drift_ratio=room.drift_ratio * self.group.drift_ratio),

@@ -151,7 +151,6 @@ class KeyframeSettings:
     opacity_decay: float = 0.0  # weight of the mean opacity in the loss, of Gaussians as far away as the cameras look
     near_power: float = 4.0  # of the nearness of a Gaussian (`Views.nearness`), in that weight
     near_margin: float = 2.0  # width and height of the views, times those of the pictures, that it may be in
-    scale_decay: float = 0.0  # weight of the mean scale in the loss, in units of the distance of the cameras
     position_noise: float = 0.0  # of its spread: first move of a transparent Gaussian, decays as the rate of means
     split_shrink: float = 1.6  # by which the scales of a Gaussian are divided when it is split
     split_offset: float = 0.7  # of a random offset drawn from the Gaussian, for both halves

@@ -68,7 +68,6 @@ class RoomSettings:
     price: float = 2.0  # of a Gaussian, times that of a subject: few views gain more by one than others do
     opacity_decay: float = 0.003  # of a keyframe: no mask removes what floats before the cameras
     position_noise: float = 3.0  # of a keyframe, for the same reason
-    scale_decay: float = 0.13  # of a keyframe: where no picture says how far something reaches, it does not
     field_in_tracking: bool = False  # it drags what stands still with what moves beside it
 
 
