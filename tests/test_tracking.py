@@ -113,6 +113,18 @@ def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
     assert spread(smaller) < spread(stretched.nodes), "against the stretch"
 
 
+def test_nodes_that_carry_what_is_far_do_not_move():
+    """Else they take it along with what is near, and the sky comes up to the cameras."""
+    x = torch.from_numpy(blob(200).means)
+    x[:40] *= 12
+    everything, far = torch.ones(200, dtype=torch.bool), torch.arange(200) < 40
+    settings = dataclasses.replace(TINY.graph, nodes=32)
+    graph = NodeGraph.of(x, torch.ones(200), 1.0, everything, settings, far)
+    carriers = graph.copy().carriers(everything)
+    assert 0 < carriers.sum() < len(graph)
+    assert not (carriers & NodeGraph.of(x, torch.ones(200), 1.0, everything, settings).carriers(far)).any()
+
+
 def test_newcomers_have_nodes_of_their_own_that_change_nothing_for_others():
     x = torch.from_numpy(blob(200).means)
     spawned = 0.2 * torch.from_numpy(blob(60, seed=1).means) + torch.tensor([0.9, 0, 0])  # amid the others

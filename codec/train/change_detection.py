@@ -79,7 +79,7 @@ class Changes:
 
     def behind(self, frame: int, masks: list[np.ndarray], means: np.ndarray, visible: list[np.ndarray]) -> np.ndarray:
         """Gaussians behind the pixels of `masks`, [N] bool: enough of the cameras that see them have them there, and
-        they are not too far away to be what has changed (`ChangeDetectionSettings.far`).
+        they are not too far away to be what has changed (`far`).
 
         Args:
             masks: [h, w] bool of each training camera, as of `advance`.
@@ -94,8 +94,11 @@ class Changes:
             on = np.flatnonzero(sees & (depth > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height))
             seen[on] += 1
             hit[on] += mask[y[on], x[on]]
-        near = self.views.distance(means) <= self.settings.far * self.views.working_distance
-        return near & (hit > 0) & (hit >= self.settings.seen_share * seen)
+        return ~self.far(means) & (hit > 0) & (hit >= self.settings.seen_share * seen)
+
+    def far(self, means: np.ndarray) -> np.ndarray:
+        """[N] bool, which of `means` [N, 3] are too far away to tell how they move (`ChangeDetectionSettings.far`)."""
+        return self.views.distance(means) > self.settings.far * self.views.working_distance
 
     def _dilated(self, mask: np.ndarray) -> np.ndarray:
         """[h, w] bool with a margin around it."""

@@ -69,6 +69,7 @@ class NodeGraph:
         chosen: [M, 3] u32, nodes on the lattice.
         batch: [M] int; 0 for nodes of the keyframe, else the number of the batch of Gaussians that a node came in with.
         extent: [3], of the keyframe, world units.
+        held: [M] bool, nodes that do not move.
 
     Attributes:
         nodes: [M, 3] positions of the nodes at rest.
@@ -83,9 +84,10 @@ class NodeGraph:
         chosen: np.ndarray,
         batch: np.ndarray,
         extent: torch.Tensor,
+        held: np.ndarray,
         settings: DeformationGraphSettings,
     ):
-        self.settings = settings
+        self.settings, self.held = settings, held
         self.low, self.step, self.extent = low, step, extent
         self.chosen, self.batch = chosen, batch
         self._connect()
@@ -112,6 +114,7 @@ class NodeGraph:
         radius: float,
         moving: torch.Tensor,
         settings: DeformationGraphSettings,
+        far: torch.Tensor | None = None,
     ) -> NodeGraph:
         """Nodes for the Gaussians of a keyframe, dense where these move and where they are small.
 
@@ -120,6 +123,7 @@ class NodeGraph:
             sizes: [N], proportional to the distance of nodes.
             radius: of the moving Gaussians, world units.
             moving: [N] bool.
+            far: [N] bool, what stands still whatever happens: nodes that carry some of it are held. None: nothing.
         """
         low, step, nodes = means.min(0).values, settings.lattice * radius, settings.nodes
         grid = torch.round((means - low) / step).numpy().astype(np.uint32)
@@ -132,7 +136,11 @@ class NodeGraph:
                 some.append(grid[mask.numpy()][farthest_points(means[mask].numpy(), most, sizes[mask].numpy())])
         chosen = np.unique(np.concatenate(some), axis=0)
         chosen = chosen[_native.morton_order(chosen)]
-        return NodeGraph(means, low, step, chosen, np.zeros(len(chosen), int), means.max(0).values - low, settings)
+        batch, held, extent = np.zeros(len(chosen), int), np.zeros(len(chosen), bool), means.max(0).values - low
+        graph = NodeGraph(means, low, step, chosen, batch, extent, held, settings)
+        if far is not None:
+            graph.held = graph.carriers(far).numpy()
+        return graph
 
     def extend(self, means: torch.Tensor) -> None:
         """More Gaussians to carry, at [K, 3] at rest."""
@@ -164,6 +172,7 @@ class NodeGraph:
             alone = (self._weights(means + shift, chosen)[0] >= len(self.chosen)).all()
             if alone and all(np.array_equal(a, b) for a, b in zip(before, after, strict=True)):
                 self.batch = np.concatenate([self.batch, np.full(len(more), self.batch.max() + 1)])
+                self.held = np.concatenate([self.held, np.zeros(len(more), bool)])
                 self.chosen = chosen
                 self._connect()
                 return shift
@@ -189,13 +198,14 @@ class NodeGraph:
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays."""
-        return {n: np.asarray(getattr(self, n)) for n in ("means", "low", "step", "chosen", "batch", "extent")}
+        return {n: np.asarray(getattr(self, n)) for n in ("means", "low", "step", "chosen", "batch", "extent", "held")}
 
     @staticmethod
     def restored(state: dict[str, np.ndarray], settings: DeformationGraphSettings) -> NodeGraph:
         """Inverse of `state`."""
         means, low, extent = (torch.from_numpy(state[n]) for n in ("means", "low", "extent"))
-        return NodeGraph(means, low, float(state["step"]), state["chosen"], state["batch"], extent, settings)
+        chosen, batch, held = state["chosen"], state["batch"], state["held"]
+        return NodeGraph(means, low, float(state["step"]), chosen, batch, extent, held, settings)
 
     def copy(self) -> NodeGraph:
         """The same nodes; Gaussians added to the copy are not added here."""
@@ -254,10 +264,10 @@ class NodeGraph:
 
     def carriers(self, chosen: torch.Tensor) -> torch.Tensor:
         """Nodes that carry a Gaussian of `chosen` ([N] bool) with a weight of more than
-        `carrier_weight_min`, [M] bool."""
+        `carrier_weight_min`, but for those that are held, [M] bool."""
         some = chosen.numpy()
         carried = self.neighbors[some][self.weights[some] > self.settings.carrier_weight_min]
-        return torch.from_numpy(np.isin(np.arange(len(self)), carried))
+        return torch.from_numpy(np.isin(np.arange(len(self)), carried) & ~self.held)
 
 
 def _padded(a: np.ndarray, width: int) -> np.ndarray:

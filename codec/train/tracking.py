@@ -98,7 +98,8 @@ class Tracker:
         sizes = torch.ones(len(key))
         if not views.capture.has_alpha:  # there is a background
             sizes = key.params["log_scales"].sort(1).values[:, 1:].mean(1).exp()  # without the thin axis
-        graph = NodeGraph.of(means, sizes, radius, torch.from_numpy(moving), settings.graph)
+        far = torch.from_numpy(changes.far(means.numpy()))
+        graph = NodeGraph.of(means, sizes, radius, torch.from_numpy(moving), settings.graph, far)
         own = Model({**key.params, "means": torch.zeros_like(means)})
         gradient = float(torch.quantile(stats.mean_screen_gradient(), s.gradient_quantile))
         tracker = Tracker(graph, own, views, settings, np.array([radius, loss, gradient]), changes)
