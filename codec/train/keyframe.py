@@ -193,10 +193,8 @@ class _Run:
         return torch.from_numpy(k.opacity_decay * near**k.near_power).float()
 
 
-def add_opacity_decay(
-    grads: dict[str, torch.Tensor], params: dict[str, torch.Tensor], weights: float | torch.Tensor
-) -> None:
-    """Adds to the gradients those of the mean of all opacities times their `weights` ([N], or one for all)."""
+def add_opacity_decay(grads: dict[str, torch.Tensor], params: dict[str, torch.Tensor], weights: torch.Tensor) -> None:
+    """Adds to the gradients those of the mean of all opacities times their `weights` [N]."""
     opacities = torch.sigmoid(params["logit_opacities"])
     grads["logit_opacities"].add_(weights * opacities * (1 - opacities), alpha=1 / len(opacities))
 

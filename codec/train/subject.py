@@ -25,6 +25,7 @@ class Subject:
         first: frame of their keyframe.
         loss: image loss of it.
         radius: of the points that the keyframe started from, without the far shell, world units.
+        shown: pixels of the scene in its pictures, the median of the views.
         canonical: Gaussians that all groups since the keyframe refer to; None before the first is fine-tuned.
         parents: [N] index of each Gaussian in the group before.
         steps: quantization steps of all groups since the keyframe; None before the first is fine-tuned.
@@ -34,6 +35,7 @@ class Subject:
     first: int
     loss: float
     radius: float
+    shown: float
     canonical: Model | None = None
     parents: np.ndarray | None = None
     steps: Steps | None = None
@@ -50,7 +52,7 @@ class Subject:
         canonical = {f"canonical.{n}": p.numpy() for n, p in self.canonical.params.items()}
         exposure, poses = self.tracker.views.exposure, self.tracker.views.extrinsics
         cameras = {"exposure": exposure.values, "extrinsics": poses.values, "center": poses.center}
-        whole = {"keyframe": np.array([self.first, self.loss, self.radius]), "parents": self.parents}
+        whole = {"keyframe": np.array([self.first, self.loss, self.radius, self.shown]), "parents": self.parents}
         whole["steps"] = _steps_to_array(self.steps)
         return {**whole, **cameras, **canonical, **self.tracker.state()}
 
@@ -60,12 +62,12 @@ class Subject:
     ) -> Subject:
         """Inverse of `state`; also sets the calibration of `views`."""
         canonical = {n: torch.from_numpy(state[f"canonical.{n}"]) for n in NAMES}
-        first, loss, radius = state["keyframe"].tolist()
+        first, loss, radius, shown = state["keyframe"].tolist()
         views.exposure.values, views.extrinsics.values = state["exposure"], state["extrinsics"]
         views.extrinsics.set_subject(state["center"], radius)
         steps = _steps_from_array(state["steps"])
         tracker = Tracker.restored(state, views, settings, rig)
-        return Subject(tracker, int(first), loss, radius, Model(canonical), state["parents"], steps)
+        return Subject(tracker, int(first), loss, radius, shown, Model(canonical), state["parents"], steps)
 
 
 def _steps_to_array(steps: Steps | None) -> np.ndarray:
