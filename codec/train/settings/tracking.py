@@ -17,7 +17,7 @@ class ChangeDetectionSettings:
     threshold: float = 6.0  # grey levels, after a mean over 3 x 3: above the noise of sensors; -1: everything changes
     margin: float = 0.02  # of the width, around a change: parts without texture move with it
     seen_share: float = 0.5  # of the cameras that see a Gaussian must see a change there
-    far: float = 3.0  # times the distance of the cameras from where their axes meet: what is farther stands still
+    far: float = 2.0  # times the distance of the cameras from where their axes meet: what is farther stands still
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class RoomSettings:
 
     nodes: float = 2.5  # times those of a subject: much of what seems to move is what lies behind it
     motion_steps: float = 0.5  # times those of a subject: fine-tuning finds more in nearly the same time
-    finetune_steps: float = 2.0  # times those of a subject
+    finetune_steps: float = 3.0  # times those of a subject
     frequencies: float = 2.0  # times those of a subject: no search tells that something small moves fast
     rigidity: float = 1 / 3  # times that of a subject
     cut_ratio: float = 5 / 3  # times that of a subject, since few views of a room fit its keyframe far too well
