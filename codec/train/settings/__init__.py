@@ -145,8 +145,7 @@ class TrainSettings:
         """The settings for a capture: those of a room where it has no masks."""
         if capture.has_alpha:
             return self
-        room = self.room
-        field = self.motion_field.tracking and room.field_in_tracking
+        room, field = self.room, self.motion_field
         return replace(
             self,
             motion_steps=round(room.motion_steps * self.motion_steps),
@@ -163,7 +162,12 @@ class TrainSettings:
             finetune=self.finetune.with_frequencies(room.frequencies),
             group=replace(self.group, drift_ratio=room.drift_ratio * self.group.drift_ratio),
             graph=replace(self.graph, nodes=round(room.nodes * self.graph.nodes)),
-            motion_field=replace(self.motion_field, tracking=field),
+            motion_field=replace(
+                field,
+                tracking=field.tracking and room.field_in_tracking,
+                grid_rate=room.field_rates * field.grid_rate,
+                mlp_rate=room.field_rates * field.mlp_rate,
+            ),
         )
 
     def of_fast_motion(self, frames: int, share: float) -> TrainSettings:
