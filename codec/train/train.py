@@ -182,8 +182,12 @@ class _Run:
         model, radius = initial_model(self.capture, frames[0], budget.points, s, self.views.view)
         on_step = self._report(f"keyframe {frames[0]}")
         loss = train_keyframe(model, self.views, frames[0], s, steps=budget.steps, radius=radius, on_step=on_step)
-        shown = float(np.median(self.views.covered(frames[0])))
-        return Subject(Tracker.start(model, self.views, s, loss, frames, self.rig), frames[0], loss, radius, shown)
+        tracker = Tracker.start(model, self.views, s, loss, frames, self.rig)
+        return Subject(tracker, frames[0], loss, radius, self._shown(frames[0]))
+
+    def _shown(self, frame: int) -> float:
+        """Pixels of the scene in the pictures of a frame, the median of the views."""
+        return float(np.median(self.views.covered(frame)))
 
     def _track(self, frames: range, stop: int, track: _TrackedFrames) -> str:
         """Tracks `frames` up to the end of the group and adds them to `track`; returns why that came early
@@ -196,7 +200,7 @@ class _Run:
         """
         subject, g = self.subject, self.settings.group
         for frame in frames:
-            if np.median(self.views.covered(frame)) > g.shown_ratio * subject.shown:
+            if self._shown(frame) > g.shown_ratio * subject.shown:
                 return "more"
             long_enough = len(track.models) >= g.changed_frames_min
             if long_enough and subject.tracker.changed_fraction(frame, track.moved()) > g.changed_fraction_max:

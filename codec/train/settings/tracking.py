@@ -69,7 +69,7 @@ class RoomSettings:
     opacity_decay: float = 0.003  # of a keyframe: no mask removes what floats before the cameras
     position_noise: float = 3.0  # of a keyframe, for the same reason
     field_in_tracking: bool = False  # it drags what stands still with what moves beside it
-    field_rates: float = 0.2  # times those of a subject, in fine-tuning, for the same reason
+    field_rates: float = 0.2  # times those of a subject, for the same reason
 
 
 @dataclass(frozen=True)
