@@ -22,7 +22,7 @@ from ..render.backend import TURNS, Backend
 from .deformation_graph import NodeGraph, Pose
 from .entropy_model import CanonicalRate
 from .model import NAMES, REMOVED_LOGIT, Model, SizeBound, harmonics_turned, quat_product
-from .motion_field import MotionField
+from .motion_field import FieldMotion, MotionField
 from .settings import TrainSettings
 
 
@@ -32,7 +32,7 @@ class Frame:
 
     Attributes:
         params: attributes as they are rendered; harmonics as at rest, with TURNS.
-        pose: of the nodes; turn: [M, 3] rotation vectors behind the tracked one.
+        pose: of the nodes; turn: [M, 3] rotation vectors behind the tracked one; by_field: what the field says of them.
         means, rotations: [N, 3] and [N, 4], where the nodes carry the Gaussians. rest: [N, 3], canonical means.
         residual: [N, 4], the residual rotation, unit. inner: [N, 4], rotation before it. quats: [N, 4], canonical.
         shown: [N] bool.
@@ -41,6 +41,7 @@ class Frame:
     params: dict[str, torch.Tensor]
     pose: Pose
     turn: torch.Tensor
+    by_field: FieldMotion | None
     means: torch.Tensor
     rest: torch.Tensor
     rotations: torch.Tensor
@@ -188,13 +189,14 @@ class GroupModel:
         """Residual at frame `t` for each coefficient of an attribute that is 1, [K] f32."""
         return self.unit[name] * self.basis[: len(self.coefficients[name]), t]
 
-    def pose(self, t: int) -> tuple[Pose, torch.Tensor]:
-        """Corrected pose of the nodes at frame `t`, and their turn behind the tracked one, [M, 3] rotation vectors."""
-        turn, shift = self.turns[t], self.shifts[t]
+    def pose(self, t: int) -> tuple[Pose, torch.Tensor, FieldMotion | None]:
+        """Corrected pose of the nodes at frame `t`, their turn behind the tracked one, [M, 3] rotation vectors, and
+        what the field says of them."""
+        turn, shift, by_field = self.turns[t], self.shifts[t], None
         if self.field is not None:
             by_field = self.field(t)
-            turn, shift = turn + by_field[0] * self.carriers, shift + by_field[1] * self.carriers
-        return self._tracked_poses[t].moved(turn, shift), turn
+            turn, shift = turn + by_field.turn * self.carriers, shift + by_field.shift * self.carriers
+        return self._tracked_poses[t].moved(turn, shift), turn, by_field
 
     def by_nodes(
         self, t: int, frame: Frame, by_carried: tuple[torch.Tensor, torch.Tensor], rigidity: float
@@ -216,7 +218,7 @@ class GroupModel:
         delta = {
             n: torch.from_numpy(backend.trajectory_sum(c, self.at(n, t), zone)) for n, c in self.coefficients.items()
         }
-        pose, turn = self.pose(t)
+        pose, turn, by_field = self.pose(t)
         means, rotations = self.graph.carry(p["means"], pose)
         dq = delta["quats"]
         residual = torch.cat([(1 - dq.square().sum(1, keepdim=True)).clamp(min=1e-6).sqrt(), dq], 1)
@@ -233,7 +235,7 @@ class GroupModel:
         }
         if self._turned:
             params[TURNS] = rotations
-        return Frame(params, pose, turn, means, p["means"], rotations, residual, inner, p["quats"], shown)
+        return Frame(params, pose, turn, by_field, means, p["means"], rotations, residual, inner, p["quats"], shown)
 
     def limit_sizes(self, t: int, frame: Frame, bound: SizeBound | None) -> None:
         """Brings the trajectories of Gaussians that are larger than `bound` in `frame`, which is that at `t`, back to

@@ -17,7 +17,7 @@ from ..render.optimizer import Adam
 from .deformation_graph import Pose
 from .keyframe import Statistics
 from .model import Model, quat_product
-from .motion_field import MotionField
+from .motion_field import FieldMotion, MotionField
 from .views import Target, photometric_loss
 
 if TYPE_CHECKING:
@@ -54,14 +54,13 @@ class FrameFit:
             self._largest = bound.log_scales(tracker.carried(tracker.own, tracker.pose)[0]["means"])
         self.statistics = Statistics(len(self.own), tracker.settings.keyframe.mse_min)
 
-    def _pose(self) -> Pose:
-        if self._field is None:
-            return replace(self.tracker.pose, **self._nodes).next()
-        turn, shift = self._field()
-        turn = self._nodes["angular_velocity"] + self._carriers * turn
-        return replace(
-            self.tracker.pose, angular_velocity=turn, velocity=self._nodes["velocity"] + self._carriers * shift
-        ).next()
+    def _pose(self) -> tuple[Pose, FieldMotion | None]:
+        """Pose of the nodes, and what the field says of them."""
+        turn, shift, by_field = self._nodes["angular_velocity"], self._nodes["velocity"], None
+        if self._field is not None:
+            by_field = self._field()
+            turn, shift = turn + self._carriers * by_field.turn, shift + self._carriers * by_field.shift
+        return replace(self.tracker.pose, angular_velocity=turn, velocity=shift).next(), by_field
 
     def step(self, target: Target, decay: float, *, full: bool, stiff: bool, slow: bool) -> float:
         """One view; returns its image loss without the mask term.
@@ -72,7 +71,8 @@ class FrameFit:
             stiff: nodes hold together, and slow: the Gaussians' own attributes follow slowly, where the velocity is
                 not known (`TrackingSettings.stiff_rigidity`, `slow_rates`).
         """
-        t, s, pose = self.tracker, self.tracker.settings.tracking, self._pose()
+        t, s = self.tracker, self.tracker.settings.tracking
+        pose, by_field = self._pose()
         params, rotations = t.carried(self.own, pose)
         result = photometric_loss(params, target, t.settings, self._rng, t.views.backend)
         if full:
@@ -80,7 +80,7 @@ class FrameFit:
         grads = result.grads
         by_rotations = quat_product(grads["quats"], self.own.params["quats"], inverse_b=True)
         rigidity = (s.stiff_rigidity if stiff else 1.0) * t.settings.rigidity
-        self._step_nodes(pose, (grads["means"], by_rotations), rigidity, decay)
+        self._step_nodes(pose, by_field, (grads["means"], by_rotations), rigidity, decay)
         grads = {**grads, "quats": quat_product(rotations, grads["quats"], inverse_a=True)}  # before rotation
         free = grads
         if not self._all_move:
@@ -90,14 +90,16 @@ class FrameFit:
             self.own.limit_sizes(self._largest)
         return result.image_loss
 
-    def _step_nodes(self, pose: Pose, by_carried: tuple, rigidity: float, decay: float) -> None:
+    def _step_nodes(
+        self, pose: Pose, by_field: FieldMotion | None, by_carried: tuple, rigidity: float, decay: float
+    ) -> None:
         """One step of the nodes along the gradients by where they carry the Gaussians, and along that of rigidity."""
         graph, base = self.tracker.graph, (self.tracker.pose.rotations, pose.angular_velocity)
         by = graph.gradients(graph.means, base, pose, by_carried, rigidity)
         by = [g * self._carriers for g in by]
         self._adam.step(self._nodes, dict(zip(self._nodes, by, strict=True)), self._scaled(decay))
-        if self._field is not None:
-            self._field.step(0, *by, decay)
+        if by_field is not None:
+            self._field.step(by_field, *by, decay)
 
     def _scaled(self, decay: float) -> dict[str, float]:
         return {n: r * decay for n, r in self._rates.items()}
@@ -105,4 +107,4 @@ class FrameFit:
     def result(self) -> tuple[Model, Pose]:
         """The Gaussians' own attributes and the pose of the nodes."""
         quats = torch.nn.functional.normalize(self.own.params["quats"], dim=1)
-        return Model({**self.own.params, "quats": quats}), self._pose()
+        return Model({**self.own.params, "quats": quats}), self._pose()[0]

@@ -51,7 +51,13 @@ class HashGrid(torch.nn.Module):
 
     def forward(self, points: torch.Tensor) -> torch.Tensor:
         """[N, 3] in [0, 1] (clamped) -> [N, L * F]; gradients for the table, and for points that require one."""
-        return _Lookup.apply(points, self.table, self.native, len(self.cells))
+        return _Lookup.apply(points, self.table, self)
+
+    def lookup(self, points: torch.Tensor) -> torch.Tensor:
+        """`forward` at points [N, 3] f32, without gradients and their bookkeeping."""
+        out = np.empty((len(points), len(self.cells) * self.features), np.float32)
+        self.native.forward(points.numpy(), self.table.detach().numpy(), out)
+        return torch.from_numpy(out)
 
     def by_table(self, points: torch.Tensor, grad_out: torch.Tensor) -> torch.Tensor:
         """Gradient [entries, F] by the table, from that by the result of `forward` at points [N, 3] f32."""
@@ -83,15 +89,13 @@ class HashGrid(torch.nn.Module):
 
 class _Lookup(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, points, table, native, levels):
+    def forward(ctx, points, table, grid):
         if points.ndim != 2 or points.shape[1] != 3:
             raise UsageError(f"points have shape {tuple(points.shape)}, expected [N, 3]")
         x = points.detach().float().contiguous()
-        out = np.empty((len(x), levels * table.shape[1]), np.float32)
-        native.forward(x.numpy(), table.detach().numpy(), out)
-        ctx.native, ctx.dtype = native, points.dtype
+        ctx.native, ctx.dtype = grid.native, points.dtype
         ctx.save_for_backward(x, table)
-        return torch.from_numpy(out)
+        return grid.lookup(x)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -106,4 +110,4 @@ class _Lookup(torch.autograd.Function):
             grad_table.numpy(),
             None if grad_points is None else grad_points.numpy(),
         )
-        return None if grad_points is None else grad_points.to(ctx.dtype), grad_table, None, None
+        return None if grad_points is None else grad_points.to(ctx.dtype), grad_table, None

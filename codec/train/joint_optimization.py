@@ -202,8 +202,8 @@ class _Finetuner:
         values = {f"turn {t}": group.turns[t], f"shift {t}": group.shifts[t]}
         grads = {f"turn {t}": by_turns, f"shift {t}": by_shifts}
         self.nodes.step(values, grads, {n: decay * self.node_rates[n.split()[0]] for n in values})
-        if group.field is not None:
-            group.field.step(t, by_turns, by_shifts, decay)
+        if frame.by_field is not None:
+            group.field.step(frame.by_field, by_turns, by_shifts, decay)
 
     def _bit_weight(self) -> float:
         """Weight of a bit in the image loss.

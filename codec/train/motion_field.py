@@ -10,6 +10,7 @@ frame, is evaluated at every Gaussian, and is not joined over time.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 
@@ -17,6 +18,20 @@ from ..render.backend import Backend
 from ..render.optimizer import Adam, AdamSettings
 from .hash_grid import HashGrid
 from .settings import MotionFieldSettings
+
+
+@dataclass(frozen=True)
+class FieldMotion:
+    """What a field says of M nodes at one frame.
+
+    Attributes:
+        turn, shift: [M, 3] rotation vectors, and [M, 3] translations in world units.
+        layers: input and output of the MLP, and what is between its layers, for the step along its gradients.
+    """
+
+    turn: torch.Tensor
+    shift: torch.Tensor
+    layers: list[torch.Tensor]
 
 
 class MotionField:
@@ -59,26 +74,21 @@ class MotionField:
             self._parameters |= {f"mlp.{i}.weight": layer.weight.data, f"mlp.{i}.bias": layer.bias.data}
         self._adam = Adam(backend, adam)
 
-    def __call__(self, frame: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-        """Rotation vectors [M, 3] and translations [M, 3] in world units at a frame."""
-        out = self._layers(frame)[-1]
-        return out[:, :3], self._radius * out[:, 3:]
-
     @torch.no_grad()
-    def _layers(self, frame: int) -> list[torch.Tensor]:
-        """Input and output of the MLP, and what is between its layers."""
-        x, p = self._grid(self._points), self._parameters
-        x = [torch.cat([x, self._encoding[frame].expand(len(x), -1)], 1)]
+    def __call__(self, frame: int = 0) -> FieldMotion:
+        """Motion at a frame."""
+        x, p = self._grid.lookup(self._points), self._parameters
+        layers = [torch.cat([x, self._encoding[frame].expand(len(x), -1)], 1)]
         for i in range(3):
-            y = torch.addmm(p[f"mlp.{i}.bias"], x[-1], p[f"mlp.{i}.weight"].T)
-            x.append(y.relu_() if i < 2 else y)
-        return x
+            y = torch.addmm(p[f"mlp.{i}.bias"], layers[-1], p[f"mlp.{i}.weight"].T)
+            layers.append(y.relu_() if i < 2 else y)
+        return FieldMotion(y[:, :3], self._radius * y[:, 3:], layers)
 
     @torch.no_grad()
-    def step(self, frame: int, by_turns: torch.Tensor, by_shifts: torch.Tensor, decay: float) -> None:
-        """One step along the gradients by the rotation vectors and the translations at a frame, [M, 3] both; all
+    def step(self, motion: FieldMotion, by_turns: torch.Tensor, by_shifts: torch.Tensor, decay: float) -> None:
+        """One step along the gradients by the rotation vectors and the translations of a motion, [M, 3] both; all
         learning rates times `decay`."""
-        layers, p, grads = self._layers(frame), self._parameters, {}
+        layers, p, grads = motion.layers, self._parameters, {}
         by = torch.cat([by_turns, self._radius * by_shifts], 1)
         for i in (2, 1, 0):
             grads[f"mlp.{i}.weight"], grads[f"mlp.{i}.bias"] = by.T @ layers[i], by.sum(0)

@@ -1,9 +1,12 @@
 //! Multi-resolution hash grid (Instant-NGP, Mueller et al. 2022): [N, 3] in [0, 1] -> [N, L * F], trilinear at each level.
 //!
 //! A level whose vertices fit the table is dense, the others are hashed. A level is one task that walks all points in order:
-//! its part of the table stays in the cache, gradients need no atomics, and results do not depend on the threads.
+//! its part of the table stays in the cache, gradients need no atomics, and results do not depend on the threads. Few points
+//! are less work than waking a thread.
 
 mod cell;
+
+use std::ops::Range;
 
 use rayon::prelude::*;
 
@@ -11,7 +14,7 @@ use crate::error::{RasterError, check_length};
 use crate::parallel::parallel_for;
 use cell::GridLevel;
 
-/// Points of one task when the outputs of the levels are interleaved.
+/// Points of one task when the outputs of the levels are interleaved; so few are looked up at all levels by one.
 const POINTS: usize = 256;
 
 /// Shape of a grid; the table is [entries, F], level after level.
@@ -105,29 +108,46 @@ impl HashGrid {
         let (n, stride) = (points.len() / 3, self.outputs().max(1));
         self.scratch.resize(n * stride, 0.0);
         let (table, _) = table.as_chunks::<F>();
-        let levels = self.levels.par_iter().zip(self.scratch.par_chunks_mut((n * F).max(1)));
-        levels.for_each(|(level, out)| {
-            let rows = &table[level.first..level.first + level.entries];
-            for (out, point) in out.as_chunks_mut::<F>().0.iter_mut().zip(points.as_chunks::<3>().0) {
-                let cell = level.cell(point);
-                let weights = cell.weights();
-                *out = [0.0; F];
-                for corner in 0..8 {
-                    let (w, row) = (weights[corner], &rows[cell.rows[corner] as usize]);
-                    for f in 0..F {
-                        out[f] += w * row[f];
+        let (grain, scratch) = (self.grain(n), self.scratch.as_chunks_mut::<F>().0);
+        let cut =
+            |work, levels: &Range<usize>, middle: usize| <[[f32; F]]>::split_at_mut(work, n * (middle - levels.start));
+        parallel_for(
+            0..self.levels.len(),
+            grain,
+            scratch,
+            &cut,
+            &|levels, out: &mut [[f32; F]]| {
+                for (level, out) in self.levels[levels].iter().zip(out.chunks_exact_mut(n.max(1))) {
+                    let rows = &table[level.first..level.first + level.entries];
+                    for (out, point) in out.iter_mut().zip(points.as_chunks::<3>().0) {
+                        let cell = level.cell(point);
+                        let weights = cell.weights();
+                        *out = [0.0; F];
+                        for corner in 0..8 {
+                            let (w, row) = (weights[corner], &rows[cell.rows[corner] as usize]);
+                            for f in 0..F {
+                                out[f] += w * row[f];
+                            }
+                        }
                     }
                 }
-            }
-        });
+            },
+        );
         let scratch = self.scratch.as_chunks::<F>().0;
-        out.par_chunks_mut(POINTS * stride).enumerate().for_each(|(i, out)| {
-            for (k, point) in out.chunks_exact_mut(stride).enumerate() {
-                for (l, features) in point.as_chunks_mut::<F>().0.iter_mut().enumerate() {
-                    *features = scratch[l * n + i * POINTS + k];
+        let cut =
+            |work, points: &Range<usize>, middle: usize| <[f32]>::split_at_mut(work, stride * (middle - points.start));
+        parallel_for(0..n, POINTS, out, &cut, &|points, out: &mut [f32]| {
+            for (point, out) in points.zip(out.chunks_exact_mut(stride)) {
+                for (l, features) in out.as_chunks_mut::<F>().0.iter_mut().enumerate() {
+                    *features = scratch[l * n + point];
                 }
             }
         });
+    }
+
+    /// Levels of one task for `n` points.
+    fn grain(&self, n: usize) -> usize {
+        if n <= POINTS { self.levels.len().max(1) } else { 1 }
     }
 
     /// Gradients from `grad_out` [N, L * F]: `grad_table` is added to, `grad_points` (if wanted) overwritten.
@@ -162,26 +182,36 @@ impl HashGrid {
     }
 
     fn table_backward<const F: usize>(&self, points: &[f32], grad_out: &[f32], grad_table: &mut [f32]) {
-        let stride = self.outputs().max(1);
+        let (n, stride) = (points.len() / 3, self.outputs().max(1));
         let (rows, _) = grad_table.as_chunks_mut::<F>();
-        let cut = |rows, levels: &std::ops::Range<usize>, middle: usize| {
+        let cut = |rows, levels: &Range<usize>, middle: usize| {
             let n = self.levels[middle].first - self.levels[levels.start].first;
             <[[f32; F]]>::split_at_mut(rows, n)
         };
-        parallel_for(0..self.levels.len(), 1, rows, &cut, &|l, rows: &mut [[f32; F]]| {
-            let level = self.levels[l.start];
-            for (g, point) in grad_out.chunks_exact(stride).zip(points.as_chunks::<3>().0) {
-                let g = &g[l.start * F..(l.start + 1) * F];
-                let cell = level.cell(point);
-                let weights = cell.weights();
-                for corner in 0..8 {
-                    let (w, row) = (weights[corner], &mut rows[cell.rows[corner] as usize]);
-                    for f in 0..F {
-                        row[f] += w * g[f];
+        parallel_for(
+            0..self.levels.len(),
+            self.grain(n),
+            rows,
+            &cut,
+            &|levels, mut rows: &mut [[f32; F]]| {
+                for l in levels {
+                    let level = self.levels[l];
+                    let (of_level, rest) = rows.split_at_mut(level.entries);
+                    rows = rest;
+                    for (g, point) in grad_out.chunks_exact(stride).zip(points.as_chunks::<3>().0) {
+                        let g = &g[l * F..(l + 1) * F];
+                        let cell = level.cell(point);
+                        let weights = cell.weights();
+                        for corner in 0..8 {
+                            let (w, row) = (weights[corner], &mut of_level[cell.rows[corner] as usize]);
+                            for f in 0..F {
+                                row[f] += w * g[f];
+                            }
+                        }
                     }
                 }
-            }
-        });
+            },
+        );
     }
 
     fn points_backward<const F: usize>(
