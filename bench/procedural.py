@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from gscodec.capture import Capture, View
+from gscodec.capture.background import background_of, cut_out
 from gscodec.model.camera import Camera, look_at
 
 SAMPLES = 3  # rays along each side of a pixel
@@ -71,7 +72,8 @@ class Scene:
         pose_noise: degrees and metres by which the calibration of each training camera is wrong.
         handheld: degrees and metres (root mean square) by which each camera shakes, each in its own way.
         orbit: degrees a frame by which all cameras go around the subject.
-        masks: the views have alpha.
+        masks: the views have alpha. Without them a background of one colour is cut out, as it is of files.
+        noise: standard deviation of the noise of the sensor, over a black level of three times that; 0: there is none.
         depth_noise: standard deviation of the noise of the depth images, a share of the depth; None: there are none.
     """
 
@@ -88,6 +90,7 @@ class Scene:
     handheld: tuple[float, float] = (0.0, 0.0)
     orbit: float = 0.0
     masks: bool = True
+    noise: float = 0.0
     depth_noise: float | None = None
 
     def capture(self, name: str) -> Capture:
@@ -120,13 +123,17 @@ class Scene:
             seed = np.random.default_rng([2, camera, frame])
             depth = None if self.depth_noise is None else _sensed(depth, self.depth_noise, seed)
             if not self.masks:
-                return View(_u8(gain(camera, frame) * rgba[..., :3]), depth=depth)
+                seen = gain(camera, frame) * rgba[..., :3]
+                if self.noise:
+                    seen = seen + seed.normal(3 * self.noise, self.noise, seen.shape)
+                return View(_u8(seen), depth=depth)
             return View(_u8(gain(camera, frame) * rgb), _u8(alpha), depth)
 
         poses = told if self.orbit or any(self.handheld) else None
         cameras = [told(i, 0) for i in range(len(rig))]
         has_depth = self.depth_noise is not None
-        return Capture(name, 25.0, cameras, self.frames, self.masks, read, has_depth=has_depth, poses=poses)
+        capture = Capture(name, 25.0, cameras, self.frames, self.masks, read, has_depth=has_depth, poses=poses)
+        return capture if self.masks else before_background(capture)
 
     def _exposed(self, camera: Camera, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """[H, W, 4] f32, premultiplied, the mean over the time for which the shutter is open, and the depth [H, W] in
@@ -135,6 +142,21 @@ class Scene:
         times = frame + self.shutter * (np.arange(count) - (count - 1) / 2) / count
         traced = [trace(self.shapes(t), self.light(t), camera) for t in times]
         return np.mean([rgba for rgba, _ in traced], 0), traced[count // 2][1]
+
+
+def before_background(capture: Capture) -> Capture:
+    """A capture without masks, whose background is cut out if it has one colour."""
+    color = background_of([capture.view(i, 0).rgb for i in range(len(capture.cameras))])
+    if color is None:
+        return capture
+
+    @cache
+    def read(camera: int, frame: int) -> View:
+        view = capture.read(camera, frame)
+        rgb, alpha = cut_out(view.rgb, color)
+        return replace(view, rgb=rgb, alpha=alpha)
+
+    return replace(capture, has_alpha=True, read=read)
 
 
 def write_transforms(capture: Capture, folder: Path) -> None:

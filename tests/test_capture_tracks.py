@@ -185,7 +185,7 @@ def test_one_subject_stays_one(tmp_path):
 def test_what_cannot_be_split_is_said(folder, tmp_path):
     plain = tmp_path / "plain"
     plain.mkdir()
-    write_transforms(rig(ball, False, 24), plain)
+    write_transforms(Scene(ball, frames=4, train=3, test=0, size=24, masks=False, noise=0.02).capture("noise"), plain)
     out = tmp_path / "a.gsv"
     assert "there are no masks" in fails("encode", plain, out, "--tracks", "masks")
     assert "expected masks or motion" in fails("encode", plain, out, "--tracks", "people")

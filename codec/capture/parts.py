@@ -23,7 +23,7 @@ from .masks import FRAMES_LEAST, mask_of
 
 WAYS = ("masks", "motion")
 SAMPLES = 31  # frames of which the median is taken
-NO_ROOM = "its images have an alpha channel, so that nothing is known of the room; encode it without --tracks"
+NO_ROOM = "its images show the subject alone, so that nothing is known of the room; encode it without --tracks"
 FILL = 3.0  # pixels, radius of what fills a hole in
 
 
@@ -69,7 +69,7 @@ def _masked(capture: Capture) -> Capture:
             f"{capture.name}: there are no masks; expected a mask for each picture (gscodec masks makes them), "
             f"or --tracks motion"
         )
-    if any(f.has_alpha and not f.masks for f in capture.footage):
+    if any(f.subject_alone for f in capture.footage):
         raise CaptureError(f"{capture.name}: {NO_ROOM}")
     return capture
 
@@ -80,7 +80,7 @@ def _unmasked(capture: Capture) -> Capture:
         raise CaptureError(
             f"{capture.name}: {capture.frame_count} frames, expected {FRAMES_LEAST} or more to see what moves"
         )
-    if any(f.has_alpha and not f.masks for f in capture.footage):
+    if any(f.subject_alone for f in capture.footage):
         raise CaptureError(f"{capture.name}: {NO_ROOM}")
     read = lambda i, t: replace(capture.view(i, t), alpha=None)  # noqa: E731
     poses = None if capture.poses is None else capture.camera

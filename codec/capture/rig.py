@@ -17,6 +17,7 @@ import numpy as np
 
 from ..errors import CaptureError
 from ..model.camera import NEAR, Camera, meeting_point
+from .background import background_of, cut_out
 from .capture import Capture, differs, extent
 from .depth import DepthImages, along_axis
 from .images import SUFFIXES, View, image_size, read_image, read_mask
@@ -45,6 +46,7 @@ class Feed:
         masks: the mask file of each frame, empty where there are none.
         width, height: of the video or the first image; later images are checked against the camera.
         has_alpha: views have an alpha channel, of their own or from masks; False drops their own.
+        background: [3] colour of what is no part of the subject, which is cut out; None: there are masks, or none.
 
     Raises:
         CaptureError: an image is missing or not readable, or only some frames have masks or depth images.
@@ -72,9 +74,15 @@ class Feed:
             raise CaptureError(f"{depths.files[0].parent}: {len(depths.files)} depth images for {len(self)} frames")
         self.masks = there
         self.has_alpha = alpha or bool(there)
+        self.background: np.ndarray | None = None
 
     def __len__(self) -> int:
         return self._source.frame_count if isinstance(self._source, Video) else len(self._source)
+
+    @property
+    def subject_alone(self) -> bool:
+        """Whether nothing is known of what is behind the subject, since its own alpha or its background is the mask."""
+        return self.background is not None or (self.has_alpha and not self.masks)
 
     @property
     def fps(self) -> float:
@@ -87,6 +95,9 @@ class Feed:
         if self.depths:
             height, width = view.rgb.shape[:2]
             view = replace(view, depth=self.depths.read(t, width, height))
+        if self.background is not None:
+            rgb, alpha = cut_out(view.rgb, self.background)
+            return replace(view, rgb=rgb, alpha=alpha)
         if not self.masks:
             return view
         alpha = read_mask(self.masks[t], labels=self._labels)
@@ -170,16 +181,37 @@ def assemble(
     def poses(index: int, frame: int) -> Camera:
         return _at(pinholes[index], frame)
 
-    if all(f.opaque() for f in feeds):  # many tools write an alpha channel without masks
-        for feed in feeds:
-            feed.has_alpha = False
-    alpha = any(f.has_alpha for f in feeds)
+    _find_masks(feeds)
+    alpha = any(f.has_alpha or f.background is not None for f in feeds)
     moving = any(len(track) > 1 for track in tracks)
     cameras = [track[0] for track in pinholes]
     fps, poses_of = fps or feeds[0].fps, poses if moving else None
     depth = any(f.depths for f in feeds)
     more = {"has_depth": depth, "poses": poses_of, "points": points, "footage": feeds}
     return Capture(name, fps, cameras, frame_count, alpha, read, **more)
+
+
+def _find_masks(feeds: Sequence[Feed]) -> None:
+    """Drops alpha channels that say nothing, which many tools write, and finds the background of pictures without
+    masks."""
+    if all(f.opaque() for f in feeds):
+        for feed in feeds:
+            feed.has_alpha = False
+    if any(f.has_alpha for f in feeds):
+        return
+    try:
+        color = background_of([f.picture(t).rgb for f in feeds for t in sorted({0, len(f) // 2})])
+    except CaptureError:  # whoever needs the picture says so
+        return
+    if color is None:
+        return
+    warnings.warn(
+        f"{feeds[0].path.parent}: no masks, and a background of one colour, {tuple(color.astype(int).tolist())}: what "
+        f"differs from it is the subject (gscodec masks makes other masks)",
+        stacklevel=5,
+    )
+    for feed in feeds:
+        feed.background = color
 
 
 def _with_near(tracks: Sequence[Track]) -> list[Track]:

@@ -150,7 +150,7 @@ def _of_capture(path: Path, frame: int, sheet: Path | None, as_json: bool) -> No
         f"{path}: {facts['layout']}, {split[0]} training and {split[1]} test cameras"
         f"{' that move' if facts['moves'] else ''}, {facts['frames']} frames at {facts['fps']:g} fps"
     )
-    masks = {None: "no masks", "alpha": "masks from alpha", "files": "masks from files"}[facts["masks"]]
+    masks = "no masks" if facts["masks"] is None else f"masks from {facts['masks']}"
     points = "no sparse points" if facts["points"] is None else f"{facts['points']} sparse points"
     error, ratio = facts["epipolar_error"], facts["colour_ratio"]
     checked = "unknown" if error is None else f"{error:.2f} pixels from epipolar lines ({facts['matches']} matches)"
