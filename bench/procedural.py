@@ -28,6 +28,7 @@ OPENGL = np.diag([1.0, -1, -1, 1])  # OpenCV camera axes -> OpenGL's
 WAVES = 3  # sines of which the motion of a handheld camera is made
 PERIODS = (7.0, 30.0)  # frames, of these sines
 ROLL = 20  # frames, the period of an exposure that rolls
+BACKDROP = 0.35  # grey behind the subject where its masks are wrong
 EXPOSURES = 5  # moments of a picture whose shutter is open for some time
 
 
@@ -74,6 +75,8 @@ class Scene:
         orbit: degrees a frame by which all cameras go around the subject.
         masks: the views have alpha. Without them a background of one colour is cut out, as it is of files.
         noise: standard deviation of the noise of the sensor, over a black level of three times that; 0: there is none.
+        mask_errors: share of the masks of training cameras that lack a piece, and of those that have one too many; all
+            are grown or shrunk by up to two pixels, before a grey background.
         depth_noise: standard deviation of the noise of the depth images, a share of the depth; None: there are none.
     """
 
@@ -91,6 +94,7 @@ class Scene:
     orbit: float = 0.0
     masks: bool = True
     noise: float = 0.0
+    mask_errors: float = 0.0
     depth_noise: float | None = None
 
     def capture(self, name: str) -> Capture:
@@ -127,6 +131,9 @@ class Scene:
                 if self.noise:
                     seen = seen + seed.normal(3 * self.noise, self.noise, seen.shape)
                 return View(_u8(seen), depth=depth)
+            if self.mask_errors and rig[camera].split == "train":
+                rgb = rgba[..., :3] + BACKDROP * (1 - alpha[..., None])
+                alpha = _wrong(alpha, self.mask_errors, seed)
             return View(_u8(gain(camera, frame) * rgb), _u8(alpha), depth)
 
         poses = told if self.orbit or any(self.handheld) else None
@@ -142,6 +149,22 @@ class Scene:
         times = frame + self.shutter * (np.arange(count) - (count - 1) / 2) / count
         traced = [trace(self.shapes(t), self.light(t), camera) for t in times]
         return np.mean([rgba for rgba, _ in traced], 0), traced[count // 2][1]
+
+
+def _wrong(alpha: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
+    """A mask as tools make it: a rim that is off, and at times a disc that is missing, or one beside the subject."""
+    import cv2
+
+    size = int(rng.integers(-2, 3))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(size) + 1,) * 2)
+    out = (cv2.dilate if size > 0 else cv2.erode)(alpha, kernel)
+    inside, rim = alpha > 0.5, (cv2.dilate(alpha, np.ones((15, 15))) > 0.5) & (alpha < 0.5)
+    for where, value in ((inside, 0.0), (rim, 1.0)):
+        radius, wrong = rng.uniform(0.06, 0.12) * len(alpha), rng.random() < share
+        if wrong and where.any():
+            y, x = rng.choice(np.argwhere(where)).tolist()
+            cv2.circle(out, (x, y), round(radius), value, -1)
+    return out
 
 
 def before_background(capture: Capture) -> Capture:
