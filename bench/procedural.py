@@ -76,7 +76,7 @@ class Scene:
         masks: the views have alpha. Without them a background of one colour is cut out, as it is of files.
         noise: standard deviation of the noise of the sensor, over a black level of three times that; 0: there is none.
         mask_errors: share of the masks of training cameras that lack a piece, and of those that have one too many; all
-            are grown or shrunk by up to two pixels, before a grey background.
+            are grown or shrunk by up to a pixel, before a grey background.
         depth_noise: standard deviation of the noise of the depth images, a share of the depth; None: there are none.
     """
 
@@ -155,7 +155,7 @@ def _wrong(alpha: np.ndarray, share: float, rng: np.random.Generator) -> np.ndar
     """A mask as tools make it: a rim that is off, and at times a disc that is missing, or one beside the subject."""
     import cv2
 
-    size = int(rng.integers(-2, 3))
+    size = int(rng.integers(-1, 2))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(size) + 1,) * 2)
     out = (cv2.dilate if size > 0 else cv2.erode)(alpha, kernel)
     inside, rim = alpha > 0.5, (cv2.dilate(alpha, np.ones((15, 15))) > 0.5) & (alpha < 0.5)

@@ -163,6 +163,26 @@ def test_a_cleaner_capture_gets_a_finer_quality():
     assert 30 < noisy < clean - 3 < 87
 
 
+def test_masks_that_are_wrong_do_not_lower_the_quality():
+    truth = [blob(400)]
+    calibration, chosen = Calibration.plain(16, 1), []
+    capture = pictures_of(truth, small_cameras(truth), calibration.gains[0])
+    holes = np.zeros((64, 64), bool)
+    holes[26:38, 26:38] = True  # in the middle of the subject
+
+    def pierced(camera: int, frame: int) -> View:
+        view = capture.read(camera, frame)
+        return replace(view, alpha=np.where(holes & (camera % 4 == 0), 0, view.alpha).astype(np.uint8))
+
+    wrong = np.random.default_rng(1).normal(0, 0.05, truth[0].sh0.shape).astype(np.float32)
+    model = replace(truth[0], sh0=truth[0].sh0 + wrong)
+    group = replace(next(fit_groups([DenseGroup([model])])), calibration=calibration)
+    for pictures in (capture, replace(capture, read=pierced)):
+        coder = GroupCoder(EncodeSettings(layers=1), refine_by_pictures=PictureRefinement(pictures))
+        chosen.append(choose_quality(coder, group, coder.measure(group, 0), 0))
+    assert abs(chosen[0] - chosen[1]) < 5
+
+
 def test_what_refinement_has_chosen_is_not_undone_by_a_predicted_group():
     """What has not changed costs nothing, but for places, which trajectories set right where that shows."""
     truth = [blob(400, sh_count=3)]

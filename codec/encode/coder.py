@@ -36,8 +36,10 @@ class RefineByPictures(Protocol):
     ) -> None:
         """By `views` pictures; None: by as many as usually pay."""
 
-    def pictures(self, group: ParametricGroup, first_frame: int, count: int, seed: int) -> Iterable[Target]:
-        """`count` of the pictures, in the order that `seed` draws."""
+    def masked_pictures(
+        self, group: ParametricGroup, first_frame: int, count: int, seed: int
+    ) -> Iterable[tuple[Target, np.ndarray | None]]:
+        """`count` of the pictures, in the order that `seed` draws, each with its mask, [H, W] u8; None: it has none."""
 
 
 FORM = ("rest", "rotations", "axis_order", "axis_rotation")  # arrays of a `ReferenceForm`

@@ -60,13 +60,19 @@ def _next(tried: dict[float, float]) -> float:
 
 
 def _errors(coder: GroupCoder, group: ParametricGroup, quantized: Quantized, first_frame: int) -> tuple[float, float]:
-    """Mean squared error against the pictures, of the frames before coding and of those decoded from `quantized`."""
+    """Mean squared error against the pictures, of the frames before coding and of those decoded from `quantized`, where
+    the mask is not contradicted by the former."""
     s, backend, errors = coder.settings.quality_search, CpuBackend(), np.zeros(2)
     rounding = AdaptiveRounding(quantized, coder.settings)
     coder.refine_by_pictures(group, first_frame, rounding, s.frame_pictures * len(group))
     count = max(s.judged, len(group))
-    for t, camera, background, picture in coder.refine_by_pictures.pictures(group, first_frame, count, s.seed):
-        for i, g in enumerate((rounding.source(t), rounding.frame(t))):
-            image, _ = backend.render(params_of(g), camera, background)
-            errors[i] += float(np.mean((np.clip(image, 0, 1) - picture) ** 2)) / count
+    pictures = coder.refine_by_pictures.masked_pictures(group, first_frame, count, s.seed)
+    for (t, camera, background, picture), mask in pictures:
+        rendered = [backend.render(params_of(g), camera, background) for g in (rounding.source(t), rounding.frame(t))]
+        agreed = slice(None)
+        if mask is not None:
+            agreed = np.abs(rendered[0][1] - mask / 255) <= s.mask_error_max
+        for i, (image, _) in enumerate(rendered):
+            difference = (np.clip(image, 0, 1) - picture)[agreed]
+            errors[i] += float(np.square(difference).sum()) / max(difference.size, 1) / count
     return errors[0], errors[1]

@@ -147,6 +147,7 @@ class QualitySearchSettings:
         finest: very fine steps, with which coding is said to cost nothing.
         tolerance: of the excess of the squared error, as a log ratio. excess_min: below it, it is noise.
         frame_pictures: pictures a frame by which a try is refined.
+        mask_error_max: difference of alpha by which model and mask contradict each other: such a pixel says nothing.
         judged: pictures by which it is judged, at least one a frame. seed: of their order.
     """
 
@@ -158,6 +159,7 @@ class QualitySearchSettings:
     tolerance: float = 0.15
     excess_min: float = 0.005
     frame_pictures: int = 10
+    mask_error_max: float = 0.5
     judged: int = 24
     seed: int = 1
 

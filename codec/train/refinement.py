@@ -73,6 +73,16 @@ class PictureRefinement:
         Raises:
             CaptureError: a picture cannot be read.
         """
+        return (picture for picture, _ in self.masked_pictures(group, first_frame, count, seed))
+
+    def masked_pictures(
+        self, group: ParametricGroup, first_frame: int, count: int, seed: int = 0
+    ) -> Iterator[tuple[Picture, np.ndarray | None]]:
+        """`pictures`, each with its mask, [H, W] u8; None: the capture has none.
+
+        Raises:
+            CaptureError: a picture cannot be read.
+        """
         calibration, frames = group.calibration, len(group)
 
         def read(camera: int, t: int) -> tuple[View, Camera]:
@@ -89,4 +99,5 @@ class PictureRefinement:
             view, camera = cached(i, t)
             background = tuple(random.uniform(0, 1, 3).tolist())
             evened = replace(view, rgb=calibration.evened(view.rgb, i, t))
-            yield t, camera, background, np.ascontiguousarray(blend(evened, background) / 255, np.float32)
+            picture = np.ascontiguousarray(blend(evened, background) / 255, np.float32)
+            yield (t, camera, background, picture), view.alpha
