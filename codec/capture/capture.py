@@ -34,7 +34,7 @@ class Capture:
         fps: frames a second.
         cameras: undistorted pinhole cameras, as they are in frame 0; each has an image of every frame.
         frame_count: frames of this (possibly restricted) capture.
-        has_alpha: views have an alpha channel (from the images or from masks).
+        has_alpha: views have an alpha channel (from the images, from masks, or cut out of a background of one colour).
         has_depth: views of at least one camera have depth.
         read: (camera index, frame of the source) -> View at the source's size, undistorted; thread-safe.
         first_frame: source frame that is frame 0 here.
