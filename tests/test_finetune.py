@@ -247,4 +247,4 @@ def test_trajectories_do_not_outgrow_the_bound_on_sizes():
     finetune(group, views, range(3), TINY, radius=1.0)
     for t in range(3):
         params = group.frame(t, CpuBackend()).params
-        assert (params["log_scales"] <= views.size_bound.log_scales(params["means"]) + 0.5).all()
+        assert (params["log_scales"] <= views.size_bound.log_scales(params["means"]) + 0.1).all()

@@ -237,16 +237,17 @@ class GroupModel:
             params[TURNS] = rotations
         return Frame(params, pose, turn, by_field, means, p["means"], rotations, residual, inner, p["quats"], shown)
 
-    def limit_sizes(self, t: int, frame: Frame, bound: SizeBound | None) -> None:
+    def limit_sizes(self, t: int, frame: Frame, bound: SizeBound | None) -> float:
         """Brings the trajectories of Gaussians that are larger than `bound` in `frame`, which is that at `t`, back to
-        it."""
+        it; returns by how much the largest was too large, as a natural log."""
         if bound is None:
-            return
+            return 0.0
         excess = (frame.params["log_scales"] - bound.log_scales(frame.params["means"])).clamp(min=0)
         large = torch.nonzero(excess.any(1))[:, 0].numpy()
         if len(large):
             at = self.at("log_scales", t)
             self.coefficients["log_scales"][:, large] -= (at / (at @ at))[:, None, None] * excess.numpy()[large]
+        return float(excess.max()) if len(excess) else 0.0
 
     def gradients(self, frame: Frame, grads: dict[str, torch.Tensor]) -> tuple[dict, dict, torch.Tensor]:
         """From the gradients by what is rendered: those by the residuals, attribute -> [N, C], 0 for Gaussians that are

@@ -26,6 +26,9 @@ from .motion_field import MotionField
 from .settings import FinetuneSettings, TrainSettings
 from .views import Target, Views, add_harmonics_prior, start_photometric_loss
 
+SIZE_PASSES = 8  # over the frames of a group, in which sizes come to their bound
+SIZE_EXCESS = 0.01  # natural log of a size over its bound, that is as good as none
+
 
 class _Finetuner:
     """State of one run; `step` is some views of one frame."""
@@ -85,11 +88,14 @@ class _Finetuner:
             self._step_canonical(canonical, decay)
 
     def limit_sizes(self) -> None:
-        """No Gaussian is larger than the views allow in any frame, up to what its temporal frequencies can say."""
-        if self.views.size_bound is None:
+        """No Gaussian is larger than the views allow in any frame, up to what its temporal frequencies can say. What
+        brings one frame to the bound may move another beyond it, so that all come again."""
+        group, backend, bound = self.group, self.views.backend, self.views.size_bound
+        if bound is None:
             return
-        for t in range(self.group.frames):
-            self.group.limit_sizes(t, self.group.frame(t, self.views.backend), self.views.size_bound)
+        for _ in range(SIZE_PASSES):
+            if max(group.limit_sizes(t, group.frame(t, backend), bound) for t in range(group.frames)) < SIZE_EXCESS:
+                return
 
     def _step_canonical(self, grads: dict[str, torch.Tensor], decay: float) -> None:
         """One step of the new canonical Gaussians along the gradients of the image and of the rate term, as that was at
