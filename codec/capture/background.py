@@ -26,6 +26,14 @@ RIM = 2  # pixels on each side, among which a pixel of the rim finds the colour 
 def background_of(pictures: Sequence[np.ndarray]) -> np.ndarray | None:
     """[3] f32 colour of the background that pictures of different cameras, [H, W, 3] u8, have in common; None: they
     have none, or show nothing else."""
+    color = border_color(pictures)
+    if color is None or not any((np.abs(p - color) > ALIKE).any() for p in pictures):
+        return None
+    return color
+
+
+def border_color(pictures: Sequence[np.ndarray]) -> np.ndarray | None:
+    """[3] f32 colour that the borders of pictures, [H, W, 3] u8, have in common; None: they have none."""
     borders = [np.concatenate([p[0], p[-1], p[:, 0], p[:, -1]]) for p in pictures]
     colors, counts = np.unique(np.concatenate(borders), axis=0, return_counts=True)
     color = colors[counts.argmax()].astype(np.float32)
@@ -35,9 +43,7 @@ def background_of(pictures: Sequence[np.ndarray]) -> np.ndarray | None:
         same, alike = (difference <= SAME).mean(), (difference <= ALIKE).mean()
         return bool(same >= max(BORDER_MIN, PURE_MIN * alike))
 
-    if np.mean([plain(b) for b in borders]) < PICTURES_MIN:
-        return None
-    return color if any((np.abs(p - color) > ALIKE).any() for p in pictures) else None
+    return color if np.mean([plain(b) for b in borders]) >= PICTURES_MIN else None
 
 
 def cut_out(rgb: np.ndarray, color: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -79,7 +79,7 @@ def make_masks(
 
 
 def _check(capture: Capture, plates: Path | None, overwrite: bool) -> None:
-    if any(f.has_alpha and not f.masks for f in capture.footage):
+    if any(f.subject_alone and f.background is None for f in capture.footage):
         raise UsageError(f"{capture.name}: its images have an alpha channel, which is their mask; none is to be made")
     there = next((m for f in capture.footage for m in (*f.masks, *f.mask_files) if m.is_file()), None)
     if there is not None and not overwrite:

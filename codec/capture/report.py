@@ -159,7 +159,7 @@ def _missing(capture: Capture, path: Path, facts: dict) -> list[str]:
     if facts["masks"] is None:
         more = "; seg/ is not read, copy it to masks/ to train only what it marks" if (root / "seg").is_dir() else ""
         out.append(f"no masks: whole pictures are trained (gscodec masks makes some){more}")
-    elif unmasked and facts["masks"] != "background":
+    elif unmasked:
         out.append(f"no masks of {', '.join(unmasked)}: their whole pictures are trained")
     start = "the visual hull" if facts["masks"] else "matched features and a plane sweep"
     start = "depth images" if facts["depth"] else start

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import CaptureError
 from ..model.camera import NEAR, Camera, meeting_point
-from .background import background_of, cut_out
+from .background import background_of, border_color, cut_out
 from .capture import Capture, differs, extent
 from .depth import DepthImages, along_axis
 from .images import SUFFIXES, View, image_size, read_image, read_mask
@@ -45,8 +45,8 @@ class Feed:
         path: of the video or the first image.
         masks: the mask file of each frame, empty where there are none.
         width, height: of the video or the first image; later images are checked against the camera.
-        has_alpha: views have an alpha channel, of their own or from masks; False drops their own.
-        background: [3] colour of what is no part of the subject, which is cut out; None: there are masks, or none.
+        has_alpha: views have an alpha channel, of their own, from masks or from the background; False drops their own.
+        background: [3] colour of what is no part of the subject, which is cut out; None: it is not.
 
     Raises:
         CaptureError: an image is missing or not readable, or only some frames have masks or depth images.
@@ -82,7 +82,7 @@ class Feed:
     @property
     def subject_alone(self) -> bool:
         """Whether nothing is known of what is behind the subject, since its own alpha or its background is the mask."""
-        return self.background is not None or (self.has_alpha and not self.masks)
+        return self.has_alpha and not self.masks
 
     @property
     def fps(self) -> float:
@@ -182,7 +182,7 @@ def assemble(
         return _at(pinholes[index], frame)
 
     _find_masks(feeds)
-    alpha = any(f.has_alpha or f.background is not None for f in feeds)
+    alpha = any(f.has_alpha for f in feeds)
     moving = any(len(track) > 1 for track in tracks)
     cameras = [track[0] for track in pinholes]
     fps, poses_of = fps or feeds[0].fps, poses if moving else None
@@ -200,7 +200,10 @@ def _find_masks(feeds: Sequence[Feed]) -> None:
     if any(f.has_alpha for f in feeds):
         return
     try:
-        color = background_of([f.picture(t).rgb for f in feeds for t in sorted({0, len(f) // 2})])
+        first = [f.picture(0).rgb for f in feeds]
+        if border_color(first) is None:  # of a room nothing else is read
+            return
+        color = background_of(first + [f.picture(len(f) // 2).rgb for f in feeds])
     except CaptureError:  # whoever needs the picture says so
         return
     if color is None:
@@ -211,7 +214,7 @@ def _find_masks(feeds: Sequence[Feed]) -> None:
         stacklevel=5,
     )
     for feed in feeds:
-        feed.background = color
+        feed.background, feed.has_alpha = color, True
 
 
 def _with_near(tracks: Sequence[Track]) -> list[Track]:
