@@ -201,7 +201,7 @@ def _ours(capture: Capture, frames: range, settings, encodings) -> Iterator[tupl
     if frames.step != 1:
         raise UsageError("gscodec follows what moves: it needs every frame, expected a range without a step")
     own = part(capture, frames)
-    groups, seconds_of_group = sequence(own, settings)
+    groups, seconds_of_group = sequence(own, settings, encodings[0].random_access)
     trained = sum(seconds_of_group)
     found = {"seconds_of_group": [round(s, 1) for s in seconds_of_group], "peak_gib": peak_gib()}
     yield "model", trained, None, shown(groups), found
@@ -257,12 +257,12 @@ def v3_coded(models: list[Gaussians]) -> tuple[int, list[Gaussians]]:
     return size, decoded
 
 
-def sequence(capture: Capture, settings) -> tuple[list[ParametricGroup], list[float]]:
-    """Trains the capture; returns the groups and the seconds of each."""
+def sequence(capture: Capture, settings, random_access: int = 0) -> tuple[list[ParametricGroup], list[float]]:
+    """Trains the capture (`random_access`: see `train_groups`); returns the groups and the seconds of each."""
     from gscodec.train.train import train_groups
 
     groups, seconds, start = [], [], time.perf_counter()
-    for group in train_groups(capture, settings):
+    for group in train_groups(capture, settings, random_access=random_access):
         groups.append(group)
         seconds.append(time.perf_counter() - start - sum(seconds))
     return groups, seconds
