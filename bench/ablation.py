@@ -6,8 +6,9 @@ per capture and variant, all from the same seed and preset; "another seed" says 
 is that of the model before coding, `psnr_coded` that of the decoded stream; both are measured on the test cameras, of
 the subject where there are masks. A variant is a change of the training settings, so that each entry can be repeated by
 any caller of the training; but for V3's recipe (`baselines/v3.py`), which has a hash grid for each frame and a packing
-of its own. What moves Gaussians is compared at equal time: a variant that is faster or slower than the whole recipe is
-trained again with more steps a frame, or fewer.
+of its own. What moves Gaussians is compared at equal time and bytes: a variant that is faster or slower than the whole
+recipe is trained again with more steps a frame, or fewer, and it is coded at three qualities, `curve`, on which
+`psnr_at_bytes` is where the whole recipe's bytes lie.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from gscodec.capture import Capture
 from gscodec.encode.settings import EncodeSettings
@@ -34,6 +37,7 @@ LUMBERJACK, STAGE, BASKETBALL, FAST, FEW = "lumberjack", "stage", "basketball", 
 FRAMES = {LUMBERJACK: (0, 10), STAGE: (7, 15), BASKETBALL: (0, 8), FAST: (0, 12), FEW: (0, 12)}  # the ball comes at 10
 EQUAL = 0.05  # share by which times may differ
 RUNS = 3  # until they do not, at most; the nearest one counts
+CURVE = (-5.0, 5.0)  # qualities besides, from the one that was asked for
 
 
 @dataclass(frozen=True)
@@ -42,29 +46,29 @@ class Trained:
 
     Attributes:
         models: Gaussians of each frame. groups: frames in each group. seconds: of training.
-        code: bytes and decoded frames of the stream.
+        code: bytes and decoded frames of the stream, of a quality.
     """
 
     models: list[Gaussians]
     groups: list[int]
     seconds: float
-    code: Callable[[], tuple[int, list[Gaussians]]]
+    code: Callable[[float], tuple[int, list[Gaussians]]]
 
 
-def ours(capture: Capture, settings: TrainSettings, quality: float) -> Trained:
+def ours(capture: Capture, settings: TrainSettings) -> Trained:
     """gscodec's training and coding."""
     groups, seconds = train.sequence(capture, settings)
-    code = lambda: train.coded(capture, groups, settings, EncodeSettings(quality))[:2]  # noqa: E731
+    code = lambda quality: train.coded(capture, groups, settings, EncodeSettings(quality))[:2]  # noqa: E731
     return Trained(train.shown(groups), [len(g) for g in groups], sum(seconds), code)
 
 
-def v3(capture: Capture, settings: TrainSettings, _: float) -> Trained:
+def v3(capture: Capture, settings: TrainSettings) -> Trained:
     """V3's, with the steps of a frame that the settings have."""
     from .baselines.v3 import train_v3
 
     steps, start = (settings.motion_steps, settings.finetune_steps), time.perf_counter()
     models = train_v3(capture, range(capture.frame_count), settings, steps)
-    return Trained(models, [len(models)], time.perf_counter() - start, lambda: train.v3_coded(models))
+    return Trained(models, [len(models)], time.perf_counter() - start, lambda _: train.v3_coded(models))
 
 
 @dataclass(frozen=True)
@@ -73,14 +77,15 @@ class Variant:
 
     Attributes:
         captures: those that use what it takes away.
-        equal_time: the steps of a frame are scaled until training takes as long as the whole recipe.
+        equal: compared at equal time and bytes: the steps of a frame are scaled until training takes as long as the
+            whole recipe, and the stream is coded at `CURVE`, too.
         recipe: what trains and codes.
     """
 
     change: Callable[[TrainSettings], TrainSettings]
     captures: tuple[str, ...] = (LUMBERJACK, STAGE)
-    equal_time: bool = False
-    recipe: Callable[[Capture, TrainSettings, float], Trained] = ours
+    equal: bool = False
+    recipe: Callable[[Capture, TrainSettings], Trained] = ours
 
 
 def run_with(**values) -> Callable[[TrainSettings], TrainSettings]:
@@ -96,23 +101,21 @@ def stage_with(stage: str, **values) -> Callable[[TrainSettings], TrainSettings]
 TRACKING = TrackingSettings()
 VARIANTS = {
     WHOLE: Variant(run_with(), tuple(FRAMES)),
-    "another seed": Variant(run_with(seed=1), tuple(FRAMES)),
+    "another seed": Variant(run_with(seed=1), tuple(FRAMES), equal=True),
     "no D-SSIM": Variant(run_with(ssim_lambda=0.0)),
     "no mask term": Variant(run_with(mask_lambda=0.0), (LUMBERJACK,)),
     "no rigidity": Variant(run_with(rigidity=0.0)),
-    "nodes alone": Variant(run_with(motion_field=MOTIONS["nodes"]), tuple(FRAMES), equal_time=True),
-    "nodes alone, another seed": Variant(
-        run_with(motion_field=MOTIONS["nodes"], seed=1), tuple(FRAMES), equal_time=True
-    ),
+    "nodes alone": Variant(run_with(motion_field=MOTIONS["nodes"]), tuple(FRAMES), equal=True),
+    "nodes alone, another seed": Variant(run_with(motion_field=MOTIONS["nodes"], seed=1), tuple(FRAMES), equal=True),
     "field alone": Variant(  # the nodes have no variables of their own
         lambda s: stage_with("finetune", node_rotation_rate=0.0, node_translation_rate=0.0)(
             stage_with("tracking", node_rotation_rate=0.0, node_translation_rate=0.0)(s)
         ),
         tuple(FRAMES),
-        equal_time=True,
+        equal=True,
     ),
     "V3's grid": Variant(  # steps of motion and of fine-tuning in the proportion of its public code
-        run_with(motion_steps=100, finetune_steps=250), tuple(FRAMES), equal_time=True, recipe=v3
+        run_with(motion_steps=100, finetune_steps=250), tuple(FRAMES), equal=True, recipe=v3
     ),
     "harmonics stay in the world": Variant(run_with(turned_harmonics=False), tuple(FRAMES)),
     "no rate term": Variant(run_with(rate_lambda=0.0)),
@@ -145,7 +148,8 @@ def run(
     """Yields the entries of each capture and puts them into the result file `out` as they come.
 
     Args:
-        names: variants; None: all that use the capture. The whole recipe is measured first, if one is at equal time.
+        names: variants; None: all that use the capture. The whole recipe is measured first, if one is compared at equal
+            time and bytes.
 
     Raises:
         UsageError: a capture is not in the data folder.
@@ -171,26 +175,30 @@ def _open(capture: str, data: Path | None) -> Capture:
 
 
 def _entries(capture: Capture, names: Sequence[str], preset: str, quality: float) -> Iterator[dict]:
-    whole = None  # seconds of the whole recipe
-    if any(VARIANTS[name].equal_time for name in names):
+    whole, kb = None, None  # seconds and bytes of the whole recipe
+    if any(VARIANTS[name].equal for name in names):
         names = [WHOLE, *(name for name in names if name != WHOLE)]
     for name in names:
         variant = VARIANTS[name]
         settings = variant.change(train_settings(preset, quality=quality))
-        settings, trained = _trained(capture, variant, settings, quality, whole if variant.equal_time else None)
-        whole = trained.seconds if name == WHOLE else whole
-        yield {"variant": name, "preset": preset, **_measured(capture, trained, settings, quality)}
+        settings, trained = _trained(capture, variant, settings, whole if variant.equal else None)
+        entry = {"variant": name, "preset": preset, **_measured(capture, trained, settings, quality)}
+        if name == WHOLE:
+            whole, kb = trained.seconds, entry["kb_per_frame"]
+        elif variant.equal and variant.recipe is ours:
+            entry |= _at_bytes(capture, trained, quality, entry, kb)
+        yield entry
 
 
 def _trained(
-    capture: Capture, variant: Variant, settings: TrainSettings, quality: float, seconds: float | None
+    capture: Capture, variant: Variant, settings: TrainSettings, seconds: float | None
 ) -> tuple[TrainSettings, Trained]:
     """Trained with the settings; of the runs with more or fewer steps a frame the one that takes about `seconds`. The
     keyframe's time does not depend on them: from the second run on, both are found from the last two."""
     runs, factor, before, earlier = [], 1.0, 0.0, 0.0
     while len(runs) < RUNS:
         scaled = _with_steps(settings, factor)
-        trained = variant.recipe(capture, scaled, quality)
+        trained = variant.recipe(capture, scaled)
         took = trained.seconds
         if seconds is None or abs(took / seconds - 1) <= EQUAL:
             return scaled, trained
@@ -208,13 +216,13 @@ def _with_steps(settings: TrainSettings, factor: float) -> TrainSettings:
 
 
 def _measured(capture: Capture, trained: Trained, settings: TrainSettings, quality: float) -> dict:
-    size, decoded = trained.code()
+    size, decoded = trained.code(quality)
     model, stream = (train.evaluate(capture, frames) for frames in (trained.models, decoded))
     return {
         "quality": quality,
         "frames": len(decoded),
-        "psnr": model["psnr_fg"] or model["psnr"],
-        "psnr_coded": stream["psnr_fg"] or stream["psnr"],
+        "psnr": _psnr(model),
+        "psnr_coded": _psnr(stream),
         "kb_per_frame": size / 1000 / len(decoded),
         "haze": stream["haze"],
         "flicker": stream["flicker"],
@@ -223,3 +231,21 @@ def _measured(capture: Capture, trained: Trained, settings: TrainSettings, quali
         "steps": [settings.motion_steps, settings.finetune_steps],
         "seconds_per_frame": round(trained.seconds / len(decoded), 2),
     }
+
+
+def _at_bytes(capture: Capture, trained: Trained, quality: float, entry: dict, kb: float) -> dict:
+    """kB/frame and PSNR at other qualities beside those of `entry`, and the PSNR at `kb` of the line through them over
+    the logarithm of bytes (its ends go on straight)."""
+    curve = [(entry["kb_per_frame"], entry["psnr_coded"])]
+    for step in CURVE:
+        size, decoded = trained.code(quality + step)
+        curve.append((size / 1000 / len(decoded), _psnr(train.evaluate(capture, decoded))))
+    curve.sort()
+    rates, psnr = np.log([r for r, _ in curve]), [p for _, p in curve]
+    i = int(np.clip(np.searchsorted(rates, math.log(kb)) - 1, 0, len(rates) - 2))
+    slope = (psnr[i + 1] - psnr[i]) / (rates[i + 1] - rates[i])
+    return {"curve": curve, "psnr_at_bytes": psnr[i] + slope * (math.log(kb) - rates[i])}
+
+
+def _psnr(result: dict) -> float:
+    return result["psnr_fg"] or result["psnr"]
