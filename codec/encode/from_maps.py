@@ -17,11 +17,10 @@ from ..bitstream.quantized_group import (
     QuantizedRig,
     QuantizedTrajectories,
 )
+from ..decode.maps import FORMAT, SOUND
 from ..errors import UsageError, require
 from .audio import AudioTrack, GroupSound
 from .writer import StreamWriter
-
-FORMAT, SOUND = "gscodec maps 2", "sound.bin"  # those of decode/maps.py
 
 
 def encode_maps(folder: Path, out: Path, audio: AudioTrack | None = None) -> tuple[int, int]:
