@@ -12,7 +12,7 @@ import typer
 
 from ..errors import UsageError
 from ..fingerprint import inputs, program
-from ..model.gaussians import GOP
+from ..model.gaussians import GOP, RANDOM_ACCESS
 from ..progress import Bar
 from .options import (
     PRESET,
@@ -55,7 +55,7 @@ def encode(
     frames: Frames = None,
     gop: Gop = GOP,
     keep_all: Annotated[bool, typer.Option("--keep-all", help="Keep Gaussians that nobody can see.")] = False,
-    random_access: RandomAccess = 60,
+    random_access: RandomAccess = RANDOM_ACCESS,
     layers: Annotated[
         int | None,
         typer.Option(help="Layers of importance; the first ones alone are a coarser picture.", show_default="auto"),

@@ -13,7 +13,7 @@ import typer
 from ..atomic_write import part_file
 from ..errors import require
 from ..fingerprint import inputs, program, sentence
-from ..model.gaussians import GOP
+from ..model.gaussians import GOP, RANDOM_ACCESS
 from ..progress import Bar
 from .inputs import open_frames
 from .options import PRESET, Frames, Gop, Motion, Preset, Quality, RandomAccess, RigPath, stdout
@@ -29,7 +29,7 @@ def train(
     motion: Motion = "field",
     frames: Frames = None,
     gop: Gop = GOP,
-    random_access: RandomAccess = 60,
+    random_access: RandomAccess = RANDOM_ACCESS,
     quality: Quality = None,
     rig: RigPath = None,
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ..errors import UsageError
+from ..model.gaussians import RANDOM_ACCESS
 from ..render.optimizer import AdamSettings
 
 LAYERS_MAX = 16  # spec 4
@@ -186,7 +187,7 @@ class EncodeSettings:
     quality: float | None = None
     bitrate: float | None = None
     keep_all: bool = False
-    random_access: int = 60
+    random_access: int = RANDOM_ACCESS
     layers: int | None = None
     refine: int | None = None
     doubt: float = 0.7

@@ -18,6 +18,7 @@ SH_C0 = 0.28209479177387814  # Y_00; colour = 0.5 + SH_C0 * sh0 (3D Gaussian Spl
 SH_COUNTS = {0: 0, 3: 1, 8: 2, 15: 3}  # K of shN -> SH degree
 OPACITY_LIMIT = 1e-6  # distance of opacities from 0 and 1
 GOP = 30  # frames of a group at most, unless told otherwise: a second
+RANDOM_ACCESS = 150  # frames from one independent group to the next at most: five seconds
 
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:
