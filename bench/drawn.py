@@ -18,7 +18,7 @@ from gscodec.atomic_write import part_file
 from gscodec.capture import Capture
 from gscodec.capture.images import read_image
 from gscodec.errors import UsageError
-from gscodec.model.camera import NEAR, Camera, look_at
+from gscodec.model.camera import NEAR, PIXEL_LOW_PASS, Camera, look_at
 from gscodec.model.gaussian_sequence import GaussianSequence
 from gscodec.render.image import render_rgba
 from gscodec.render.movie import up_vector
@@ -84,7 +84,8 @@ def draw(sequence: GaussianSequence, name: str, rig: Rig, folder: Path) -> Captu
         for i in missing:
             _write(file(i, t), render_rgba(shown, cameras[i]))
     read = lambda camera, t: read_image(file(camera, t))  # noqa: E731
-    return Capture(name, sequence.fps, cameras, sequence.frame_count, True, read)
+    capture = Capture(name, sequence.fps, cameras, sequence.frame_count, True, read)
+    return capture.with_low_pass(PIXEL_LOW_PASS)  # as of any other pictures
 
 
 def animated_capture(splat: Path, work: Path, frames: int, rig: Rig) -> Capture:

@@ -17,7 +17,7 @@ import numpy as np
 
 from gscodec.capture import Capture, View
 from gscodec.capture.background import background_of, cut_out
-from gscodec.model.camera import Camera, look_at
+from gscodec.model.camera import PIXEL_LOW_PASS, Camera, look_at
 
 SAMPLES = 3  # rays along each side of a pixel
 FOCAL = 1.9  # image widths
@@ -221,7 +221,8 @@ def _rig(train: int, test: int, size: int) -> list[Camera]:
     def camera(name: str, angle: float, z: float, split: str) -> Camera:
         across = np.sqrt(DISTANCE**2 - z**2)
         eye = np.array([across * np.cos(angle), across * np.sin(angle), z])
-        return Camera(name, K, look_at(eye, np.zeros(3), (0, 0, 1)), size, size, split=split)
+        viewmat = look_at(eye, np.zeros(3), (0, 0, 1))
+        return Camera(name, K, viewmat, size, size, split=split, low_pass=PIXEL_LOW_PASS)
 
     turn = 2 * np.pi / train
     cameras = [camera(f"cam{i:02}", i * turn, HEIGHTS[i % len(HEIGHTS)], "train") for i in range(train)]

@@ -26,7 +26,7 @@ from gscodec.encode.tracks import TrackPlan, write_tracks
 from gscodec.fit import fit_groups
 from gscodec.metrics.bd_rate import bd_rate
 from gscodec.metrics.evaluate import evaluate_capture, evaluate_splats
-from gscodec.model.camera import Camera, look_at
+from gscodec.model.camera import PIXEL_LOW_PASS, Camera, look_at
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.model.rig import Rig
 from gscodec.render.image import render_rgba
@@ -105,7 +105,7 @@ def capture_of(f: Figure) -> Capture:
         to_u8 = lambda x: np.rint(255 * np.clip(x, 0, 1)).astype(np.uint8)  # noqa: E731
         return View(to_u8(rgb), to_u8(rgba[..., 3]))
 
-    return Capture("figure", 12.5, cameras, f.sequence.frame_count, True, read)
+    return Capture("figure", 12.5, cameras, f.sequence.frame_count, True, read).with_low_pass(PIXEL_LOW_PASS)
 
 
 def training(work: Path) -> Iterator[dict]:

@@ -9,7 +9,7 @@ const clamp = (v, low, high) => Math.min(Math.max(v, low), high);
 
 const FIELD_OF_VIEW = (40 * Math.PI) / 180; // as `gscodec render`
 const PITCH_MAX = 1.5;
-const NEAR = 0.01; // spec 14
+const [NEAR, LOW_PASS] = [0.01, 0.3]; // spec 14
 
 export function upVector(axis) {
   const v = [0, 0, 0];
@@ -18,7 +18,10 @@ export function upVector(axis) {
 }
 
 // A view from `eye` for who packs all Gaussians: its direction and lens do not matter.
-export const viewFrom = ([x, y, z]) => new Float32Array([16, 16, 8, 8, 8, 8, 1, 0, 0, -x, 0, 1, 0, -y, 0, 0, 1, -z, NEAR]);
+export const viewFrom = ([x, y, z]) => new Float32Array([16, 16, 8, 8, 8, 8, 1, 0, 0, -x, 0, 1, 0, -y, 0, 0, 1, -z, NEAR, LOW_PASS]);
+
+// Low-pass of views from other places than the cameras of a config, px^2.
+export const lowPassOf = (cameras) => cameras[0]?.low_pass ?? LOW_PASS;
 
 export class Camera {
   // bounds: 1 to 99 % box of the first frame, 6 numbers; references: cameras of the config
@@ -31,6 +34,7 @@ export class Camera {
     this.side = [this.up[2], this.up[0], this.up[1]];
     this.ahead = cross(this.up, this.side);
     this.references = references;
+    this.lowPass = lowPassOf(references);
     this.nearest = Math.min(...references.map((c) => c.near), references.length ? Infinity : NEAR);
     this.reset();
   }
@@ -112,18 +116,18 @@ export class Camera {
     return this.center.map((v, i) => (this.up[i] ? (this.up[i] > 0 ? this.low : this.high)[i] : v));
   }
 
-  // width, height, fx, fy, cx, cy, 12 of world-to-camera, near: the input of the rasterizer.
+  // width, height, fx, fy, cx, cy, 12 of world-to-camera, near, low-pass: the input of the rasterizer.
   view(width, height) {
     const c = this.reference;
     if (c) {
       const s = Math.min(width / c.width, height / c.height);
       const [cx, cy] = [s * (c.k[2] - c.width / 2) + width / 2, s * (c.k[4] - c.height / 2) + height / 2];
-      return new Float32Array([width, height, s * c.k[0], s * c.k[3], cx, cy, ...c.viewmat, c.near]);
+      return new Float32Array([width, height, s * c.k[0], s * c.k[3], cx, cy, ...c.viewmat, c.near, c.low_pass]);
     }
     const f = Math.min(width, height) / 2 / this.tangent;
     const eye = add(this.target, this.#back(), this.distance);
     const rows = this.#axes().flatMap((axis) => [...axis, -dot(axis, eye)]);
     const near = Math.min(this.nearest, this.distance / 2);
-    return new Float32Array([width, height, f, f, width / 2, height / 2, ...rows, near]);
+    return new Float32Array([width, height, f, f, width / 2, height / 2, ...rows, near, this.lowPass]);
   }
 }

@@ -8,6 +8,7 @@
 // large group only the tiles in view are fetched and decoded, and others when the view comes to them (parts.js).
 
 import { AdaptiveSource } from "./abr.js";
+import { lowPassOf } from "./camera.js";
 import { ALL, AUTO, Native, load } from "./native.js";
 import { LayerChoice } from "./layers.js";
 import { Renderer } from "./renderer.js";
@@ -124,7 +125,8 @@ export class Engine extends EventTarget {
 
   // Who draws from now on: "cpu", "gpu", or "auto", the GPU if it is hardware. Rejects if the GPU cannot be used.
   use(how) {
-    return this.renderer.use(how, this.bounds, this.source.config.background);
+    const { background, cameras } = this.source.config;
+    return this.renderer.use(how, this.bounds, background, lowPassOf(cameras));
   }
 
   get gpu() {

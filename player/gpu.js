@@ -3,7 +3,6 @@
 
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i; // slower than the wasm rasterizer
 const ALPHA_MIN = 1 / 255;
-const LOW_PASS = 0.3;
 const AHEAD = 2; // metres from the viewer to a scene that stands on the floor
 const REACH = 20; // metres that a tap reaches
 const FAR = 1e6; // of the depth buffer, which nothing else uses
@@ -41,14 +40,14 @@ export class Gpu {
   #world;
   #head = null; // the camera of a session
 
-  // origin: middle of the scene, which packed Gaussians are relative to; background: 3 numbers
-  static async create(canvas, { origin, background }) {
+  // origin: middle of the scene, which packed Gaussians are relative to; background: 3 numbers; lowPass: px^2
+  static async create(canvas, { origin, background, lowPass }) {
     const spark = await import("./spark.js");
     if (!canvas.getContext("webgl2", { antialias: false, alpha: false })) throw new Error("this browser has no WebGL2 here");
-    return new Gpu(spark, canvas, origin, background);
+    return new Gpu(spark, canvas, origin, background, lowPass);
   }
 
-  constructor(spark, canvas, origin, background) {
+  constructor(spark, canvas, origin, background, lowPass) {
     this.#spark = spark;
     spark.ColorManagement.enabled = false; // colours are blended as they are
     this.#renderer = new spark.WebGLRenderer({ canvas, antialias: false, alpha: false });
@@ -60,7 +59,7 @@ export class Gpu {
     this.#sorter = new spark.SparkRenderer({
       renderer: this.#renderer,
       autoUpdate: false,
-      preBlurAmount: LOW_PASS, // without compensation of the opacity
+      preBlurAmount: lowPass, // without compensation of the opacity
       blurAmount: 0,
       minAlpha: ALPHA_MIN,
       maxStdDev: Math.sqrt(-2 * Math.log(ALPHA_MIN)),
@@ -149,7 +148,7 @@ export class Gpu {
   // A pinhole camera with OpenCV axes -> OpenGL.
   #look(view) {
     const [w, h, fx, fy, cx, cy] = view;
-    const near = view.at(-1);
+    const near = view[18];
     const { projectionMatrix, projectionMatrixInverse, matrix } = this.#camera;
     const depth = [-(FAR + near) / (FAR - near), (-2 * FAR * near) / (FAR - near)];
     projectionMatrix.set((2 * fx) / w, 0, 1 - (2 * cx) / w, 0, 0, (2 * fy) / h, (2 * cy) / h - 1, 0, 0, 0, ...depth, 0, 0, -1, 0);

@@ -143,7 +143,7 @@ export class Native {
 
   // Image
 
-  // view: 19 floats, see wasm.rs; ends: of bands for which others project, too, see `divide`. Calls take(band) for each band;
+  // view: 20 floats, see wasm.rs; ends: of bands for which others project, too, see `divide`. Calls take(band) for each band;
   // `splats` is a view into the memory of the instance. Returns the number of bands, and the load of each row of tiles.
   project(view, count, take, ends = []) {
     this.#floats(view, ends);

@@ -25,8 +25,8 @@ export class Renderer {
     this.#leaveGpu();
   }
 
-  // See Engine.use. `bounds`: box of the scene, 6 numbers.
-  async use(how, bounds, background) {
+  // See Engine.use. `bounds`: box of the scene, 6 numbers; `lowPass`: px^2.
+  async use(how, bounds, background, lowPass) {
     this.#how = how;
     if (how === "cpu") return this.#leaveGpu();
     const { Gpu, gpuName } = await import("./gpu.js"); // after the first picture
@@ -36,7 +36,7 @@ export class Renderer {
     canvas.hidden = true;
     const [low, high] = [bounds.slice(0, 3), bounds.slice(3)];
     const origin = low.map((v, i) => (v + high[i]) / 2);
-    const gpu = await Gpu.create(canvas, { origin, background });
+    const gpu = await Gpu.create(canvas, { origin, background, lowPass });
     if (this.#closed || this.gpu || this.#how !== how) return gpu.close();
     this.canvas.after(canvas);
     canvas.addEventListener("webglcontextlost", () => this.#loseGpu("its context was lost"));

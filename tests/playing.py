@@ -173,9 +173,9 @@ def screenshot(browser, element: str) -> np.ndarray:
 
 
 def camera_of(view: list[float]) -> Camera:
-    w, h, fx, fy, cx, cy, *m, near = view
+    w, h, fx, fy, cx, cy, *m, near, low_pass = view
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return Camera("view", K, np.array([*m, 0, 0, 0, 1.0]).reshape(4, 4), int(w), int(h), near=near)
+    return Camera("view", K, np.array([*m, 0, 0, 0, 1.0]).reshape(4, 4), int(w), int(h), near=near, low_pass=low_pass)
 
 
 def show(browser, t: int) -> Camera:

@@ -13,7 +13,7 @@ import pytest
 from gscodec.capture import View, find_capture, open_capture
 from gscodec.capture.undistort import Undistortion
 from gscodec.errors import CaptureError, UsageError, require
-from gscodec.model.camera import Camera, look_at
+from gscodec.model.camera import PIXEL_LOW_PASS, Camera, look_at
 
 W, H = 24, 16
 GL = np.diag([1.0, -1, -1, 1])
@@ -98,6 +98,7 @@ def test_near_plane_is_the_files_or_a_share_of_the_distance(rig):
     data["near"] = 0.5
     data["frames"][0]["near"] = 0.25
     assert sorted({c.near for c in save().cameras}) == [0.25, 0.5]
+    assert {c.low_pass for c in save().cameras} == {PIXEL_LOW_PASS}
 
 
 def test_frame_range_and_scale(rig):

@@ -206,7 +206,7 @@ def test_a_three_js_scene_shows_it(gl_browser, address, app):
             view = view @ np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
         view = np.diag([1.0, -1, -1, 1]) @ view  # OpenGL -> OpenCV
         focal = 75 / np.tan(np.radians(22.5))
-        camera = camera_of([200, 150, focal, focal, 100, 75, *view[:3].ravel(), 0.01])
+        camera = camera_of([200, 150, focal, focal, 100, 75, *view[:3].ravel(), 0.01, 0.3])
         want = render_image(stream.frame(8), camera, tuple(stream.config["background"]))
         assert want.std() > 10
         assert scene_comes_to(gl_browser, want), upright
@@ -253,7 +253,7 @@ def test_a_playcanvas_scene_shows_it(gl_browser, address, app):
     view = np.array(gl_browser.eval(PLAYCANVAS)).reshape(4, 4).T
     view = np.diag([1.0, -1, -1, 1]) @ view
     focal = 75 / np.tan(np.radians(22.5))
-    camera = camera_of([200, 150, focal, focal, 100, 75, *view[:3].ravel(), 0.01])
+    camera = camera_of([200, 150, focal, focal, 100, 75, *view[:3].ravel(), 0.01, 0.3])
     want = render_image(stream.frame(8), camera, tuple(stream.config["background"]))
     assert want.std() > 10
     assert scene_comes_to(gl_browser, want)

@@ -308,7 +308,7 @@ def test_simd_draws_what_scalar_draws(browser, server):
     body = """
         native.decode(0, payload(groups[1]), config.level);
         native.frame(0, 1);
-        const view = new Float32Array([200, 150, 240, 240, 100, 75, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 3, 0.01]);
+        const view = new Float32Array([200, 150, 240, 240, 100, 75, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 3, 0.01, 0.3]);
         const pictures = [];
         for (let level = 0; native.x.use_level(level); level++) {
             let splats;

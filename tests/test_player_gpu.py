@@ -151,7 +151,7 @@ def test_augmented_reality_stands_on_the_floor_and_goes_where_one_taps(on_gpu, g
         want = []
         for eye in (-0.03, 0.03):
             moved = flip @ np.array([x - eye, 0, z]) * radius - turn @ np.array(foot)  # a scene becomes 2 m high
-            view = [200, 200, 200, 200, 100, 100, *np.c_[turn, moved].ravel(), 0.01]
+            view = [200, 200, 200, 200, 100, 100, *np.c_[turn, moved].ravel(), 0.01, 0.3]
             want.append(render_image(stream.frame(2), camera_of(view), (0, 0, 0)))
         return np.concatenate(want, 1)
 

@@ -107,7 +107,7 @@ def open_partly(browser, server, url: str) -> None:
 def compare(browser, stream, t: int, camera: Camera) -> int:
     """Compares a picture by `camera` with that of the whole group, once all is there; Gaussians that were decoded."""
     k = [camera.K[i] for i in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2))]
-    c = {"width": camera.width, "height": camera.height, "near": 0.01, "k": k}
+    c = {"width": camera.width, "height": camera.height, "near": 0.01, "low_pass": 0.3, "k": k}
     c |= {"viewmat": camera.viewmat[:3].flatten().tolist()}
     browser.eval(f"{PLAYER}.camera.reference = {json.dumps(c)}")
     show(browser, t)

@@ -114,6 +114,10 @@ class Capture:
         cameras = [self.camera(i, a) for i in range(len(self.cameras))]
         return replace(self, cameras=cameras, first_frame=self.first_frame + a, frame_count=b - a)
 
+    def with_low_pass(self, low_pass: float) -> Capture:
+        """The capture for Gaussians that are drawn with another low-pass, px^2."""
+        return replace(self, cameras=[replace(c, low_pass=low_pass) for c in self.cameras])
+
     def scaled(self, scale: float) -> Capture:
         """The capture with images `scale` times the size (area filter), at least 1 pixel.
 

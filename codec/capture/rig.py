@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import CaptureError
-from ..model.camera import NEAR, Camera, meeting_point
+from ..model.camera import NEAR, PIXEL_LOW_PASS, Camera, meeting_point
 from .background import background_of, border_color, cut_out
 from .capture import Capture, differs, extent
 from .depth import DepthImages, along_axis
@@ -162,7 +162,7 @@ def assemble(
         CaptureError: the feeds have no frames.
     """
     tracks, feeds, frame_count = _same_length(tracks, feeds)
-    tracks = _with_near(_still(tracks))
+    tracks = _as_drawn(_still(tracks))
     lenses = [Undistortion() for _ in tracks]
     pinholes = [[lens.camera(c) for c in track] for lens, track in zip(lenses, tracks, strict=True)]
 
@@ -217,13 +217,14 @@ def _find_masks(feeds: Sequence[Feed]) -> None:
         feed.background, feed.has_alpha = color, True
 
 
-def _with_near(tracks: Sequence[Track]) -> list[Track]:
-    """Near planes where the layout says nothing: at `NEAR_SHARE` of the depth at which the optical axes meet."""
+def _as_drawn(tracks: Sequence[Track]) -> list[Track]:
+    """With the low-pass of pictures, and near planes where the layout says nothing: at `NEAR_SHARE` of the depth at
+    which the optical axes meet."""
     meeting, out = meeting_point([track[0] for track in tracks]), []
     for track in tracks:
         depth = float(track[0].viewmat[2] @ [*meeting, 1])
         near = NEAR_SHARE * depth if track[0].near == NEAR and depth > 0 else track[0].near
-        out.append([replace(c, near=near) for c in track])
+        out.append([replace(c, near=near, low_pass=PIXEL_LOW_PASS) for c in track])
     return out
 
 

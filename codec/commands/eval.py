@@ -50,6 +50,7 @@ def evaluate_stream(
     from ..decode import Scene, open_stream
     from ..decode.report import describe
     from ..metrics.evaluate import evaluate_capture, evaluate_splats
+    from ..model.camera import low_pass_of
     from ..splats import detect_input, open_sequence
 
     whole = open_stream_of_frames(stream_path, tracks)
@@ -66,7 +67,8 @@ def evaluate_stream(
         if splats:
             options["stream_frames"] = whole.frame_count
             return evaluate_splats(stream.frame, reference, frames=chosen, **options)
-        return evaluate_capture(stream.frame, reference.frames(chosen.start, chosen.stop), split=split, **options)
+        capture = reference.frames(chosen.start, chosen.stop).with_low_pass(low_pass_of(whole.cameras))
+        return evaluate_capture(stream.frame, capture, split=split, **options)
 
     result = measure(whole, whole.byte_count)
     if isinstance(whole, Scene):  # its tracks have layers of their own

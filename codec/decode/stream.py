@@ -93,7 +93,15 @@ class Stream:
     def cameras(self) -> list[Camera]:
         """Reference cameras of the capture."""
         return [
-            Camera(c["name"], np.array(c["K"]), np.array(c["viewmat"]), c["width"], c["height"], near=c["near"])
+            Camera(
+                c["name"],
+                np.array(c["K"]),
+                np.array(c["viewmat"]),
+                c["width"],
+                c["height"],
+                near=c["near"],
+                low_pass=c["low_pass"],
+            )
             for c in self.config["cameras"]
         ]
 

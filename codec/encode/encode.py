@@ -89,6 +89,7 @@ def stream_config(
                 "K": np.asarray(c.K, float).tolist(),
                 "viewmat": np.asarray(c.viewmat, float).tolist(),
                 "near": float(c.near),
+                "low_pass": float(c.low_pass),
                 "width": c.width,
                 "height": c.height,
             }

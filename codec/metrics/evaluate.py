@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 
 import numpy as np
 
 from ..capture import Capture, View, composite
 from ..errors import UsageError
-from ..model.camera import Camera
+from ..model.camera import Camera, low_pass_of
 from ..model.gaussian_sequence import GaussianSequence
 from ..model.gaussians import Gaussians
 from .codec_cameras import codec_cameras
@@ -160,6 +161,7 @@ def evaluate_splats(
     if outside or not picked:
         raise UsageError(f"frames {outside or 'none'} to evaluate, the sequence has 0 to {sequence.frame_count - 1}")
     cameras = codec_cameras([sequence.frame(t) for t in sorted({picked[0], picked[len(picked) // 2], picked[-1]})])
+    cameras = [replace(c, low_pass=low_pass_of(sequence.cameras)) for c in cameras]
     rows, counts, given = [], [], []
     for i, t in enumerate(picked):
         reference, decoded = sequence.frame(t), frame_source(t)

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 NEAR = 0.01  # world units, near plane of a camera of which nothing is known (spec 14)
+LOW_PASS = 0.3  # px^2, of splats of other tools: 3D Gaussian Splatting (spec 14)
+PIXEL_LOW_PASS = 0.1  # px^2, of pictures: a pixel is a box, whose variance is 1/12 (Mip-Splatting has the same)
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,7 @@ class Camera:
         split: "train", "val" or "test".
         near: near plane, world units: Gaussians whose centre is nearer are not drawn. A reader of captures leaves
             `NEAR` where its layout says nothing; `Capture` then puts it at a share of the distance to the scene.
+        low_pass: variance of the low-pass with which Gaussians are drawn, px^2 (spec 14).
     """
 
     name: str
@@ -37,6 +40,7 @@ class Camera:
     split: str = "train"
     near: float = NEAR
     fisheye: bool = False
+    low_pass: float = LOW_PASS
 
     @property
     def center(self) -> np.ndarray:
@@ -86,6 +90,11 @@ class Calibration:
     def camera(self, camera: Camera, index: int) -> Camera:
         """`camera`, which is camera `index` of the capture in any frame or a crop of it, with the true viewmat."""
         return replace(camera, viewmat=camera.viewmat @ self.corrections[index])
+
+
+def low_pass_of(cameras: Sequence[Camera]) -> float:
+    """Low-pass of what is drawn from other places than these cameras of a stream, a sequence or a capture, px^2."""
+    return cameras[0].low_pass if cameras else LOW_PASS
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:

@@ -6,12 +6,13 @@ import json
 import os
 import subprocess
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import UsageError, require
-from ..model.camera import NEAR, Camera, look_at
+from ..model.camera import NEAR, Camera, look_at, low_pass_of
 from ..model.gaussians import Gaussians
 from .image import render_image
 from .png import write_png
@@ -65,19 +66,20 @@ def camera_path(stream, camera: str, size: str | None, frames: range) -> Iterato
     Raises:
         UsageError: the camera or the size makes no sense.
     """
-    wanted = parse_size(size)
+    wanted, low_pass = parse_size(size), low_pass_of(stream.cameras)
     if camera == "orbit":
         width, height = wanted or (512, 512)
         first, near = stream.frame(frames[0]), min((c.near for c in stream.cameras), default=NEAR)
         for t in frames:
             turn = t / (stream.fps * ORBIT_SECONDS)
-            yield orbit_camera(first, stream.config["up"], turn, width, height, near)
+            orbit = orbit_camera(first, stream.config["up"], turn, width, height, near)
+            yield replace(orbit, low_pass=low_pass)
         return
     known = {c.name: c for c in stream.cameras}
     if camera in known:
         fixed = known[camera]
     elif camera.endswith(".json"):
-        fixed = load_camera(Path(camera))
+        fixed = replace(load_camera(Path(camera)), low_pass=low_pass)
     else:
         names = ", ".join(known) or "none in this file"
         raise UsageError(

@@ -12,7 +12,6 @@ import torch
 from ..model.camera import Camera
 
 # The normative constants; the same as in native/raster/src/constants.rs.
-LOW_PASS = 0.3  # px^2
 FOV_MARGIN = 0.3  # of half the field of view
 ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.999
@@ -59,7 +58,7 @@ def project(means, quats, log_scales, camera: Camera):
     J[:, :, 2] = -focal * slope / z[:, None]
     M = rotation_matrices(quats) * log_scales.exp()[:, None]
     T = J @ R @ M
-    cov = T @ T.transpose(1, 2) + LOW_PASS * torch.eye(2, dtype=means.dtype)
+    cov = T @ T.transpose(1, 2) + camera.low_pass * torch.eye(2, dtype=means.dtype)
     return p[:, :2] / z[:, None] * focal + center, torch.linalg.inv(cov), z
 
 

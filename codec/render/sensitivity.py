@@ -19,7 +19,7 @@ from ..bitstream.channels import channel_values
 from ..bitstream.color import STEP_WEIGHTS, TO_RGB
 from ..bitstream.quantization import Steps, error_for, subject_radius
 from ..model.attributes import BY_NAME
-from ..model.camera import Camera, cameras_around
+from ..model.camera import Camera, cameras_around, low_pass_of
 from ..model.gaussians import PARAMETERS, SH_C0, Gaussians
 from .backend import TURNS, Backend
 from .cpu import CpuBackend
@@ -76,7 +76,8 @@ def sensitivity_cameras(means: np.ndarray, given: list[Camera] = (), count: int 
     """
     taken = [given[i] for i in np.linspace(0, len(given) - 1, min(len(given), count // 2)).round().astype(int)]
     fitted = [of_width(c, SIZE) for c in taken]
-    return fitted + cameras_around(means, count - len(taken), name="sensitivity", turn=1.3)
+    others = cameras_around(means, count - len(taken), name="sensitivity", turn=1.3)
+    return fitted + [replace(c, low_pass=low_pass_of(given)) for c in others]
 
 
 def of_width(camera: Camera, width: int) -> Camera:

@@ -100,6 +100,7 @@ def view(camera: Camera) -> dict:
         "intrinsics": [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
         "viewmat": m[:3].tolist(),
         "near": float(camera.near),
+        "low_pass": float(camera.low_pass),
     }
 
 

@@ -23,7 +23,7 @@ from ..capture.detect import LOOKED_FOR, find_capture
 from ..capture.images import SUFFIXES as PICTURES
 from ..capture.rig import VIDEOS
 from ..errors import CaptureError, UsageError
-from ..model.camera import NEAR, Camera
+from ..model.camera import LOW_PASS, NEAR, Camera
 from ..model.gaussian_sequence import DenseGroup, GaussianSequence
 from ..model.gaussians import GOP
 from ..model.parametric_group import ParametricGroup
@@ -258,4 +258,5 @@ def _camera(c: dict) -> Camera:
         int(c["height"]),
         split=str(c.get("split", "train")),
         near=float(c.get("near", NEAR)),
+        low_pass=float(c.get("low_pass", LOW_PASS)),
     )

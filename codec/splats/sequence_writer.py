@@ -110,5 +110,6 @@ def _camera(c: Camera) -> dict:
         "K": c.K.tolist(),
         "viewmat": c.viewmat.tolist(),
         "near": c.near,
+        "low_pass": c.low_pass,
         "split": c.split,
     }

@@ -28,6 +28,8 @@ export interface ReferenceCamera {
   viewmat: number[];
   /** Nothing nearer than this is drawn. */
   near: number;
+  /** Variance of the low-pass with which pictures are drawn, pixels^2. */
+  low_pass: number;
 }
 
 export interface Config {
@@ -43,8 +45,8 @@ export interface Config {
 }
 
 /**
- * 19 numbers: width, height, fx, fy, cx, cy in pixels; the 12 of world to camera, [3, 4] row by row, axes x right, y down,
- * z ahead; near plane.
+ * 20 numbers: width, height, fx, fy, cx, cy in pixels; the 12 of world to camera, [3, 4] row by row, axes x right, y down,
+ * z ahead; near plane; low-pass.
  */
 export type View = Float32Array;
 

@@ -80,7 +80,7 @@ fn gradients<'a>(g: &'a mut Grads) -> PyResult<Gradients<'a>> {
     })
 }
 
-/// size, (fx, fy, cx, cy), rows of the world-to-camera matrix and near plane.
+/// size, (fx, fy, cx, cy), rows of the world-to-camera matrix, near plane and low-pass.
 #[derive(FromPyObject)]
 struct ViewArgs {
     #[pyo3(item)]
@@ -91,6 +91,8 @@ struct ViewArgs {
     viewmat: [[f32; 4]; 3],
     #[pyo3(item)]
     near: f32,
+    #[pyo3(item)]
+    low_pass: f32,
 }
 
 impl ViewArgs {
@@ -105,6 +107,7 @@ impl ViewArgs {
             rotation: std::array::from_fn(|i| [m[i][0], m[i][1], m[i][2]]),
             translation: [m[0][3], m[1][3], m[2][3]],
             near: self.near,
+            low_pass: self.low_pass,
         }
     }
 }

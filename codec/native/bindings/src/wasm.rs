@@ -142,7 +142,7 @@ pub extern "C" fn attribute(which: usize) {
     with(|p| p.attribute(which));
 }
 
-/// Projects the evaluated frame. Input: 19 f32: width, height, fx, fy, cx, cy, 12 of world-to-camera, near plane; then the ends of
+/// Projects the evaluated frame. Input: 20 f32: width, height, fx, fy, cx, cy, 12 of world-to-camera, near plane, low-pass; then the ends of
 /// the bands as `divide` gives them, or nothing. Returns the number of bands, at most `bands`, or 0. Output: the load of each row of
 /// tiles.
 #[unsafe(no_mangle)]

@@ -22,6 +22,7 @@ fn config() -> Config {
         k: [1.0; 5],
         viewmat: [0.5; 12],
         near: 0.5,
+        low_pass: 0.1,
     };
     Config {
         timescale: 30_000,

@@ -149,6 +149,7 @@ mod tests {
             rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
             translation: [0.0; 3],
             near: crate::constants::NEAR,
+            low_pass: crate::constants::LOW_PASS,
         }
     }
 

@@ -1,7 +1,7 @@
 //! The constants of rendering. They are normative (the bitstream specification repeats them), because two players that
 //! differ here show different pictures. Everything else in this crate is free to change.
 
-/// Added to the diagonal of the 2-D covariance, px^2 (the low-pass of 3D Gaussian Splatting).
+/// Low-pass of a view that names none, px^2: added to the diagonal of the 2-D covariance (3D Gaussian Splatting).
 pub const LOW_PASS: f32 = 0.3;
 /// x/z and y/z inside the Jacobian are clamped to the image edge plus this share of half the field of view (1.3x in all).
 pub const FOV_MARGIN: f32 = 0.3;

@@ -18,6 +18,7 @@ pub enum RasterError {
         limit: usize,
     },
     Near,
+    LowPass,
     NothingRendered,
 }
 
@@ -28,6 +29,7 @@ impl fmt::Display for RasterError {
             RasterError::Empty(size) => write!(f, "an image of {} x {} pixels is empty", size.width, size.height),
             RasterError::TooMany { what, limit } => write!(f, "more than {limit} {what}"),
             RasterError::Near => f.write_str("the near plane is not in front of the camera"),
+            RasterError::LowPass => f.write_str("the low-pass of the view is not above 0"),
             RasterError::NothingRendered => {
                 write!(f, "backward without a forward pass of these Gaussians and this view")
             }

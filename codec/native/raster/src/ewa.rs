@@ -4,7 +4,7 @@
 //! storing them. The covariance is M M^T with M = J W R S (2x3): positive semi-definite by construction, and its determinant
 //! follows from the cross product of the rows (Cauchy-Binet) without the cancellation of ac - b^2.
 
-use crate::constants::{FOV_MARGIN, LOW_PASS};
+use crate::constants::FOV_MARGIN;
 use crate::scene::View;
 use crate::sh;
 use crate::simd::{Vector, c};
@@ -24,6 +24,7 @@ pub struct Lens {
     pub slope_max: [f32; 2],
     pub size: [f32; 2],
     pub near: f32,
+    pub low_pass: f32,
 }
 
 impl Lens {
@@ -40,6 +41,7 @@ impl Lens {
             slope_max: std::array::from_fn(|i| (size[i] - view.center[i]) / view.focal[i] + margin(i)),
             size,
             near: view.near,
+            low_pass: view.low_pass,
         }
     }
 }
@@ -126,7 +128,7 @@ pub fn ewa<V: Vector>(soa: &Soa, lens: &Lens, at: usize) -> Ewa<V> {
             m[i][j] = dot3(jw[i], [rot[0][j], rot[1][j], rot[2][j]]) * scale[j];
         }
     }
-    let low = c::<V>(LOW_PASS);
+    let low = c::<V>(lens.low_pass);
     let (xx, xy, yy) = (dot3(m[0], m[0]), dot3(m[0], m[1]), dot3(m[1], m[1]));
     let [a, b] = m;
     let cross = [

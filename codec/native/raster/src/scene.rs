@@ -145,15 +145,19 @@ pub struct View {
     pub center: [f32; 2],
     pub rotation: [[f32; 3]; 3], // world to camera
     pub translation: [f32; 3],
-    pub near: f32, // world units; Gaussians whose centre is nearer are not drawn
+    pub near: f32,     // world units; Gaussians whose centre is nearer are not drawn
+    pub low_pass: f32, // px^2, added to the diagonal of the 2-D covariance
 }
 
 impl View {
     /// # Errors
-    /// An empty or too large image; a near plane that is not in front.
+    /// An empty or too large image; a near plane that is not in front; a low-pass that is not above 0.
     pub fn check(&self) -> Result<(), RasterError> {
         if !(self.near > 0.0 && self.near.is_finite()) {
             return Err(RasterError::Near);
+        }
+        if !(self.low_pass > 0.0 && self.low_pass.is_finite()) {
+            return Err(RasterError::LowPass);
         }
         check_size(self.size)
     }

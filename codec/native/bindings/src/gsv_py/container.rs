@@ -3,7 +3,7 @@
 use super::placement::{placement_from, placement_into};
 use super::values::{bytes_of, invalid, item, optional, raise, value};
 use gsv::container::audio::AudioTrack;
-use gsv::container::config::{COLOR_SPACES, Camera, Config, NEAR, UP_AXES, rate};
+use gsv::container::config::{COLOR_SPACES, Camera, Config, LOW_PASS, NEAR, UP_AXES, rate};
 use gsv::container::demux::Demuxer;
 use gsv::container::whole;
 use gsv::container::write::{self, Reference, Sound};
@@ -89,6 +89,7 @@ fn camera_from(d: &Bound<PyDict>) -> PyResult<Camera> {
         k: [k[0], k[1], k[2], k[4], k[5]].map(|v| v as f32),
         viewmat: std::array::from_fn(|i| v[i] as f32),
         near: optional(d, "near")?.map_or(Ok(NEAR), |v| v.extract())?,
+        low_pass: optional(d, "low_pass")?.map_or(Ok(LOW_PASS), |v| v.extract())?,
     })
 }
 
@@ -117,6 +118,7 @@ fn config_into<'py>(py: Python<'py>, c: &Config) -> PyResult<Bound<'py, PyDict>>
         )?;
         one.set_item("viewmat", v.into_pyarray(py).reshape([4, 4])?)?;
         one.set_item("near", f64::from(c.near))?;
+        one.set_item("low_pass", f64::from(c.low_pass))?;
         one.set_item("width", c.width)?;
         one.set_item("height", c.height)?;
         cameras.append(one)?;

@@ -358,7 +358,7 @@ fn by_layer(wanted: &[u8], h: &Header) -> Vec<Vec<bool>> {
 }
 
 /// Numbers of a view.
-const VIEW: usize = 19;
+const VIEW: usize = 20;
 
 /// A view from its first numbers; missing ones are 0, which the rasterizer refuses.
 fn view(numbers: &[f32]) -> View {
@@ -373,5 +373,6 @@ fn view(numbers: &[f32]) -> View {
         rotation: std::array::from_fn(|i| std::array::from_fn(|j| m(i, j))),
         translation: std::array::from_fn(|i| m(i, 3)),
         near: v[18],
+        low_pass: v[19],
     }
 }

@@ -112,13 +112,14 @@ fn run(r: &AudioRun) -> String {
 
 fn camera(c: &Camera) -> String {
     format!(
-        r#"{{"name":{},"width":{},"height":{},"k":{},"viewmat":{},"near":{}}}"#,
+        r#"{{"name":{},"width":{},"height":{},"k":{},"viewmat":{},"near":{},"low_pass":{}}}"#,
         string(&c.name),
         c.width,
         c.height,
         list(c.k.iter(), f32::to_string),
         list(c.viewmat.iter(), f32::to_string),
         c.near,
+        c.low_pass,
     )
 }
 

@@ -12,6 +12,8 @@ pub const UP_AXES: [&str; 6] = ["x", "y", "z", "-x", "-y", "-z"];
 pub const COLOR_SPACES: [&str; 1] = ["srgb"];
 /// Near plane of a camera of a file that names none, world units.
 pub const NEAR: f32 = 0.01;
+/// Low-pass of a camera of a file that names none, px^2: that of 3D Gaussian Splatting.
+pub const LOW_PASS: f32 = 0.3;
 
 /// A reference camera: OpenCV axes, pixel centres at half-integers.
 #[derive(Debug, Clone, PartialEq)]
@@ -25,6 +27,8 @@ pub struct Camera {
     pub viewmat: [f32; 12],
     /// Gaussians whose centre is nearer than this are not drawn, world units.
     pub near: f32,
+    /// Variance of the low-pass with which pictures are drawn, px^2.
+    pub low_pass: f32,
 }
 
 impl Default for Camera {
@@ -36,6 +40,7 @@ impl Default for Camera {
             k: [0.0; 5],
             viewmat: [0.0; 12],
             near: NEAR,
+            low_pass: LOW_PASS,
         }
     }
 }
@@ -116,6 +121,11 @@ impl Config {
                 f.step(&mut c.near, "near")?;
             }
         }
+        if f.more() {
+            for c in &mut self.cameras {
+                f.step(&mut c.low_pass, "low_pass")?;
+            }
+        }
         Ok(())
     }
 }
@@ -161,11 +171,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn near_planes_may_be_missing() {
+    fn near_planes_and_low_passes_may_be_missing() {
         let camera = Camera {
             width: 1,
             height: 1,
             near: 0.75,
+            low_pass: 0.1,
             ..Camera::default()
         };
         let config = Config {
@@ -178,8 +189,10 @@ mod tests {
         };
         let body = config.write().unwrap();
         assert_eq!(Config::read(&body, 30).unwrap(), config);
-        let older = Config::read(&body[..body.len() - 8], 30).unwrap();
-        assert!(older.cameras.iter().all(|c| c.near == NEAR));
-        assert!(Config::read(&body[..body.len() - 4], 30).is_err());
+        let cut = |bytes: usize| Config::read(&body[..body.len() - bytes], 30);
+        let [draft_12, older] = [8, 16].map(|bytes| cut(bytes).unwrap().cameras);
+        assert!(draft_12.iter().all(|c| (c.near, c.low_pass) == (0.75, LOW_PASS)));
+        assert!(older.iter().all(|c| (c.near, c.low_pass) == (NEAR, LOW_PASS)));
+        assert!(cut(4).is_err() && cut(12).is_err());
     }
 }

@@ -34,6 +34,7 @@ fn draw_at(level: SimdLevel, n: usize, log_scale: f32, size: usize, training: bo
         rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
         translation: [0.0; 3],
         near: crate::constants::NEAR,
+        low_pass: crate::constants::LOW_PASS,
     };
     let mut r = Rasterizer::new(level, 0);
     r.forward(&splats, &view, Background::new([0.1, 0.2, 0.3]), training, training)
