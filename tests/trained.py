@@ -18,6 +18,7 @@ from gscodec.encode.encode import StreamOutput, encode_groups, stream_config
 from gscodec.encode.settings import EncodeSettings
 from gscodec.fit import fit_groups
 from gscodec.metrics.evaluate import evaluate_capture, evaluate_splats
+from gscodec.model.camera import LOW_PASS
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.model.parametric_group import ParametricGroup
 from gscodec.splats.parametric_file import from_arrays, to_arrays
@@ -71,8 +72,8 @@ def _unit(group: ParametricGroup) -> ParametricGroup:
 
 @functools.cache
 def capture():
-    """The frames of the bundled capture that the groups show."""
-    return open_capture(EXAMPLE).frames(0, FRAMES)
+    """The frames of the bundled capture that the groups show, with the low-pass that they were trained with."""
+    return open_capture(EXAMPLE).frames(0, FRAMES).with_low_pass(LOW_PASS)
 
 
 def plain(group: ParametricGroup) -> ParametricGroup:
