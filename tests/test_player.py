@@ -57,9 +57,10 @@ def test_a_view_from_where_a_camera_stood_is_never_empty(browser, server, other,
     """Cameras amid the Gaussians: their pictures, and those of the free view that goes on from there."""
     K, magenta = np.array([[90.0, 0, 80], [0, 90, 60], [0, 0, 1]]), (1.0, 0.0, 1.0)
     eyes = ([0.0, 0, 0], [0.3, 0.2, -0.4])
+    views = [look_at(np.array(e), np.add(e, [1, 0.1, 0.3]), np.array([0, 1.0, 0])) for e in eyes]
     inside = [
-        Camera(f"in{i}", K, look_at(np.array(e), np.add(e, [1, 0.1, 0.3]), np.array([0, 1.0, 0])), 160, 120, near=n)
-        for i, (e, n) in enumerate(zip(eyes, (0.005, 0.05), strict=True))
+        Camera("in0", K, views[0], 160, 120, near=0.005, low_pass=0.1),
+        Camera("in1", K, views[1], 160, 120, near=0.05, low_pass=2.0),
     ]
     path = tmp_path / "inside.gsv"
     config = stream_config(fps=FPS, sh_degree=0, gaussians=4000, frames=LENGTH, cameras=inside, background=magenta)
@@ -71,12 +72,14 @@ def test_a_view_from_where_a_camera_stood_is_never_empty(browser, server, other,
         load(browser, server.url, src=url, size="160x120", autoplay="off", camera=f"in{i}")
         assert browser.eval(f"{part('[data-set=view]')}.selectedOptions[0].text") == f"in{i}"
         seen = show(browser, 2)
-        assert seen.near == pytest.approx(camera.near)
+        assert (seen.near, seen.low_pass) == pytest.approx((camera.near, camera.low_pass))
         want = render_image(stream.frame(2), camera, magenta)
         assert empty(want) < 0.2
         assert psnr(canvas(browser), want) >= 35
         browser.eval(f"{PLAYER}.camera.orbit(0, 0)")
-        assert show(browser, 2).near <= camera.near
+        free = show(browser, 2)
+        assert free.near <= camera.near
+        assert free.low_pass == pytest.approx(0.1), "that of the first camera"
         assert empty(canvas(browser)) < 0.2
 
 
