@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gscodec.model.camera import NEAR, Camera, look_at
+from gscodec.model.camera import LOW_PASS, NEAR, Camera, look_at
 from gscodec.model.gaussians import Gaussians, logit
 from gscodec.render.movie import orbit_camera
 
@@ -61,4 +61,4 @@ def file_scene(name: str, data: Path, work: Path, width: int, height: int) -> tu
         gaussians = open_case(name, data, work).frame(0)
     else:
         gaussians = open_sequence(existing(Path(data) / "splats" / f"{name}.ply")).frame(0)
-    return gaussians, orbit_camera(gaussians, UP[name], 0.25, width, height, NEAR)
+    return gaussians, orbit_camera(gaussians, UP[name], 0.25, width, height, NEAR, LOW_PASS)

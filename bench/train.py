@@ -27,7 +27,7 @@ import numpy as np
 from gscodec.capture import Capture
 from gscodec.errors import UsageError
 from gscodec.model.camera import Camera
-from gscodec.model.gaussians import Gaussians
+from gscodec.model.gaussians import RANDOM_ACCESS, Gaussians
 from gscodec.model.parametric_group import ParametricGroup
 
 from .drawn import Rig, animated_capture
@@ -201,7 +201,7 @@ def _ours(capture: Capture, frames: range, settings, encodings) -> Iterator[tupl
     if frames.step != 1:
         raise UsageError("gscodec follows what moves: it needs every frame, expected a range without a step")
     own = part(capture, frames)
-    groups, seconds_of_group = sequence(own, settings, encodings[0].random_access)
+    groups, seconds_of_group = sequence(own, settings)
     trained = sum(seconds_of_group)
     found = {"seconds_of_group": [round(s, 1) for s in seconds_of_group], "peak_gib": peak_gib()}
     yield "model", trained, None, shown(groups), found
@@ -257,7 +257,9 @@ def v3_coded(models: list[Gaussians]) -> tuple[int, list[Gaussians]]:
     return size, decoded
 
 
-def sequence(capture: Capture, settings, random_access: int = 0) -> tuple[list[ParametricGroup], list[float]]:
+def sequence(
+    capture: Capture, settings, random_access: int = RANDOM_ACCESS
+) -> tuple[list[ParametricGroup], list[float]]:
     """Trains the capture (`random_access`: see `train_groups`); returns the groups and the seconds of each."""
     from gscodec.train.train import train_groups
 

@@ -11,14 +11,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..errors import UsageError
-from ..model.camera import Camera, cameras_around
+from ..model.camera import LOW_PASS, Camera, cameras_around
 from ..model.gaussians import Gaussians
 
 COUNT = 16
 
 
-def codec_cameras(frames: Sequence[Gaussians]) -> list[Camera]:
-    """The cameras around the Gaussians of all given frames.
+def codec_cameras(frames: Sequence[Gaussians], low_pass: float = LOW_PASS) -> list[Camera]:
+    """The cameras around the Gaussians of all given frames, which are drawn with `low_pass` (px^2).
 
     Raises:
         UsageError: the frames hold no Gaussians.
@@ -26,4 +26,4 @@ def codec_cameras(frames: Sequence[Gaussians]) -> list[Camera]:
     means = np.concatenate([g.means for g in frames]) if frames else np.zeros((0, 3))
     if not len(means):
         raise UsageError("no Gaussians to place cameras around")
-    return cameras_around(means, COUNT, name="codec")
+    return cameras_around(means, COUNT, name="codec", low_pass=low_pass)

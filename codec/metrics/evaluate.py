@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 
 import numpy as np
 
@@ -160,8 +159,8 @@ def evaluate_splats(
     outside = [t for t in picked if not 0 <= t < sequence.frame_count]
     if outside or not picked:
         raise UsageError(f"frames {outside or 'none'} to evaluate, the sequence has 0 to {sequence.frame_count - 1}")
-    cameras = codec_cameras([sequence.frame(t) for t in sorted({picked[0], picked[len(picked) // 2], picked[-1]})])
-    cameras = [replace(c, low_pass=low_pass_of(sequence.cameras)) for c in cameras]
+    some = [sequence.frame(t) for t in sorted({picked[0], picked[len(picked) // 2], picked[-1]})]
+    cameras = codec_cameras(some, low_pass_of(sequence.cameras))
     rows, counts, given = [], [], []
     for i, t in enumerate(picked):
         reference, decoded = sequence.frame(t), frame_source(t)

@@ -140,13 +140,21 @@ def fibonacci_directions(count: int, turn: float = 0.0) -> np.ndarray:
 
 
 def cameras_around(
-    points: np.ndarray, count: int, *, name: str, size: int = 512, focal: float = 1.2, turn: float = 0.0
+    points: np.ndarray,
+    count: int,
+    *,
+    name: str,
+    size: int = 512,
+    focal: float = 1.2,
+    turn: float = 0.0,
+    low_pass: float = LOW_PASS,
 ) -> list[Camera]:
     """Cameras in Fibonacci directions around the box of the 1st to 99th percentile of `points` ([N, 3]); even ones have
     its bounding sphere just in frame, odd ones stand at half that distance.
 
     Args:
-        size: width and height; focal: focal length in widths; turn: of all directions about z, radians.
+        size: width and height; focal: focal length in widths; turn: of all directions about z, radians;
+            low_pass: of the cameras, px^2.
     """
     low, high = np.percentile(points, (1, 99), axis=0)
     center, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
@@ -156,5 +164,6 @@ def cameras_around(
     cameras = []
     for i, direction in enumerate(fibonacci_directions(count, turn)):
         eye = center + direction * distance * (0.5 if i % 2 else 1)
-        cameras.append(Camera(f"{name}{i:02}", K, look_at(eye, center, (0, 0, 1)), size, size, split="test"))
+        viewmat = look_at(eye, center, (0, 0, 1))
+        cameras.append(Camera(f"{name}{i:02}", K, viewmat, size, size, split="test", low_pass=low_pass))
     return cameras

@@ -28,9 +28,9 @@ def up_vector(axis: str) -> np.ndarray:
     return v
 
 
-def orbit_camera(g: Gaussians, up: str, turn: float, width: int, height: int, near: float) -> Camera:
+def orbit_camera(g: Gaussians, up: str, turn: float, width: int, height: int, near: float, low_pass: float) -> Camera:
     """A camera around the 1-99 % box of `g` with its bounding sphere in frame; `turn` in turns, `near` plane in world
-    units."""
+    units, `low_pass` in px^2."""
     low, high = np.percentile(g.means, [1, 99], axis=0) if len(g) else (np.zeros(3), np.ones(3))
     centre, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
     u = up_vector(up)
@@ -42,7 +42,7 @@ def orbit_camera(g: Gaussians, up: str, turn: float, width: int, height: int, ne
     eye = centre + direction / np.linalg.norm(direction) * radius / np.sin(half)
     f = min(width, height) / 2 / np.tan(half)
     K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
-    return Camera("orbit", K, look_at(eye, centre, u), width, height, near=near)
+    return Camera("orbit", K, look_at(eye, centre, u), width, height, near=near, low_pass=low_pass)
 
 
 def load_camera(path: Path) -> Camera:
@@ -72,8 +72,7 @@ def camera_path(stream, camera: str, size: str | None, frames: range) -> Iterato
         first, near = stream.frame(frames[0]), min((c.near for c in stream.cameras), default=NEAR)
         for t in frames:
             turn = t / (stream.fps * ORBIT_SECONDS)
-            orbit = orbit_camera(first, stream.config["up"], turn, width, height, near)
-            yield replace(orbit, low_pass=low_pass)
+            yield orbit_camera(first, stream.config["up"], turn, width, height, near, low_pass)
         return
     known = {c.name: c for c in stream.cameras}
     if camera in known:

@@ -76,8 +76,8 @@ def sensitivity_cameras(means: np.ndarray, given: list[Camera] = (), count: int 
     """
     taken = [given[i] for i in np.linspace(0, len(given) - 1, min(len(given), count // 2)).round().astype(int)]
     fitted = [of_width(c, SIZE) for c in taken]
-    others = cameras_around(means, count - len(taken), name="sensitivity", turn=1.3)
-    return fitted + [replace(c, low_pass=low_pass_of(given)) for c in others]
+    left = count - len(taken)
+    return fitted + cameras_around(means, left, name="sensitivity", turn=1.3, low_pass=low_pass_of(given))
 
 
 def of_width(camera: Camera, width: int) -> Camera:
