@@ -53,7 +53,12 @@ class Frame:
 
 def rounded(c: np.ndarray, dead_zone: float) -> np.ndarray:
     """Integers of the coefficients, as the encoder rounds them."""
-    return np.sign(c) * np.rint(np.maximum(np.abs(c) - dead_zone, 0))
+    return np.rint(shrunk(c, dead_zone))
+
+
+def shrunk(c: np.ndarray, by: float) -> np.ndarray:
+    """Coefficients nearer to 0 by so much, those that are less by all they are."""
+    return np.sign(c) * np.maximum(np.abs(c) - np.float32(by), 0)
 
 
 class GroupModel:
@@ -114,6 +119,9 @@ class GroupModel:
         self.unit = {name: trajectory_step(steps[name], len(tracked)) for name in names}
         self.unit["sh0"] *= float(STEP_WEIGHTS[0])  # Y, Co, Cg share one step; RGB errors add up over them
         self.coefficients = self._project(tracked)
+        again = np.flatnonzero((moved & (torch.arange(len(moved)) < self.known)).numpy())
+        for c in self.coefficients.values():
+            c[:, again] = shrunk(c[:, again], self.settings.shrinkage)
         large = [(np.abs(c) > self.settings.free_min).any((0, 2)) for c in self.coefficients.values()]
         self.free = torch.from_numpy(np.any(large, 0)) | moved
         self.log_scales = {
@@ -206,13 +214,16 @@ class GroupModel:
         by_turns, by_shifts = self.graph.gradients(frame.rest, base, frame.pose, by_carried, rigidity)
         return by_turns * self.carriers, by_shifts * self.carriers
 
-    def frame(self, t: int, backend: Backend, noise: dict[str, torch.Tensor] | None = None) -> Frame:
+    def frame(
+        self, t: int, backend: Backend, noise: dict[str, torch.Tensor] | None = None, shrinkage: float = 0.0
+    ) -> Frame:
         """Frame `t`.
 
         Args:
             noise: attribute -> what is added to the canonical values; None: nothing.
+            shrinkage: quantization steps by which coefficients are nearer to 0.
         """
-        p, zone = self.key.params, self.settings.dead_zone
+        p, zone = self.key.params, self.settings.dead_zone + shrinkage
         if noise is not None:
             p = {n: v + noise[n] for n, v in p.items()}
         delta = {

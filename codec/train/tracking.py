@@ -236,13 +236,18 @@ class Tracker:
         self.moving = self.moving[chosen]
 
     def adopt(self, group: GroupModel) -> None:
-        """Goes on from the last frame as fine-tuning left it."""
-        frame = group.frame(group.frames - 1, self.views.backend)
+        """Goes on from the last frame as fine-tuning left it. What moves goes on with smaller coefficients: those that
+        no picture asks for would grow from group to group, and each pays for them anew."""
+        backend, last = self.views.backend, group.frames - 1
+        frame, smaller = group.frame(last, backend), group.frame(last, backend, shrinkage=group.settings.shrinkage)
         new = group.origin < 0
         self.moving = torch.where(new, True, self.moving[group.origin])
+        params = dict(frame.params)
+        for n, p in params.items():
+            params[n] = torch.where(self.moving.view(-1, *[1] * (p.dim() - 1)), smaller.params[n], p)
         rest = group.key.params["means"]
         self.graph, self.pose = group.graph.resting_at(rest), frame.pose
-        self.own = self._own(frame.params, *self.graph.carry(rest, frame.pose))
+        self.own = self._own(params, *self.graph.carry(rest, frame.pose))
 
     def densify(self, frame: int, on_step: OnStep = None) -> None:
         """Adds the Gaussians that `frame` needs besides, after `advance`."""

@@ -32,6 +32,7 @@ class FinetuneSettings:
     warmup: float = 0.0  # the same elsewhere: what the first steps undo, they also free
     free_min: float = 0.5  # quantization steps: a residual from the start, so that a resting Gaussian stays free
     dead_zone: float = 0.1  # quantization steps more than half of one, below which a coefficient is not coded
+    shrinkage: float = 2.0  # quantization steps by which a predicted group starts nearer to the Gaussians at rest
     coefficient_rate: float = 0.1  # quantization steps
     log_scale_start: float = -1.0  # log of a Laplace scale, quantization steps
     log_scale_rate: float = 0.02
