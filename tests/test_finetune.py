@@ -24,7 +24,7 @@ from gscodec.train.deformation_graph import NodeGraph, Pose
 from gscodec.train.entropy_model import CanonicalRate, laplace_bits
 from gscodec.train.finetune import GroupModel
 from gscodec.train.joint_optimization import _Finetuner, finetune
-from gscodec.train.model import from_gaussians, harmonics_turned
+from gscodec.train.model import Model, from_gaussians, harmonics_turned
 from gscodec.train.tracking import Tracker
 from gscodec.train.train import train_groups
 from gscodec.train.views import Views
@@ -202,6 +202,19 @@ def test_a_group_goes_on_from_what_was_fine_tuned(capture):
     for name, values in shown.items():
         np.testing.assert_allclose(model[name].detach().numpy(), values.detach().numpy(), atol=2e-5, err_msg=name)
     assert len(tracker.moving) == 320
+
+
+def test_what_moves_in_a_predicted_group_starts_nearer_to_rest():
+    key, moved = from_gaussians(blob(60)), torch.arange(60) < 30
+    graph = NodeGraph.of(key.params["means"], torch.ones(60), 1.0, moved, dataclasses.replace(TINY.graph, nodes=8))
+    brighter = torch.linspace(0, 1, 30).repeat(2)[:, None]
+    frames = [Model({**key.params, "sh0": key.params["sh0"] + brighter})] * 4
+    group = GroupModel(graph, key, frames, [Pose.rest(graph)] * 4, steps_for(50, 1.0), moved, TINY)
+    steps = (2 * brighter / group.unit["sh0"]).numpy()  # the square root of 4 frames
+    found = group.coefficients["sh0"][0]
+    np.testing.assert_allclose(found[30:], np.broadcast_to(steps[30:], (30, 3)), atol=1e-3)
+    smaller = np.maximum(steps[:30] - TINY.finetune.shrinkage, 0)
+    np.testing.assert_allclose(found[:30], np.broadcast_to(smaller, (30, 3)), atol=1e-3)
 
 
 def test_nodes_that_carry_only_what_rests_stay(capture):
