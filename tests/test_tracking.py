@@ -81,15 +81,15 @@ def test_a_motion_out_of_reach_of_the_gradient_is_searched_for():
     R = quat_to_matrix(rotvec_to_quat(turn))
     for model in (concatenate([rough, sky]), rough):
         tracker = tracker_of(to(moved(first, turn, shift)), model)
-        found, nodes = search(tracker, 1).next().nodes.numpy(), tracker.pose.nodes.numpy()
+        found, nodes = search(tracker, 1, TINY.motion_search.ratio).next().nodes.numpy(), tracker.pose.nodes.numpy()
         near = np.linalg.norm(nodes, axis=1) < 2
         missed = np.abs(found - (nodes @ R.T + shift))[near].mean()
         assert missed < 0.1, "radii of the blob, most of whose nodes move by more than 1"
         np.testing.assert_array_equal(found[~near], nodes[~near], "the sky stays")
     tracker.moving[:] = False
-    assert search(tracker, 1) is None, "there is nothing to search for"
+    assert search(tracker, 1, TINY.motion_search.ratio) is None, "there is nothing to search for"
     near = to(moved(first, 0.03 * turn, 0.03 * shift))
-    assert search(tracker_of(near), 1) is None, "a search takes seconds"
+    assert search(tracker_of(near), 1, TINY.motion_search.ratio) is None, "a search takes seconds"
 
 
 def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():

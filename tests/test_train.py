@@ -38,6 +38,18 @@ def test_light_that_comes_on_starts_a_group():
     assert psnr_of(second.frame(1), capture, 6) > psnr_of(alone.frame(1), capture, 6) - 1.0
 
 
+def test_a_jump_starts_a_group():
+    """Low temporal frequencies would show it in all frames of the group."""
+    whole = blob(300)
+    at = lambda x: DenseGroup([dataclasses.replace(whole, means=whole.means + np.float32([x, 0, 0]))])  # noqa: E731
+    frames = [at(0.03 * t) for t in range(6)] + [at(-0.6 + 0.03 * t) for t in range(2)]
+    capture = capture_of(GaussianSequence(25.0, frames))
+    first, second = train_groups(capture, dataclasses.replace(TINY, gop=10, finetune_steps=30))
+    assert (len(first), first.ended, len(second)) == (6, "jump", 2)
+    assert second.parents is not None
+    assert psnr_of(second.frame(0), capture, 6) > 33
+
+
 def test_the_first_frame_that_is_fitted_may_lose_more_than_the_next(capture, monkeypatch):
     """No tracked frame comes near a keyframe's own fit, so that the bound of a cut is none for the first."""
     advance, losses = Tracker.advance, iter((1.8, 2.9))  # times that of the keyframe; a cut is at 1.5 times the last

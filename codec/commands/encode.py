@@ -39,6 +39,7 @@ ENDED = {  # ParametricGroup.ended
     "drift": "tracking had come too far from the keyframe",
     "more": "much comes into the pictures that the keyframe did not show",
     "change": "much that stood still begins to change",
+    "jump": "what moves is suddenly elsewhere",
     "empty": "nothing was seen until then",
 }
 

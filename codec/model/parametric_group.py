@@ -81,7 +81,8 @@ class ParametricGroup:
         rate_optimized: training had a rate term, which has dropped what is not worth its bits.
         ended: why it is shorter than it may be: "cut" (the next frame cannot be tracked), "drift" (nor well enough,
             since the keyframe is too far), "more" (it shows much that the keyframe did not), "change" (much that rests
-            begins to change), "empty" (nothing is seen before the next frame); an empty string: it is not.
+            begins to change), "jump" (what moves is suddenly elsewhere), "empty" (nothing is seen before the next
+            frame); an empty string: it is not.
         turned_harmonics: shN turns with the nodes; otherwise it stays in the world.
     """
 

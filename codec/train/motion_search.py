@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from .tracking import Tracker
 
 
-def search(tracker: Tracker, frame: int) -> Pose | None:
+def search(tracker: Tracker, frame: int, ratio: float) -> Pose | None:
     """The pose of `tracker`, in the frame before `frame`, with the step that fits `frame` best; None: constant velocity
-    fits well enough, or nothing fits better."""
+    fits well enough, its loss is less than `ratio` times that of the frame before, or nothing fits better."""
     if not tracker.moving.any() or not tracker.views.show(frame):  # all that moved is gone
         return None
     s, pose = tracker.settings.motion_search, None
@@ -37,7 +37,7 @@ def search(tracker: Tracker, frame: int) -> Pose | None:
         bodies = _Bodies(tracker, pose or tracker.pose, frame, parts)
         still = np.zeros((parts, 6), np.float32)
         start = bodies.loss(still)
-        if pose is None and start < s.ratio * bodies.loss_before():
+        if pose is None and start < ratio * bodies.loss_before():
             return None
         found = [bodies.fitted(still + np.append(turn, np.zeros(3, np.float32))) for turn in _starts(s.turn)]
         best = bodies.chosen(still, start, found)

@@ -148,7 +148,7 @@ class Tracker:
             return self._missing(frame)
         if self.moving.any():
             self._relocalize(frame)
-            found = search(self, frame)
+            found = search(self, frame, self.settings.motion_search.ratio)
             self.pose, self.searched = found or self.pose, found is not None
             self._fit(frame, on_step)
         else:
@@ -302,6 +302,11 @@ class Tracker:
         """Fraction of the Gaussians that `frame`, the next one, changes, beyond those of `before` ([N] bool)."""
         new = self._behind(self.changes.copy().advance(frame), frame) & ~before.numpy()
         return float(new.mean()) if len(new) else 0.0
+
+    def jumps(self, frame: int) -> bool:
+        """Whether what moved in the last frame is far from where its velocity leads it in `frame`, the next one, and a
+        search finds it. Not told where a rig leads it."""
+        return self.rig is None and search(self, frame, self.settings.motion_search.jump_ratio) is not None
 
     def _moving(self, frame: int) -> np.ndarray:
         """Gaussians that `frame` changes, [N] bool; sets `masks`."""

@@ -153,7 +153,7 @@ class _Run:
             track.add(self.subject.tracker)
             ended = self._track(frames[1:], stop, track)
         subject, done = self.subject, frames[: len(track.models)]
-        if ended not in ("", "change"):
+        if ended not in ("", "change", "jump"):
             self.subject = None
         if len(done) == 1 and parents is None:
             subject.canonical = track.models[0]
@@ -191,10 +191,11 @@ class _Run:
 
     def _track(self, frames: range, stop: int, track: _TrackedFrames) -> str:
         """Tracks `frames` up to the end of the group and adds them to `track`; returns why that came early
-        (`ParametricGroup.ended`). Behind all reasons but "change" the next group needs a keyframe.
+        (`ParametricGroup.ended`). Behind all reasons but "change" and "jump" the next group needs a keyframe.
 
         The group ends where a large fraction of resting Gaussians changes at once: with few temporal frequencies, a
         light that is switched on would show in all frames of the group, and what was frozen without it shows it badly.
+        So would a jump behind frames that were followed without a search.
         Where a keyframe has lasted long, the few frames that are left before `stop` lose little more by drift, and do
         not pay for another one.
         """
@@ -203,8 +204,11 @@ class _Run:
             if self._shown(frame) > g.shown_ratio * subject.shown:
                 return "more"
             long_enough = len(track.models) >= g.changed_frames_min
+            followed = not any(track.searched[-g.changed_frames_min :])
             if long_enough and subject.tracker.changed_fraction(frame, track.moved()) > g.changed_fraction_max:
                 return "change"
+            if long_enough and followed and subject.tracker.jumps(frame):
+                return "jump"
             near, far = self.settings.cut_ratio * subject.tracker.loss, g.drift_ratio * subject.loss
             if subject.tracker.loss == subject.loss:  # a keyframe's own fit, which no tracked frame comes near
                 near = far

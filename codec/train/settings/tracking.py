@@ -113,6 +113,7 @@ class MotionSearchSettings:
     side: float = 64.0  # pixels, of the longer side of the pictures that are compared
     views: int = 8  # as far apart as possible
     ratio: float = 2.0  # loss at constant velocity over that of the frame before, from which there is a search
+    jump_ratio: float = 6.0  # the same, from which a motion is no longer that of the group before
     turn: float = 0.6  # radians, of the starts
     steps: int = 25  # from each start
     rate: float = 0.05  # radians, radii
@@ -158,4 +159,4 @@ class GroupSettings:
     cut_loss_floor: float = 0.002  # loss: clean images fit far better than they need to, and no frame is cut for it
     shown_ratio: float = 2.0  # pixels of the scene over those of the keyframe, in half of the views: it lacks too much
     changed_fraction_max: float = 0.1  # of the Gaussians, that begin to change in one frame
-    changed_frames_min: int = 4  # frames that a group has before `changed_fraction_max` may end it
+    changed_frames_min: int = 4  # frames that a group has before `changed_fraction_max` or a jump may end it
