@@ -119,7 +119,7 @@ class GroupModel:
         self.unit = {name: trajectory_step(steps[name], len(tracked)) for name in names}
         self.unit["sh0"] *= float(STEP_WEIGHTS[0])  # Y, Co, Cg share one step; RGB errors add up over them
         self.coefficients = self._project(tracked)
-        again = np.flatnonzero((moved & (torch.arange(len(moved)) < self.known)).numpy())
+        again = (moved & (torch.arange(len(moved)) < self.known)).numpy()
         for c in self.coefficients.values():
             c[:, again] = shrunk(c[:, again], self.settings.shrinkage)
         large = [(np.abs(c) > self.settings.free_min).any((0, 2)) for c in self.coefficients.values()]

@@ -67,8 +67,8 @@ def train_groups(
     A group continues the Gaussians of the one before (`parents`). It ends early before a frame whose image loss is
     `cut_ratio` times that of the tracked frame before, or `drift_ratio` times that of the keyframe (unless few frames
     are left), or which shows `shown_ratio` times as much as the keyframe; then the next group starts with a keyframe.
-    It also ends before one in which a large fraction of the Gaussians begins to change. Frames without a subject, until
-    a camera sees something, are a group without Gaussians.
+    It also ends before one in which a large fraction of the Gaussians begins to change, or what moves jumps. Frames
+    without a subject, until a camera sees something, are a group without Gaussians.
     Every segment of `random_access` frames starts with a keyframe: a segment depends on no frames but its own.
 
     Args:
@@ -195,9 +195,8 @@ class _Run:
 
         The group ends where a large fraction of resting Gaussians changes at once: with few temporal frequencies, a
         light that is switched on would show in all frames of the group, and what was frozen without it shows it badly.
-        So would a jump behind frames that were followed without a search.
-        Where a keyframe has lasted long, the few frames that are left before `stop` lose little more by drift, and do
-        not pay for another one.
+        So would a jump behind frames that were followed without a search. Where a keyframe has lasted long, the few
+        frames that are left before `stop` lose little more by drift, and do not pay for another one.
         """
         subject, g = self.subject, self.settings.group
         for frame in frames:
