@@ -183,14 +183,20 @@ def test_masks_say_where_nothing_is():
 
 def test_the_motion_field_is_zero_at_first_and_learns_a_motion_that_nodes_share():
     nodes = torch.from_numpy(np.random.default_rng(3).uniform(-1, 1, (40, 3)).astype(np.float32))
-    field = MotionField(nodes, 2.0, 6, MotionFieldSettings(), 0, CpuBackend(), AdamSettings())
+    settings = MotionFieldSettings()
+    field = MotionField(nodes, 2.0, 6, settings, 0, CpuBackend(), AdamSettings())
     first = [field(t) for t in range(6)]
     assert not any(m.turn.any() or m.shift.any() for m in first), "the nodes begin as they were tracked"
     for step in range(300):
         t = step % 6
         motion = field(t)
         wanted = 0.1 * nodes + torch.tensor([0.1 * t, 0.0, 0.2])
-        field.step(motion, 2 * (motion.turn - 0.05 * t), 2 * (motion.shift - wanted), 0.1 ** (step / 300))
+        field.step(
+            motion,
+            2 * (motion.turn - 0.05 * t),
+            2 * (motion.shift - wanted),
+            settings.searched_rates * 0.1 ** (step / 300),
+        )
     for t in range(6):
         motion = field(t)
         assert (motion.turn - 0.05 * t).abs().max() < 0.1

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 
 from ..machine import stamp
 
 WHOLE = "whole recipe"
+MORE_SEEDS = re.compile(r"seed ([2-9]|\d\d)$")  # one is enough to see what chance does
 PANELS = {"psnr_coded": "PSNR decoded, dB", "kb_per_frame": "kB a frame", "flicker": "flicker"}
 LESS, MORE = "#1f5fb4", "#c76f14"
 
@@ -15,12 +17,13 @@ def ablation_chart(result: dict):
     """A row per capture, bars of the difference from the whole recipe (matplotlib)."""
     from matplotlib.figure import Figure
 
-    captures = list(dict.fromkeys(e["capture"] for e in result["entries"]))
-    heights = [0.24 * sum(e["capture"] == c for e in result["entries"]) + 0.8 for c in captures]
+    found = [e for e in result["entries"] if not MORE_SEEDS.search(e["variant"])]
+    captures = list(dict.fromkeys(e["capture"] for e in found))
+    heights = [0.24 * sum(e["capture"] == c for e in found) + 0.8 for c in captures]
     figure = Figure(figsize=(11, sum(heights)), layout="constrained")
     rows = figure.subplots(len(captures), 3, squeeze=False, height_ratios=heights)
     for row, capture in zip(rows, captures, strict=True):
-        entries = {e["variant"]: e for e in result["entries"] if e["capture"] == capture}
+        entries = {e["variant"]: e for e in found if e["capture"] == capture}
         whole = entries.pop(WHOLE)
         for axes, (key, label) in zip(row, PANELS.items(), strict=True):
             at = whole[key]  # None: no pixel stands still, so that none flickers

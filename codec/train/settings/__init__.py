@@ -162,12 +162,7 @@ class TrainSettings:
             finetune=self.finetune.with_frequencies(room.frequencies),
             group=replace(self.group, drift_ratio=room.drift_ratio * self.group.drift_ratio),
             graph=replace(self.graph, nodes=round(room.nodes * self.graph.nodes)),
-            motion_field=replace(
-                field,
-                tracking=field.tracking and room.field_in_tracking,
-                grid_rate=room.field_rates * field.grid_rate,
-                mlp_rate=room.field_rates * field.mlp_rate,
-            ),
+            motion_field=replace(field, tracking=field.tracking and room.field_in_tracking),
         )
 
     def of_fast_motion(self, frames: int, share: float) -> TrainSettings:

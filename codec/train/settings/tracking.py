@@ -49,8 +49,9 @@ class MotionFieldSettings:
     finest: int = 32  # and of the last: about the spacing of the nodes
     width: int = 32  # of the two hidden layers
     temporal_frequencies: int = 8  # cosines of the time in the group
-    grid_rate: float = 2e-2
-    mlp_rate: float = 2e-3
+    grid_rate: float = 4e-3
+    mlp_rate: float = 4e-4
+    searched_rates: float = 5.0  # times those, in a frame whose motion a search has found, and which may still be far
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,6 @@ class RoomSettings:
     opacity_decay: float = 0.003  # of a keyframe: no mask removes what floats before the cameras
     position_noise: float = 3.0  # of a keyframe, for the same reason
     field_in_tracking: bool = False  # it drags what stands still with what moves beside it
-    field_rates: float = 0.2  # times those of a subject, for the same reason
 
 
 @dataclass(frozen=True)
