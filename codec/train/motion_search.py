@@ -28,22 +28,25 @@ if TYPE_CHECKING:
 
 
 def search(tracker: Tracker, frame: int, ratio: float) -> Pose | None:
-    """The pose of `tracker`, in the frame before `frame`, with the step that fits `frame` best; None: constant velocity
-    fits well enough, its loss is less than `ratio` times that of the frame before, or nothing fits better."""
+    """The pose of `tracker`, in the frame before `frame`, with the step that fits `frame` best. None: constant velocity
+    fits well enough, its loss is less than `ratio` times that of the frame before; or what fits best takes little of
+    that away, since few views fit any frame far better than the next one, however slowly all moves."""
     if not tracker.moving.any() or not tracker.views.show(frame):  # all that moved is gone
         return None
-    s, pose = tracker.settings.motion_search, None
+    s, pose, bodies = tracker.settings.motion_search, None, _Bodies(tracker, tracker.pose, frame, 1)
+    usual, before = bodies.loss(bodies.still), bodies.loss_before()
+    if usual < ratio * before:
+        return None
     for parts in (1, s.parts):
         bodies = _Bodies(tracker, pose or tracker.pose, frame, parts)
-        still = np.zeros((parts, 6), np.float32)
-        start = bodies.loss(still)
-        if pose is None and start < ratio * bodies.loss_before():
-            return None
-        found = [bodies.fitted(still + np.append(turn, np.zeros(3, np.float32))) for turn in _starts(s.turn)]
-        best = bodies.chosen(still, start, found)
-        if best is not still:
+        start, found = bodies.loss(bodies.still), [bodies.fitted(bodies.turned_by(turn)) for turn in _starts(s.turn)]
+        best = bodies.chosen(start, found)
+        if best is not bodies.still:
             pose = bodies.pose(best)
-    return pose
+    if pose is None:
+        return None
+    bodies = _Bodies(tracker, pose, frame, 1)
+    return pose if usual - bodies.loss(bodies.still) > s.gain_min * before else None
 
 
 def _starts(turn: float) -> np.ndarray:
@@ -54,10 +57,11 @@ def _starts(turn: float) -> np.ndarray:
 class _Bodies:
     """The moving Gaussians of a tracker a frame after `pose` at its velocity, without a far background behind them, as
     `parts` rigid bodies, and small views of `frame`. A motion [parts, 6] has for each a rotation vector about its
-    center and a translation in radii."""
+    center and a translation in radii; that of `still` is 0."""
 
     def __init__(self, tracker: Tracker, pose: Pose, frame: int, parts: int):
         self.tracker, self.settings, self._pose, self._frame = tracker, tracker.settings.motion_search, pose, frame
+        self.still = np.zeros((parts, 6), np.float32)
         views = tracker.views
         places = np.stack([views.camera(i, frame).center for i in views.train_cameras])
         chosen = sorted(farthest_points(places, min(self.settings.views, len(places))))
@@ -108,6 +112,10 @@ class _Bodies:
         moved = {"means": means, "quats": quat_product(turn.contiguous(), p["quats"])}
         return {**p, **{n: torch.where(self._moving[:, None], x, p[n]) for n, x in moved.items()}}
 
+    def turned_by(self, turn: np.ndarray) -> np.ndarray:
+        """The motion in which all parts turn by the rotation vector `turn` [3]."""
+        return self.still + np.append(turn, np.zeros(3, np.float32))
+
     def fitted(self, motion: np.ndarray) -> np.ndarray:
         """The motion that some steps of the gradient reach from `motion`."""
         t, s = self.tracker, self.settings
@@ -124,9 +132,9 @@ class _Bodies:
             adam.step(values, {"motion": by.numpy()}, {"motion": s.rate * s.rate_decay ** (step / s.steps)})
         return values["motion"]
 
-    def chosen(self, still: np.ndarray, start: float, found: list[np.ndarray]) -> np.ndarray:
+    def chosen(self, start: float, found: list[np.ndarray]) -> np.ndarray:
         """For each part one of the motions `found`, or `still`, whose loss is `start`."""
-        s = self.settings
+        s, still = self.settings, self.still
         losses = [self.loss(m) for m in found]
         best, least = min(zip(found, losses, strict=True), key=lambda x: x[1])
         if least > s.gain * start:

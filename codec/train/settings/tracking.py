@@ -121,6 +121,7 @@ class MotionSearchSettings:
     parts: int = 8  # rigid bodies of the second search
     reach: float = 4.0  # times the median distance of what moves from its middle: farther is background
     gain: float = 0.9  # a motion is taken if its loss is this share of the best one so far
+    gain_min: float = 0.45  # times the loss of the frame before: what it must take away in the end
 
 
 @dataclass(frozen=True)
