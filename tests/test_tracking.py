@@ -92,6 +92,24 @@ def test_a_motion_out_of_reach_of_the_gradient_is_searched_for():
     assert search(tracker_of(near), 1, TINY.motion_search.ratio) is None, "a search takes seconds"
 
 
+def test_a_motion_that_explains_little_of_an_error_is_none():
+    """Few views fit any frame far better than the next one, and some small motion always fits a little better."""
+    first, turn, shift = blob(300), np.array([0.0, 0.012, 0.0015]), np.array([0.0135, -0.0045, 0.003])
+    noise = lambda seed, by: first.sh0 + by * np.random.default_rng(seed).standard_normal((300, 3))  # noqa: E731
+    key, other = (dataclasses.replace(first, sh0=noise(*of)) for of in ((0, 0.2), (1, 1.0)))
+    sequence = GaussianSequence(25.0, [DenseGroup([first, moved(other, turn, shift)], None)])
+
+    def found(settings):
+        views = Views(capture_of(sequence), settings, CpuBackend())
+        tracker = Tracker.start(from_gaussians(key), views, settings, 0.01, range(2))
+        tracker.moving[:] = True
+        return search(tracker, 1, settings.motion_search.ratio)
+
+    assert found(TINY) is None
+    easy = dataclasses.replace(TINY.motion_search, gain_min=0.0)
+    assert found(dataclasses.replace(TINY, motion_search=easy)) is not None, "it does fit better"
+
+
 def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
     x = torch.from_numpy(blob(200).means)
     graph = NodeGraph.of(
