@@ -18,6 +18,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,11 @@ def stage_with(stage: str, **values) -> Callable[[TrainSettings], TrainSettings]
     return lambda settings: replace(settings, **{stage: replace(getattr(settings, stage), **values)})
 
 
+def all_of(*changes: Callable[[TrainSettings], TrainSettings]) -> Callable[[TrainSettings], TrainSettings]:
+    """Several changes, one after the other."""
+    return lambda settings: reduce(lambda s, change: change(s), changes, settings)
+
+
 def by_seeds(name: str, **values) -> dict[str, Variant]:
     """A variant for each of `SEEDS`, with other values of the settings of the whole run."""
     return {
@@ -121,13 +127,16 @@ VARIANTS = {
     "no rigidity": Variant(run_with(rigidity=0.0)),
     "nodes alone": Variant(run_with(motion_field=MOTIONS["nodes"]), tuple(FRAMES), equal=True),
     **by_seeds("nodes alone, ", motion_field=MOTIONS["nodes"]),
-    "field alone": Variant(  # the nodes have no variables of their own; it learns faster
-        lambda s: stage_with("finetune", node_rotation_rate=0.0, node_translation_rate=0.0)(
-            stage_with("tracking", node_rotation_rate=0.0, node_translation_rate=0.0)(
-                stage_with(
-                    "motion_field", grid_rate=5 * FIELD.grid_rate, mlp_rate=5 * FIELD.mlp_rate, searched_rates=1.0
-                )(s)
-            )
+    "field alone": Variant(  # the nodes have no variables of their own; it learns as fast as behind a search
+        all_of(
+            stage_with("finetune", node_rotation_rate=0.0, node_translation_rate=0.0),
+            stage_with("tracking", node_rotation_rate=0.0, node_translation_rate=0.0),
+            stage_with(
+                "motion_field",
+                grid_rate=FIELD.searched_rates * FIELD.grid_rate,
+                mlp_rate=FIELD.searched_rates * FIELD.mlp_rate,
+                searched_rates=1.0,
+            ),
         ),
         tuple(FRAMES),
         equal=True,
@@ -138,8 +147,8 @@ VARIANTS = {
     "harmonics stay in the world": Variant(run_with(turned_harmonics=False), tuple(FRAMES)),
     "no rate term": Variant(run_with(rate_lambda=0.0)),
     "no fine-tuning": Variant(run_with(finetune_steps=0)),
-    "no cuts": Variant(lambda s: stage_with("group", drift_ratio=math.inf)(replace(s, cut_ratio=math.inf)), (FAST,)),
-    "no search": Variant(stage_with("motion_search", ratio=math.inf), (FAST,)),
+    "no cuts": Variant(all_of(run_with(cut_ratio=math.inf), stage_with("group", drift_ratio=math.inf)), (FAST,)),
+    "no search": Variant(stage_with("motion_search", ratio=math.inf, jump_ratio=math.inf), (FAST,)),
     "first rounds not stiff": Variant(stage_with("tracking", stiff_rigidity=1.0), (FAST,)),
     "colours held in tracking": Variant(stage_with("tracking", rates=TRACKING.rates.but(sh0=0.0, shN=0.0))),
     "full-size pictures only": Variant(stage_with("tracking", small_scale=1.0)),

@@ -28,6 +28,11 @@ from gscodec.train.tracking import Tracker
 from gscodec.train.views import Views
 
 
+def started(model, capture, settings=TINY, frames=2):
+    """A tracker of Gaussians that are the keyframe of the capture."""
+    return Tracker.start(from_gaussians(model), Views(capture, settings, CpuBackend()), settings, 0.01, range(frames))
+
+
 @pytest.fixture(scope="module")
 def capture():
     return capture_of(turning(300, frames=5))
@@ -61,9 +66,8 @@ def test_a_far_background_does_not_make_what_moves_larger():
     """Rates of the nodes are in radii of what moves: with the sky in it, a subject flies off."""
     capture, subject = capture_of(turning(300, frames=2), masks=False), blob(300)
     sky = dataclasses.replace(subject, means=20 * subject.means, log_scales=subject.log_scales + 3)
-    start = lambda g: Tracker.start(from_gaussians(g), Views(capture, TINY, CpuBackend()), TINY, 0.01, range(2))  # noqa: E731
-    alone = start(subject).radius
-    assert start(concatenate([subject, sky.take(np.arange(100))])).radius < 1.5 * alone
+    alone = started(subject, capture).radius
+    assert started(concatenate([subject, sky.take(np.arange(100))]), capture).radius < 1.5 * alone
 
 
 def test_a_motion_out_of_reach_of_the_gradient_is_searched_for():
@@ -74,7 +78,7 @@ def test_a_motion_out_of_reach_of_the_gradient_is_searched_for():
     sky = dataclasses.replace(first, means=20 * first.means).take(np.arange(100))
 
     def tracker_of(capture, model=rough):  # of a keyframe that has errors, as any has
-        tracker = Tracker.start(from_gaussians(model), Views(capture, TINY, CpuBackend()), TINY, 0.01, range(2))
+        tracker = started(model, capture)
         tracker.moving[:] = True
         return tracker
 
@@ -100,8 +104,7 @@ def test_a_motion_that_explains_little_of_an_error_is_none():
     sequence = GaussianSequence(25.0, [DenseGroup([first, moved(other, turn, shift)], None)])
 
     def found(settings):
-        views = Views(capture_of(sequence), settings, CpuBackend())
-        tracker = Tracker.start(from_gaussians(key), views, settings, 0.01, range(2))
+        tracker = started(key, capture_of(sequence), settings)
         tracker.moving[:] = True
         return search(tracker, 1, settings.motion_search.ratio)
 
@@ -185,7 +188,7 @@ def test_masks_say_where_nothing_is():
     )
     whole, none = concatenate([left, right]), left.take(np.zeros(0, int))
     capture = capture_of(GaussianSequence(25.0, [DenseGroup([g]) for g in (whole, left, none, none)]))
-    tracker = Tracker.start(from_gaussians(whole), Views(capture, TINY, CpuBackend()), TINY, 0.01, range(4))
+    tracker = started(whole, capture, frames=4)
     models, poses = [tracker.model], [tracker.pose]
     for frame in (1, 2, 3):
         loss = tracker.advance(frame)

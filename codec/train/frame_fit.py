@@ -44,7 +44,6 @@ class FrameFit:
         self._carriers, self._adam = carriers, Adam(backend, s.node_adam)
         self._rates = {"angular_velocity": s.node_rotation_rate, "velocity": s.node_translation_rate * tracker.radius}
         self._field, f = None, tracker.settings.motion_field
-        self._field_rates = f.searched_rates if tracker.searched else 1.0
         if f.tracking:
             nodes, seed = tracker.graph.nodes, tracker.settings.seed
             self._field = MotionField(nodes, tracker.radius, 1, f, seed, backend, s.node_adam)
@@ -100,7 +99,8 @@ class FrameFit:
         by = [g * self._carriers for g in by]
         self._adam.step(self._nodes, dict(zip(self._nodes, by, strict=True)), self._scaled(decay))
         if by_field is not None:
-            self._field.step(by_field, *by, decay * self._field_rates)
+            searched = self.tracker.settings.motion_field.searched_rates if self.tracker.searched else 1.0
+            self._field.step(by_field, *by, decay * searched)
 
     def _scaled(self, decay: float) -> dict[str, float]:
         return {n: r * decay for n, r in self._rates.items()}

@@ -33,25 +33,23 @@ def search(tracker: Tracker, frame: int, ratio: float) -> Pose | None:
     that away, since few views fit any frame far better than the next one, however slowly all moves."""
     if not tracker.moving.any() or not tracker.views.show(frame):  # all that moved is gone
         return None
-    s, pose, bodies = tracker.settings.motion_search, None, _Bodies(tracker, tracker.pose, frame, 1)
-    usual, before = bodies.loss(bodies.still), bodies.loss_before()
+    s, whole = tracker.settings.motion_search, _Bodies(tracker, tracker.pose, frame, 1)
+    usual, before = whole.loss(whole.still), whole.loss_before()
     if usual < ratio * before:
         return None
-    for parts in (1, s.parts):
-        bodies = _Bodies(tracker, pose or tracker.pose, frame, parts)
-        start, found = bodies.loss(bodies.still), [bodies.fitted(bodies.turned_by(turn)) for turn in _starts(s.turn)]
-        best = bodies.chosen(start, found)
-        if best is not bodies.still:
-            pose = bodies.pose(best)
+    pose = whole.best_pose(usual)
+    parts = _Bodies(tracker, pose or tracker.pose, frame, s.parts)
+    pose = parts.best_pose(parts.loss(parts.still)) or pose
     if pose is None:
         return None
-    bodies = _Bodies(tracker, pose, frame, 1)
-    return pose if usual - bodies.loss(bodies.still) > s.gain_min * before else None
+    there = _Bodies(tracker, pose, frame, 1)
+    return pose if usual - there.loss(there.still) > s.gain_min * before else None
 
 
 def _starts(turn: float) -> np.ndarray:
-    """Rotation vectors [7, 3]: none, and `turn` radians either way about each axis."""
-    return np.concatenate([np.zeros((1, 3)), turn * np.eye(3), -turn * np.eye(3)]).astype(np.float32)
+    """Motions [7, 6] of one part: none, and by `turn` radians either way about each axis."""
+    turns = np.concatenate([np.zeros((1, 3)), turn * np.eye(3), -turn * np.eye(3)])
+    return np.pad(turns, ((0, 0), (0, 3))).astype(np.float32)
 
 
 class _Bodies:
@@ -112,10 +110,6 @@ class _Bodies:
         moved = {"means": means, "quats": quat_product(turn.contiguous(), p["quats"])}
         return {**p, **{n: torch.where(self._moving[:, None], x, p[n]) for n, x in moved.items()}}
 
-    def turned_by(self, turn: np.ndarray) -> np.ndarray:
-        """The motion in which all parts turn by the rotation vector `turn` [3]."""
-        return self.still + np.append(turn, np.zeros(3, np.float32))
-
     def fitted(self, motion: np.ndarray) -> np.ndarray:
         """The motion that some steps of the gradient reach from `motion`."""
         t, s = self.tracker, self.settings
@@ -149,6 +143,12 @@ class _Bodies:
                 if (loss := self.loss(tried)) < least:
                     best, least, changed = tried, loss, True
         return self.fitted(best) if changed and least < s.gain * start else best
+
+    def best_pose(self, start: float) -> Pose | None:
+        """The pose with the motion that fits best; None: that is `still`, whose loss is `start`."""
+        found = [self.fitted(self.still + motion) for motion in _starts(self.settings.turn)]
+        best = self.chosen(start, found)
+        return None if best is self.still else self.pose(best)
 
     def pose(self, motion: np.ndarray) -> Pose:
         """The pose of the tracker with a step that ends behind `motion`."""

@@ -145,7 +145,7 @@ class TrainSettings:
         """The settings for a capture: those of a room where it has no masks."""
         if capture.has_alpha:
             return self
-        room, field = self.room, self.motion_field
+        room, tracked = self.room, self.motion_field.tracking and self.room.field_in_tracking
         return replace(
             self,
             motion_steps=round(room.motion_steps * self.motion_steps),
@@ -162,7 +162,7 @@ class TrainSettings:
             finetune=self.finetune.with_frequencies(room.frequencies),
             group=replace(self.group, drift_ratio=room.drift_ratio * self.group.drift_ratio),
             graph=replace(self.graph, nodes=round(room.nodes * self.graph.nodes)),
-            motion_field=replace(field, tracking=field.tracking and room.field_in_tracking),
+            motion_field=replace(self.motion_field, tracking=tracked),
         )
 
     def of_fast_motion(self, frames: int, share: float) -> TrainSettings:
