@@ -35,13 +35,18 @@ def capture():
     return capture_of(turning(300, frames=5))
 
 
+def resting(count, frames, settings=TINY):
+    """A group of so many Gaussians that rest."""
+    key, everything = from_gaussians(blob(count)), torch.ones(count, dtype=torch.bool)
+    nodes = dataclasses.replace(settings.graph, nodes=8)
+    graph = NodeGraph.of(key.params["means"], torch.ones(count), 1.0, everything, nodes)
+    poses = [Pose.rest(graph)] * frames
+    return GroupModel(graph, None, [key] * frames, poses, steps_for(50, 1.0), everything, settings)
+
+
 def test_a_longer_group_has_more_temporal_frequencies():
-    key = from_gaussians(blob(50))
-    everything = torch.ones(50, dtype=torch.bool)
-    graph = NodeGraph.of(key.params["means"], torch.ones(50), 1.0, everything, dataclasses.replace(TINY.graph, nodes=8))
     for frames, means, colours in ((4, 4, 4), (20, 10, 6), (30, 15, 9), (31, 16, 10)):
-        poses = [Pose.rest(graph)] * frames
-        group = GroupModel(graph, None, [key] * frames, poses, steps_for(50, 1.0), everything, TINY)
+        group = resting(50, frames)
         assert len(group.coefficients["means"]) == means
         assert len(group.coefficients["sh0"]) == colours
 
@@ -141,10 +146,8 @@ def test_fine_tuning_removes_and_adds_gaussians(capture, monkeypatch):
 
 def test_what_one_frame_shows_takes_one_step_for_each_gradient(capture):
     """Adam alone goes on for some five steps behind a gradient in one of 22 steps."""
-    key, frames, rounds = from_gaussians(blob(60)), 20, 5
-    everything = torch.ones(60, dtype=torch.bool)
-    graph = NodeGraph.of(key.params["means"], torch.ones(60), 1.0, everything, dataclasses.replace(TINY.graph, nodes=8))
-    group = GroupModel(graph, None, [key] * frames, [Pose.rest(graph)] * frames, steps_for(50, 1.0), everything, TINY)
+    frames, rounds = 20, 5
+    group = resting(60, frames)
     group.start[:20], group.end[:20] = 4, 5
     run = _Finetuner(group, Views(capture, TINY, CpuBackend()), range(frames), TINY, radius=1.0)
     before = group.key.params["log_scales"].clone()
@@ -156,6 +159,24 @@ def test_what_one_frame_shows_takes_one_step_for_each_gradient(capture):
     moved = (group.key.params["log_scales"] - before).mean(1) / run.canonical_rates["log_scales"]
     assert moved[20:].min() == pytest.approx(rounds * (frames + 2), rel=0.05)
     assert 0.5 * rounds < moved[:20].mean() < 1.5 * rounds
+
+
+def test_a_bit_is_dearer_where_views_are_few_and_no_cheaper_where_bits_are_many(capture):
+    cameras = len(capture.indices("train"))
+
+    def weight(rate_views: float, bits_of_a_frame: float) -> float:
+        settings = dataclasses.replace(TINY, rate_views=rate_views)
+        run = _Finetuner(
+            resting(60, 5, settings), Views(capture, settings, CpuBackend()), range(5), settings, radius=1.0
+        )
+        run.loss, run.bits = 1.0, 5 * bits_of_a_frame * run.canonical_bits
+        return run._bit_weight() * run.canonical_bits / settings.rate_lambda
+
+    share = TINY.finetune.residual_share
+    assert weight(cameras / 2, 0.0) == pytest.approx(1)
+    assert weight(cameras / 2, share / 2) == pytest.approx(1 / (1 + 2.5 * share))
+    assert weight(cameras / 2, 10.0) == weight(cameras / 2, share) == pytest.approx(1 / (1 + 5 * share))
+    assert weight(3 * cameras, 0.0) == pytest.approx(3)
 
 
 @pytest.mark.parametrize("drift", [0.2, 0.0])

@@ -214,11 +214,15 @@ class _Finetuner:
     def _bit_weight(self) -> float:
         """Weight of a bit in the image loss.
 
-        Relative changes of bits and of loss count. All groups of a subject count the canonical bits, as if each stood
-        alone, so that a bit has the same weight in all of them.
+        Relative changes of bits and of loss count, so that a bit is cheap where there are many. All groups of a subject
+        count the canonical bits, as if each stood alone, so that a bit has the same weight in all of them. Of the
+        residuals as many count as a group usually has: where motion is fast or views are few, the more of them were
+        bought, the cheaper each would be, and frames would part from each other, which see the more together.
         """
-        s = self.settings
-        return s.rate_lambda * self.loss / (self.bits + self.canonical_bits)
+        s, views = self.settings, len(self.views.train_cameras)
+        usual = s.finetune.residual_share * self.group.frames * self.canonical_bits
+        price = s.rate_lambda * max(1.0, s.rate_views / views)
+        return price * self.loss / (min(self.bits, usual) + self.canonical_bits)
 
 
 def finetune(

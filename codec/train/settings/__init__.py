@@ -91,6 +91,8 @@ class TrainSettings:
         cut_ratio: a frame whose image loss exceeds that of the frame before by this factor starts anew.
         rigidity: weight of the as-rigid-as-possible term.
         rate_lambda: share by which the image loss may rise where bits fall by one share.
+        rate_views: training cameras below which that grows with what is lacking: few views contradict little of what a
+            frame changes for its own pictures alone.
         quality: quantization that the rate term assumes (0 to 100).
         seed: of every random number.
         cache_bytes: of decoded pictures held in memory, with no effect on the result.
@@ -112,6 +114,7 @@ class TrainSettings:
     cut_ratio: float = 1.5
     rigidity: float = 0.3
     rate_lambda: float = 0.4
+    rate_views: float = 10.0
     quality: float = 56.0
     seed: int = 0
     cache_bytes: int = 2 << 30

@@ -50,6 +50,7 @@ class FinetuneSettings:
     views: int = 2  # of a frame, in one step: what a step costs besides is shared
     frames_min: float = 20.0  # a shorter group behind a keyframe has the steps of so many
     growth: float = 0.1  # share of the Gaussians that may be added then
+    residual_share: float = 0.115  # residual bits of a frame over canonical ones: where more are, a bit is no cheaper
     rate_every: int = 8  # steps: the rate term has every coefficient, an image few; its weight grows by as much
     canonical_rate_every: int = 24  # steps for which the gradient of the canonical bits, and their noise, are held
     loss_smoothing: float = 0.05  # share of one step in the running mean of the loss
