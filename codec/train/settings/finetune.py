@@ -25,7 +25,7 @@ class FinetuneSettings:
     frequencies_frames: int = FREQUENCIES_OF  # frames that `frequencies` is for
     fast_frequencies: float = 3.0  # times as many besides, where all frames were searched for (`Tracker.searched`)
     fast_rate: float = 20.0  # so many times, over the frames of the group, as fast coefficients besides, there
-    fast_steps: float = 8.0  # times as many steps a frame besides, there, since more of each frame is its own
+    fast_steps: float = 4.0  # times as many steps a frame besides, there, since more of each frame is its own
     fast_canonical: float = 1.0  # times as fast canonical attributes besides, there
     fast_warmup: float = 0.1  # share of the steps in which rates rise, there: at once they undo what was tracked
     fast_apart: float = 4.0  # `apart` there; the group then has the usual settings
