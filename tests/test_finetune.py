@@ -161,22 +161,28 @@ def test_what_one_frame_shows_takes_one_step_for_each_gradient(capture):
     assert 0.5 * rounds < moved[:20].mean() < 1.5 * rounds
 
 
-def test_a_bit_is_dearer_where_views_are_few_and_no_cheaper_where_bits_are_many(capture):
-    cameras = len(capture.indices("train"))
+def test_a_bit_is_no_cheaper_where_bits_are_many(capture):
+    run = _Finetuner(resting(60, 5), Views(capture, TINY, CpuBackend()), range(5), TINY, radius=1.0)
+    run.loss = 1.0
 
-    def weight(rate_views: float, bits_of_a_frame: float) -> float:
-        settings = dataclasses.replace(TINY, rate_views=rate_views)
-        run = _Finetuner(
-            resting(60, 5, settings), Views(capture, settings, CpuBackend()), range(5), settings, radius=1.0
-        )
-        run.loss, run.bits = 1.0, 5 * bits_of_a_frame * run.canonical_bits
-        return run._bit_weight() * run.canonical_bits / settings.rate_lambda
+    def weight(bits_of_a_frame: float) -> float:
+        run.bits = 5 * bits_of_a_frame * run.canonical_bits
+        return run._bit_weight() * run.canonical_bits / TINY.rate_lambda
 
     share = TINY.finetune.residual_share
-    assert weight(cameras / 2, 0.0) == pytest.approx(1)
-    assert weight(cameras / 2, share / 2) == pytest.approx(1 / (1 + 2.5 * share))
-    assert weight(cameras / 2, 10.0) == weight(cameras / 2, share) == pytest.approx(1 / (1 + 5 * share))
-    assert weight(3 * cameras, 0.0) == pytest.approx(3)
+    assert weight(0.0) == pytest.approx(1)
+    assert weight(share / 2) == pytest.approx(1 / (1 + 2.5 * share))
+    assert weight(10.0) == weight(share) == pytest.approx(1 / (1 + 5 * share))
+
+
+def test_few_views_have_dearer_bits_and_a_faster_field(capture):
+    cameras = len(capture.indices("train"))
+    many, few, least = (dataclasses.replace(TINY, few_views=n * cameras).of_capture(capture) for n in (0.5, 2, 3))
+    fields, slow = [s.motion_field for s in (many, few, least)], TINY.motion_field
+    assert [s.rate_lambda / TINY.rate_lambda for s in (many, few, least)] == pytest.approx([1, 2, 3])
+    assert [f.grid_rate / slow.grid_rate for f in fields] == pytest.approx([1, 4, slow.searched_rates])
+    assert [f.mlp_rate / slow.mlp_rate for f in fields] == pytest.approx([1, 4, slow.searched_rates])
+    assert [f.searched_rates * f.grid_rate for f in fields] == pytest.approx([slow.searched_rates * slow.grid_rate] * 3)
 
 
 @pytest.mark.parametrize("drift", [0.2, 0.0])

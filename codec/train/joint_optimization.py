@@ -219,10 +219,9 @@ class _Finetuner:
         residuals as many count as a group usually has: where motion is fast or views are few, the more of them were
         bought, the cheaper each would be, and frames would part from each other, which see the more together.
         """
-        s, views = self.settings, len(self.views.train_cameras)
+        s = self.settings
         usual = s.finetune.residual_share * self.group.frames * self.canonical_bits
-        price = s.rate_lambda * max(1.0, s.rate_views / views)
-        return price * self.loss / (min(self.bits, usual) + self.canonical_bits)
+        return s.rate_lambda * self.loss / (min(self.bits, usual) + self.canonical_bits)
 
 
 def finetune(

@@ -91,8 +91,7 @@ class TrainSettings:
         cut_ratio: a frame whose image loss exceeds that of the frame before by this factor starts anew.
         rigidity: weight of the as-rigid-as-possible term.
         rate_lambda: share by which the image loss may rise where bits fall by one share.
-        rate_views: training cameras below which that grows with what is lacking: few views contradict little of what a
-            frame changes for its own pictures alone.
+        few_views: training cameras below which views are few (`of_capture`).
         quality: quantization that the rate term assumes (0 to 100).
         seed: of every random number.
         cache_bytes: of decoded pictures held in memory, with no effect on the result.
@@ -114,7 +113,7 @@ class TrainSettings:
     cut_ratio: float = 1.5
     rigidity: float = 0.3
     rate_lambda: float = 0.4
-    rate_views: float = 10.0
+    few_views: float = 10.0
     quality: float = 56.0
     seed: int = 0
     cache_bytes: int = 2 << 30
@@ -145,9 +144,18 @@ class TrainSettings:
             raise UsageError(f"--gop {self.gop} is out of range, expected at least 1 frame in a group")
 
     def of_capture(self, capture) -> TrainSettings:
-        """The settings for a capture: those of a room where it has no masks."""
-        if capture.has_alpha:
-            return self
+        """The settings for a capture. Few views contradict little of what a frame changes for its own pictures alone:
+        the fewer there are, the dearer is a bit, and the faster learns the field, which moves all that is near
+        together. Where there are no masks, they are those of a room, and the field drags what stands still along.
+        """
+        few, field = max(1.0, self.few_views / max(1, len(capture.indices("train")))), self.motion_field
+        settings = replace(self, rate_lambda=few * self.rate_lambda)
+        if not capture.has_alpha:
+            return settings._of_room()
+        return replace(settings, motion_field=field.faster(min(few**2, field.searched_rates)))
+
+    def _of_room(self) -> TrainSettings:
+        """The settings for a capture without masks."""
         room, tracked = self.room, self.motion_field.tracking and self.room.field_in_tracking
         return replace(
             self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from ...render.optimizer import AdamSettings
 from .learning_rates import LearningRates, keyframe_rates
@@ -52,6 +52,11 @@ class MotionFieldSettings:
     grid_rate: float = 4e-3
     mlp_rate: float = 4e-4
     searched_rates: float = 5.0  # times those, in a frame whose motion a search has found, and which may still be far
+
+    def faster(self, times: float) -> MotionFieldSettings:
+        """The same that learns so many times as fast, but behind a search."""
+        rates = {"grid_rate": times * self.grid_rate, "mlp_rate": times * self.mlp_rate}
+        return replace(self, **rates, searched_rates=self.searched_rates / times)
 
 
 @dataclass(frozen=True)
