@@ -131,12 +131,7 @@ VARIANTS = {
         all_of(
             stage_with("finetune", node_rotation_rate=0.0, node_translation_rate=0.0),
             stage_with("tracking", node_rotation_rate=0.0, node_translation_rate=0.0),
-            stage_with(
-                "motion_field",
-                grid_rate=FIELD.searched_rates * FIELD.grid_rate,
-                mlp_rate=FIELD.searched_rates * FIELD.mlp_rate,
-                searched_rates=1.0,
-            ),
+            run_with(motion_field=FIELD.faster(FIELD.searched_rates)),
         ),
         tuple(FRAMES),
         equal=True,

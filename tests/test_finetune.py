@@ -35,13 +35,13 @@ def capture():
     return capture_of(turning(300, frames=5))
 
 
-def resting(count, frames, settings=TINY):
+def resting(count, frames):
     """A group of so many Gaussians that rest."""
     key, everything = from_gaussians(blob(count)), torch.ones(count, dtype=torch.bool)
-    nodes = dataclasses.replace(settings.graph, nodes=8)
+    nodes = dataclasses.replace(TINY.graph, nodes=8)
     graph = NodeGraph.of(key.params["means"], torch.ones(count), 1.0, everything, nodes)
     poses = [Pose.rest(graph)] * frames
-    return GroupModel(graph, None, [key] * frames, poses, steps_for(50, 1.0), everything, settings)
+    return GroupModel(graph, None, [key] * frames, poses, steps_for(50, 1.0), everything, TINY)
 
 
 def test_a_longer_group_has_more_temporal_frequencies():

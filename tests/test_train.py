@@ -114,7 +114,7 @@ def test_larger_pictures_have_longer_keyframes_whose_fit_frames_need_not_reach()
 
 def test_a_frame_is_as_sharp_where_the_others_are_empty():
     """Empty frames say nothing about what a Gaussian is worth, how fine its steps are, or that tracking went well. What
-    three frames show is 0.9 to 1.4 dB sharper than what one shows, over three seeds."""
+    three frames show is 0.9 to 1.1 dB sharper than what one shows, over three seeds."""
     whole = blob(200)
     none = whole.take(np.zeros(0, int))
     settings = dataclasses.replace(TINY, keyframe_steps=200, finetune_steps=30)
@@ -128,10 +128,10 @@ def test_a_frame_is_as_sharp_where_the_others_are_empty():
     (least, *_), _ = trained(whole, whole, whole)
     (gone,), lengths = trained(whole, none, none)
     assert lengths == [3]
-    assert gone > least - 1.6
+    assert gone > least - 1.2
     come, lengths = trained(none, whole, whole)
     assert lengths == [1, 2]
-    assert min(come) > least - 1.6
+    assert min(come) > least - 1
 
 
 def test_groups_come_out_whole_and_a_stopped_run_goes_on(capture, tmp_path):

@@ -146,7 +146,7 @@ class TrainSettings:
     def of_capture(self, capture) -> TrainSettings:
         """The settings for a capture. Few views contradict little of what a frame changes for its own pictures alone:
         the fewer there are, the dearer is a bit, and the faster learns the field, which moves all that is near
-        together. Where there are no masks, they are those of a room, and the field drags what stands still along.
+        together. Where there are no masks, they are those of a room, whose field would drag what stands still along.
         """
         few, field = max(1.0, self.few_views / max(1, len(capture.indices("train")))), self.motion_field
         settings = replace(self, rate_lambda=few * self.rate_lambda)
