@@ -1,15 +1,15 @@
 """Ablation: captures are trained without one loss or tool at a time.
 
 lumberjack is the bundled capture, a subject with masks; stage and basketball (in the data folder, at half their size)
-are full rooms, into one of which a ball drops; the others are stress cases. bench/results/ablation.json has one entry
-per capture and variant, all of the same preset and, where it names none, of seed 0; seeds say which differences mean
-nothing, and there are more of them where nodes alone come close. `psnr` is that of the model before coding,
-`psnr_coded` that of the decoded stream; both are measured on the test cameras, of the subject where there are masks. A
-variant is a change of the training settings, so that each entry can be repeated by any caller of the training; but for
-V3's recipe (`baselines/v3.py`), which has a hash grid for each frame and a packing of its own. What moves Gaussians is
-compared at equal time and bytes: a variant that is faster or slower than the whole recipe is trained again with more
-steps a frame, or fewer, and it is coded at three qualities, `curve`, on which `psnr_at_bytes` is where the whole
-recipe's bytes lie.
+are full rooms, into one of which a ball drops; the others are stress cases, with their budget.
+bench/results/ablation.json has one entry per capture and variant, all of the same preset and, where it names none, of
+seed 0; seeds say which differences mean nothing, and there are more of them where nodes alone come close. `psnr` is
+that of the model before coding, `psnr_coded` that of the decoded stream; both are measured on the test cameras, of the
+subject where there are masks. A variant is a change of the training settings, so that each entry can be repeated by any
+caller of the training; but for V3's recipe (`baselines/v3.py`), which has a hash grid for each frame and a packing of
+its own. What moves Gaussians is compared at equal time and bytes: a variant that is faster or slower than the whole
+recipe is trained again with more steps a frame, or fewer, and it is coded at three qualities, `curve`, on which
+`psnr_at_bytes` is where the whole recipe's bytes lie.
 """
 
 from __future__ import annotations
@@ -31,12 +31,13 @@ from gscodec.train.settings import MOTIONS, TrackingSettings, TrainSettings, tra
 
 from . import train
 from .machine import ROOT, update_entries
+from .stress import BUDGET
 from .stress_scenes import CASES as STRESS
 from .stress_scenes import drawn
 
 WHOLE = "whole recipe"
 LUMBERJACK, STAGE, BASKETBALL, FAST, FEW = "lumberjack", "stage", "basketball", "fast motion", "4 cameras"
-FRAMES = {LUMBERJACK: (0, 10), STAGE: (7, 15), BASKETBALL: (0, 8), FAST: (0, 12), FEW: (0, 12)}  # the ball comes at 10
+FRAMES = {LUMBERJACK: (0, 10), STAGE: (7, 15), BASKETBALL: (0, 8), FAST: (0, 12), FEW: (0, 30)}  # the ball comes at 10
 EQUAL = 0.05  # share by which times may differ
 SEEDS = {
     1: tuple(FRAMES),
@@ -179,7 +180,8 @@ def run(
     for capture in captures:
         opened = _open(capture, data)
         chosen = names or [n for n, v in VARIANTS.items() if capture in v.captures]
-        entries = ({"capture": capture, **entry} for entry in _entries(opened, chosen, preset, quality))
+        settings = train_settings(preset, quality=quality, **(BUDGET if capture in STRESS else {}))
+        entries = ({"capture": capture, **entry} for entry in _entries(opened, chosen, preset, settings))
         yield from update_entries(out, entries, lambda e: [e["capture"], e["variant"], e["preset"]])
 
 
@@ -196,15 +198,14 @@ def _open(capture: str, data: Path | None) -> Capture:
     return train.CASES[capture].open(data).frames(first, end).scaled(0.5)
 
 
-def _entries(capture: Capture, names: Sequence[str], preset: str, quality: float) -> Iterator[dict]:
-    whole, kb = None, None  # seconds and bytes of the whole recipe
+def _entries(capture: Capture, names: Sequence[str], preset: str, settings: TrainSettings) -> Iterator[dict]:
+    quality, whole, kb = settings.quality, None, None  # seconds and bytes of the whole recipe
     if any(VARIANTS[name].equal for name in names):
         names = [WHOLE, *(name for name in names if name != WHOLE)]
     for name in names:
         variant = VARIANTS[name]
-        settings = variant.change(train_settings(preset, quality=quality))
-        settings, trained = _trained(capture, variant, settings, whole if variant.equal else None)
-        entry = {"variant": name, "preset": preset, **_measured(capture, trained, settings, quality)}
+        changed, trained = _trained(capture, variant, variant.change(settings), whole if variant.equal else None)
+        entry = {"variant": name, "preset": preset, **_measured(capture, trained, changed, quality)}
         if name == WHOLE:
             whole, kb = trained.seconds, entry["kb_per_frame"]
         elif variant.equal and variant.recipe is ours:

@@ -12,7 +12,8 @@ use numpy::{PyArray1, PyReadonlyArrayDyn, prelude::*};
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 use raster::{
-    Background, Gradients, Lambdas, Projected, SimdLevel, Size, Splats, Step, StepValue, Surface, TargetImage, View,
+    Background, Gradients, ImageWeights, Lambdas, Projected, SimdLevel, Size, Splats, Step, StepValue, Surface,
+    TargetImage, View,
 };
 
 type Bytes<'py> = PyReadonlyArrayDyn<'py, u8>;
@@ -195,19 +196,22 @@ impl Rasterizer {
     /// One training step on a batch of views. Returns for each (loss, l1, mse, ssim, mask, depth, gradient of the gain,
     /// of the offset), and [N] the largest radii. The gradients are those of the sum of the losses. A view is (camera,
     /// (background, (gain, offset) or None), (rgb, alpha or None, depth or None)); the lambdas are those of
-    /// SSIM, mask and depth.
+    /// SSIM, mask, depth and MSE.
     fn step<'py>(
         &mut self,
         py: Python<'py>,
         params: Params,
         views: Vec<TargetView>,
-        lambdas: (f32, f32, f32),
+        lambdas: (f32, f32, f32, f32),
         grads: Grads,
     ) -> PyResult<(Vec<Value>, Bound<'py, PyArray1<f32>>)> {
         let mut grads = grads;
         let (splats, mut out) = (splats(&params)?, gradients(&mut grads)?);
         let lambdas = Lambdas {
-            ssim: lambdas.0,
+            image: ImageWeights {
+                ssim: lambdas.0,
+                mse: lambdas.3,
+            },
             mask: lambdas.1,
             depth: lambdas.2,
         };
