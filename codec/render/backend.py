@@ -48,13 +48,12 @@ class LossWeights:
     """Weights of the terms of the loss.
 
     Attributes:
-        ssim: share of D-SSIM in the image loss. mask, depth, mse: of what is added to it.
+        ssim: share of D-SSIM in the image loss. mask, depth: of what is added to it.
     """
 
     ssim: float = 0.2
     mask: float = 0.0
     depth: float = 0.0
-    mse: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class RenderLoss:
     """Loss of a batch of views and its gradients. Arrays belong to the backend; its next call overwrites them.
 
     Attributes:
-        loss: image_loss, and the terms of mask, depth and mse with their `LossWeights`, summed over the views.
+        loss: image_loss, and the terms of mask and depth with their `LossWeights`, summed over the views.
         image_loss: (1 - w) * l1 + w * (1 - ssim) with w = `LossWeights.ssim`, summed over the views.
         l1, mse, ssim, mask, depth: the terms; means over pixels (and channels) and views. psnr = -10 log10(mse). The
             depth term is |sum of weights * (depth - target)| / target, 0 where the target is unknown.

@@ -68,14 +68,14 @@ class CpuBackend:
             raise UsageError("a batch has at least one view, got none")
         grads, statistics = self.workspace.gradients(arrays)
         step, native = self.workspace.native.step, [_native_view(v) for v in views]
-        lambdas = (weights.ssim, weights.mask, weights.depth, weights.mse)
+        lambdas = (weights.ssim, weights.mask, weights.depth)
         values, radii = call(step, arrays, native, lambdas, (grads, statistics))
         losses, exposure = np.array([v[:6] for v in values]), np.array([v[6:] for v in values])
         loss, means = float(losses[:, 0].sum()), losses[:, 1:].mean(0).tolist()
-        image_loss = float(((1 - weights.ssim) * losses[:, 1] + weights.ssim * (1 - losses[:, 3])).sum())
+        others = float((losses[:, 4:6] @ lambdas[1:]).sum())  # mask and depth
         return RenderLoss(
             loss,
-            image_loss,
+            loss - others,
             *means,
             pixels=sum(v.camera.width * v.camera.height for v in views),
             grads={k: _like(g, params[k]) for k, g in zip(PARAMETERS, grads, strict=True)},

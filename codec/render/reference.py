@@ -119,7 +119,6 @@ def ssim_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     return s[:, 0].permute(1, 2, 0)
 
 
-def image_loss_reference(image, target, ssim_lambda=0.2, mse_lambda=0.0) -> torch.Tensor:
-    """Image loss of training, (1 - ssim_lambda) L1 + ssim_lambda (1 - SSIM) + mse_lambda MSE."""
-    difference, ssim = image - target, ssim_map(image, target)
-    return ((1 - ssim_lambda) * difference.abs() + mse_lambda * difference.square() + ssim_lambda * (1 - ssim)).mean()
+def image_loss_reference(image, target, ssim_lambda=0.2) -> torch.Tensor:
+    """Image loss of training, (1 - ssim_lambda) L1 + ssim_lambda (1 - SSIM)."""
+    return ((1 - ssim_lambda) * (image - target).abs() + ssim_lambda * (1 - ssim_map(image, target))).mean()

@@ -60,7 +60,6 @@ class _Bodies:
     def __init__(self, tracker: Tracker, pose: Pose, frame: int, parts: int):
         self.tracker, self.settings, self._pose, self._frame = tracker, tracker.settings.motion_search, pose, frame
         self.still = np.zeros((parts, 6), np.float32)
-        self._training = replace(tracker.settings, mse_lambda=0.0)  # losses are compared: the square is of a misfit
         views = tracker.views
         places = np.stack([views.camera(i, frame).center for i in views.train_cameras])
         chosen = sorted(farthest_points(places, min(self.settings.views, len(places))))
@@ -88,7 +87,7 @@ class _Bodies:
     def _loss(self, params: dict, frame: int) -> RenderLoss:
         t = self.tracker
         targets = [t.views.target(i, frame, self._scale) for i in self._cameras]
-        return start_photometric_loss(params, targets, self._training, np.random.default_rng(0), t.views.backend)()
+        return start_photometric_loss(params, targets, t.settings, np.random.default_rng(0), t.views.backend)()
 
     def loss_before(self) -> float:
         """Loss of the frame before, as it was fitted."""

@@ -263,7 +263,7 @@ def start_photometric_loss(
 
 
 def _weights(settings: TrainSettings) -> LossWeights:
-    return LossWeights(settings.ssim_lambda, settings.mask_lambda, settings.depth_lambda, settings.mse_lambda)
+    return LossWeights(settings.ssim_lambda, settings.mask_lambda, settings.depth_lambda)
 
 
 def add_harmonics_prior(

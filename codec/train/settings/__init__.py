@@ -82,7 +82,6 @@ class TrainSettings:
         initial_points: of a keyframe, about; None: as the scene needs (budget.py).
         sh_degree: bound on the degree of spherical harmonics; a keyframe keeps them where they lower the error.
         ssim_lambda: share of D-SSIM in the image loss (3D Gaussian Splatting: 0.2).
-        mse_lambda: weight of the squared error beside it.
         mask_lambda: weight of the alpha loss where the capture has masks.
         depth_lambda: weight of the depth loss where the capture has depth images.
         harmonics_lambda: weight of half the square of the harmonics, mean over the Gaussians: they cost bits.
@@ -106,7 +105,6 @@ class TrainSettings:
     initial_points: int | None = None
     sh_degree: int = 3
     ssim_lambda: float = 0.2
-    mse_lambda: float = 0.0
     mask_lambda: float = 0.1
     depth_lambda: float = 0.1
     harmonics_lambda: float = 0.15
@@ -165,7 +163,6 @@ class TrainSettings:
             finetune_steps=round(room.finetune_steps * self.finetune_steps),
             rigidity=room.rigidity * self.rigidity,
             harmonics_views=room.harmonics_views,
-            mse_lambda=room.mse_lambda,
             cut_ratio=room.cut_ratio * self.cut_ratio,
             keyframe=replace(
                 self.keyframe,

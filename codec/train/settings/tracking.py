@@ -71,7 +71,6 @@ class RoomSettings:
     cut_ratio: float = 5 / 3  # times that of a subject, since few views of a room fit its keyframe far too well
     drift_ratio: float = 3.6  # times that of a subject, for the same reason
     harmonics_views: float = math.inf  # here more of them gain nothing for other views
-    mse_lambda: float = 3.2  # L1 fits what most cameras see, and leaves those aside that see another light or colour
     price: float = 2.0  # of a Gaussian, times that of a subject: few views gain more by one than others do
     opacity_decay: float = 0.003  # of a keyframe: no mask removes what floats before the cameras
     position_noise: float = 3.0  # of a keyframe, for the same reason

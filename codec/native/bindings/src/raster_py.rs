@@ -12,8 +12,7 @@ use numpy::{PyArray1, PyReadonlyArrayDyn, prelude::*};
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 use raster::{
-    Background, Gradients, ImageWeights, Lambdas, Projected, SimdLevel, Size, Splats, Step, StepValue, Surface,
-    TargetImage, View,
+    Background, Gradients, Lambdas, Projected, SimdLevel, Size, Splats, Step, StepValue, Surface, TargetImage, View,
 };
 
 type Bytes<'py> = PyReadonlyArrayDyn<'py, u8>;
@@ -196,22 +195,19 @@ impl Rasterizer {
     /// One training step on a batch of views. Returns for each (loss, l1, mse, ssim, mask, depth, gradient of the gain,
     /// of the offset), and [N] the largest radii. The gradients are those of the sum of the losses. A view is (camera,
     /// (background, (gain, offset) or None), (rgb, alpha or None, depth or None)); the lambdas are those of
-    /// SSIM, mask, depth and MSE.
+    /// SSIM, mask and depth.
     fn step<'py>(
         &mut self,
         py: Python<'py>,
         params: Params,
         views: Vec<TargetView>,
-        lambdas: (f32, f32, f32, f32),
+        lambdas: (f32, f32, f32),
         grads: Grads,
     ) -> PyResult<(Vec<Value>, Bound<'py, PyArray1<f32>>)> {
         let mut grads = grads;
         let (splats, mut out) = (splats(&params)?, gradients(&mut grads)?);
         let lambdas = Lambdas {
-            image: ImageWeights {
-                ssim: lambdas.0,
-                mse: lambdas.3,
-            },
+            ssim: lambdas.0,
             mask: lambdas.1,
             depth: lambdas.2,
         };

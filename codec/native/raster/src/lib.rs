@@ -48,7 +48,7 @@ pub use error::RasterError;
 pub use framebuffer::Surface;
 pub use hashgrid::HashGrid;
 pub use image_pair::Pair;
-pub use loss::{ImageLoss, ImageWeights, LossValue};
+pub use loss::{ImageLoss, LossValue};
 pub use projected::Projected;
 pub use rasterizer::{Rasterizer, Timings};
 pub use scene::{Background, Gradients, Splats, View};

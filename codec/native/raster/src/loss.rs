@@ -1,4 +1,4 @@
-//! Image loss (1 - ssim) L1 + ssim (1 - SSIM) + mse MSE, with the weights `ssim` and `mse`, and its gradient by the image.
+//! Image loss (1 - lambda) L1 + lambda (1 - SSIM) and its gradient by the image.
 //!
 //! SSIM as in 3D Gaussian Splatting: 11 x 11 Gaussian window of sigma 1.5, zeros outside of the image, mean over pixels and
 //! channels. Images stay interleaved: a row is 3 W values and horizontal taps are 3 apart. Pass 1 (`ssim.rs`) leaves three
@@ -15,13 +15,6 @@ use crate::parallel::parallel_for;
 use crate::simd::{SimdLevel, Vector, c, dispatch};
 use crate::ssim::{derivative_rows, gradient_rows};
 use crate::ssim_window::ROWS;
-
-/// Of the terms of the loss.
-#[derive(Clone, Copy)]
-pub struct ImageWeights {
-    pub ssim: f32,
-    pub mse: f32,
-}
 
 /// Means over the pixels and channels.
 #[derive(Clone, Copy, Default, Debug, PartialEq)]
@@ -50,23 +43,17 @@ impl ImageLoss {
         &mut self,
         level: SimdLevel,
         pair: Pair,
-        weights: ImageWeights,
+        lambda: f32,
         grad: &mut [f32],
     ) -> Result<LossValue, RasterError> {
         check_length("target", pair.target.len(), pair.image.len())?;
         check_length("gradient of the image", grad.len(), pair.image.len())?;
         check_length("image", pair.image.len(), pair.rows() * pair.row_values())?;
         let mean = 1.0 / pair.image.len().max(1) as f64;
-        let by = [
-            1.0 - f64::from(weights.ssim),
-            f64::from(weights.mse),
-            f64::from(weights.ssim),
-        ];
-        let sums = self.derivatives(level, pair, -by[2] * mean);
-        let slopes = [by[0] * mean, 2.0 * by[1] * mean].map(|s| s as f32);
-        self.gradient(level, pair, slopes, grad);
+        let sums = self.derivatives(level, pair, -f64::from(lambda) * mean);
+        self.gradient(level, pair, ((1.0 - f64::from(lambda)) * mean) as f32, grad);
         let [l1, mse, ssim] = sums.map(|s| s * mean);
-        let loss = by[0] * l1 + by[1] * mse + by[2] * (1.0 - ssim);
+        let loss = (1.0 - f64::from(lambda)) * l1 + f64::from(lambda) * (1.0 - ssim);
         Ok(LossValue { loss, l1, mse, ssim })
     }
 
@@ -110,8 +97,8 @@ impl ImageLoss {
             .fold([0.0; 3], |s, p| [s[0] + p[0], s[1] + p[1], s[2] + p[2]])
     }
 
-    /// Pass 2: blurs the maps and adds the gradients of L1 and MSE, whose slopes are given.
-    fn gradient(&self, level: SimdLevel, pair: Pair, slopes: [f32; 2], grad: &mut [f32]) {
+    /// Pass 2: blurs the maps and adds the gradient of L1.
+    fn gradient(&self, level: SimdLevel, pair: Pair, l1: f32, grad: &mut [f32]) {
         let values = pair.row_values();
         let maps = [&self.maps[0][..], &self.maps[1][..], &self.maps[2][..]];
         parallel_for(
@@ -121,7 +108,7 @@ impl ImageLoss {
             &|g, r, middle| g.split_at_mut((middle - r.start) * values),
             &|r, g| {
                 let columns = columns(&self.spans, &r, 10, 30, values);
-                gradient_rows(level, pair, &maps, slopes, r.start, &columns, g);
+                gradient_rows(level, pair, &maps, l1, r.start, &columns, g);
             },
         );
     }

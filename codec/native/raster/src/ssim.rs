@@ -130,7 +130,7 @@ dispatch!(
 fn gradient_kernel<V: Vector>(
     pair: Pair,
     maps: &[&[f32]; 3],
-    slopes: [f32; 2],
+    l1: f32,
     first_row: usize,
     columns: &Range<usize>,
     grad: &mut [f32],
@@ -162,20 +162,13 @@ fn gradient_kernel<V: Vector>(
                     vertical::<f32, 1>(&map, k.clone(), at, offset, temp);
                 }
             }
-            gradient_strip::<V>(pair, slopes, row, &strip, &temp, &mut grad[start..start + strip.n]);
+            gradient_strip::<V>(pair, l1, row, &strip, &temp, &mut grad[start..start + strip.n]);
         }
     }
 }
 
 #[inline(always)]
-fn gradient_strip<V: Vector>(
-    pair: Pair,
-    [l1, mse]: [f32; 2],
-    row: usize,
-    strip: &Strip,
-    temp: &[Wide; 3],
-    grad: &mut [f32],
-) {
+fn gradient_strip<V: Vector>(pair: Pair, l1: f32, row: usize, strip: &Strip, temp: &[Wide; 3], grad: &mut [f32]) {
     let at = row * pair.row_values() + strip.start;
     let mut local = [Narrow::ZERO; 2];
     local[0].copy(&pair.image[at..at + strip.n]);
@@ -184,9 +177,8 @@ fn gradient_strip<V: Vector>(
     for i in (0..strip.n).step_by(V::LANES) {
         let (x, y) = (V::load(&local[0].0[i..]), V::load(&local[1].0[i..]));
         let [d_x, d_xx, d_xy] = horizontal::<V, 3>(temp, i);
-        let by_l1 = c::<V>(l1).select(y.lt(x), zero) - c::<V>(l1).select(x.lt(y), zero);
-        let by_difference = c::<V>(mse).mul_add(x - y, by_l1);
-        let g = y.mul_add(d_xy, (x + x).mul_add(d_xx, d_x + by_difference));
+        let sign = c::<V>(l1).select(y.lt(x), zero) - c::<V>(l1).select(x.lt(y), zero);
+        let g = y.mul_add(d_xy, (x + x).mul_add(d_xx, d_x + sign));
         g.store(&mut local[0].0[i..]);
     }
     grad.copy_from_slice(&local[0].0[..strip.n]);
@@ -196,7 +188,7 @@ dispatch!(
     pub fn gradient_rows = gradient_kernel(
         pair: Pair,
         maps: &[&[f32]; 3],
-        slopes: [f32; 2],
+        l1: f32,
         first_row: usize,
         columns: &Range<usize>,
         grad: &mut [f32],

@@ -1,7 +1,7 @@
 //! The image side of a training step in one call: render, compare with an 8-bit target image, differentiate.
 //!
 //! Target: unassociated 8-bit colour and optional alpha, composited on the same background as the Gaussians. Loss: the image
-//! loss (`loss.rs`), plus mask_lambda * mean |alpha - target alpha|, plus depth_lambda * mean |D - alpha d| / d, with D the sum of weight
+//! loss, plus mask_lambda * mean |alpha - target alpha|, plus depth_lambda * mean |D - alpha d| / d, with D the sum of weight
 //! times depth and d the target depth, where that is known. No buffer with a value per pixel passes through the caller.
 
 use rayon::prelude::*;
@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use crate::clock::Clock;
 use crate::error::{RasterError, check_length};
 use crate::image_pair::Pair;
-use crate::loss::{ImageLoss, ImageWeights, LossValue};
+use crate::loss::{ImageLoss, LossValue};
 use crate::rasterizer::Rasterizer;
 use crate::scene::{Background, Gradients, Splats, View};
 
@@ -26,7 +26,7 @@ pub struct TargetImage<'a> {
 
 #[derive(Clone, Copy)]
 pub struct Lambdas {
-    pub image: ImageWeights,
+    pub ssim: f32,
     pub mask: f32,
     pub depth: f32,
 }
@@ -121,7 +121,7 @@ impl Step {
             target: &self.target,
             width: view.size.width,
         };
-        let image = self.loss.run(r.level(), pair, lambdas.image, &mut self.grad_image)?;
+        let image = self.loss.run(r.level(), pair, lambdas.ssim, &mut self.grad_image)?;
         let mask = self.rows.iter().map(|s| s[0]).sum::<f64>() / n as f64;
         let (gain, offset) = self.exposure_gradient(r, view.size.width, background, target.offset);
         Ok(StepValue {

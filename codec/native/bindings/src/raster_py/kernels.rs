@@ -3,28 +3,23 @@
 use numpy::{PyArray1, prelude::*};
 use pyo3::prelude::*;
 use raster::trajectory::{self, BitPrice, Trajectories};
-use raster::{Adam, ImageLoss, ImageWeights, Pair, SimdLevel};
+use raster::{Adam, ImageLoss, Pair, SimdLevel};
 
 use super::arrays::{In, InOut, contiguous, level, usage};
 
 /// (loss, l1, mse, ssim, gradient [H * W * 3]) of an image [H, W, 3].
 #[pyfunction]
-#[pyo3(signature = (image, target, ssim_lambda, mse_lambda=0.0, simd="auto"))]
+#[pyo3(signature = (image, target, ssim_lambda, simd="auto"))]
 #[allow(clippy::type_complexity)]
 pub fn image_loss<'py>(
     py: Python<'py>,
     image: In,
     target: In,
     ssim_lambda: f32,
-    mse_lambda: f32,
     simd: &str,
 ) -> PyResult<(f64, f64, f64, f64, Bound<'py, PyArray1<f32>>)> {
     let (level, width) = (level(simd)?, image.shape().get(1).copied().unwrap_or(0));
     let (x, y) = (contiguous(image.as_slice())?, contiguous(target.as_slice())?);
-    let weights = ImageWeights {
-        ssim: ssim_lambda,
-        mse: mse_lambda,
-    };
     let pair = Pair {
         image: x,
         target: y,
@@ -34,7 +29,7 @@ pub fn image_loss<'py>(
         .detach(|| {
             let mut grad = vec![0.0; x.len()];
             ImageLoss::default()
-                .run(level, pair, weights, &mut grad)
+                .run(level, pair, ssim_lambda, &mut grad)
                 .map(|v| (v, grad))
         })
         .map_err(usage)?;
