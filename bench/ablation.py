@@ -41,8 +41,8 @@ FRAMES = {LUMBERJACK: (0, 10), STAGE: (7, 15), BASKETBALL: (0, 8), FAST: (0, 12)
 EQUAL = 0.05  # share by which times may differ
 SEEDS = {
     1: tuple(FRAMES),
-    **dict.fromkeys((2, 3), (LUMBERJACK, FEW)),
-    **dict.fromkeys((4, 5), (LUMBERJACK,)),
+    2: (LUMBERJACK, FEW),
+    **dict.fromkeys((3, 4, 5), (LUMBERJACK,)),
 }  # besides 0
 RUNS = 3  # until they do not, at most; the nearest one counts
 CURVE = (-5.0, 5.0)  # qualities besides, from the one that was asked for
