@@ -31,7 +31,7 @@ from gscodec.train.settings import MOTIONS, TrackingSettings, TrainSettings, tra
 
 from . import train
 from .machine import ROOT, update_entries
-from .stress import BUDGET
+from .stress import budget_of
 from .stress_scenes import CASES as STRESS
 from .stress_scenes import drawn
 
@@ -180,8 +180,8 @@ def run(
     for capture in captures:
         opened = _open(capture, data)
         chosen = names or [n for n, v in VARIANTS.items() if capture in v.captures]
-        settings = train_settings(preset, quality=quality, **(BUDGET if capture in STRESS else {}))
-        entries = ({"capture": capture, **entry} for entry in _entries(opened, chosen, preset, settings))
+        settings = train_settings(preset, quality=quality, **(budget_of(capture) if capture in STRESS else {}))
+        entries = ({"capture": capture, "preset": preset, **entry} for entry in _entries(opened, chosen, settings))
         yield from update_entries(out, entries, lambda e: [e["capture"], e["variant"], e["preset"]])
 
 
@@ -198,18 +198,18 @@ def _open(capture: str, data: Path | None) -> Capture:
     return train.CASES[capture].open(data).frames(first, end).scaled(0.5)
 
 
-def _entries(capture: Capture, names: Sequence[str], preset: str, settings: TrainSettings) -> Iterator[dict]:
-    quality, whole, kb = settings.quality, None, None  # seconds and bytes of the whole recipe
+def _entries(capture: Capture, names: Sequence[str], settings: TrainSettings) -> Iterator[dict]:
+    whole, kb = None, None  # seconds and bytes of the whole recipe
     if any(VARIANTS[name].equal for name in names):
         names = [WHOLE, *(name for name in names if name != WHOLE)]
     for name in names:
         variant = VARIANTS[name]
         changed, trained = _trained(capture, variant, variant.change(settings), whole if variant.equal else None)
-        entry = {"variant": name, "preset": preset, **_measured(capture, trained, changed, quality)}
+        entry = {"variant": name, **_measured(capture, trained, changed, settings.quality)}
         if name == WHOLE:
             whole, kb = trained.seconds, entry["kb_per_frame"]
         elif variant.equal and variant.recipe is ours:
-            entry |= _at_bytes(capture, trained, quality, entry, kb)
+            entry |= _at_bytes(capture, trained, settings.quality, entry, kb)
         yield entry
 
 

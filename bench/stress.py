@@ -59,11 +59,16 @@ def measure(names: list[str], out: Path, frames: int | None = None) -> Iterator[
     return update_entries(out, (_entry(name, CASES[name], frames) for name in names), lambda e: e["case"])
 
 
+def budget_of(case: str) -> dict:
+    """Changes of the training settings with which a case is trained."""
+    return BUDGET | BUDGETS.get(case, {})
+
+
 def _entry(name: str, case: Stress, frames: int | None) -> dict:
     head = {"case": name, "frames": min(case.frames, frames or case.frames), "floor": case.floor, "why": case.why}
     try:
         capture = case.capture(head["frames"])
-        found = compare(capture, **(BUDGET | BUDGETS.get(name, {})))
+        found = compare(capture, **budget_of(name))
     except UsageError:
         raise  # the data is not there
     except Exception as e:  # a crash is a result
