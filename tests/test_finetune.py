@@ -258,26 +258,6 @@ def test_nodes_that_carry_only_what_rests_stay(capture):
     assert far[carriers.numpy()].min() > 0
 
 
-def test_a_group_that_falls_apart_has_the_usual_rates(capture, monkeypatch):
-    advance, tries = Tracker.advance, []
-
-    def found(tracker, *args):
-        loss = advance(tracker, *args)
-        tracker.searched = True
-        return loss
-
-    def noted(*args, **options):
-        tries.append(finetune(*args, **options))
-        return tries[-1]
-
-    monkeypatch.setattr(Tracker, "advance", found)
-    monkeypatch.setattr("gscodec.train.train.finetune", noted)
-    wild = dataclasses.replace(TINY.finetune, fast_rate=1e4)
-    group = next(train_groups(capture, dataclasses.replace(TINY, finetune=wild)))
-    assert tries == [False, True]
-    assert min(psnr_of(group.frame(t), capture, t) for t in range(len(group))) > 30
-
-
 def test_trajectories_do_not_outgrow_the_bound_on_sizes():
     capture = capture_of(turning(300, frames=3), masks=False)
     views = Views(capture, TINY, CpuBackend())

@@ -102,10 +102,6 @@ class Exposure(_Learned):
         away = self._frame_weight * ((values[camera] - self.values[camera]) / self._frame_free).clip(-1, 1)
         self._step(values, str(frame), camera, own + away, decay)
 
-    def forget(self, frames: range) -> None:
-        """The frames of a group have no values of their own, as before it."""
-        self._of_frame = {t: values for t, values in self._of_frame.items() if t not in frames}
-
     def go_on(self, frame: int) -> None:
         """Later frames begin as `frame`, the last one of a group."""
         self.values = self._of_frame.get(frame, self.values).copy()

@@ -12,7 +12,6 @@ views of one frame. While they are rendered, the step before is taken: a gradien
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -232,50 +231,33 @@ def finetune(
     *,
     radius: float,
     on_step: Callable[[int, float], None] | None = None,
-) -> bool:
+) -> None:
     """Optimises the coefficients of `group`, its nodes and its new canonical Gaussians over all `frames`, in place.
 
     Args:
         radius: of the moving Gaussians, world units.
         on_step: called with (step, loss) for each view of a step.
-
-    Returns:
-        False: rates were too high for these frames, the model has fallen apart and is of no use.
     """
     steps = -(-views_to_draw(group, settings) // settings.finetune.views)
     run = _Finetuner(group, views, frames, settings, radius)
     order: list[int] = []
-    bound, first_round = math.inf, len(_round_of_frames(len(frames)))
     larger = settings.finetune.views**0.5  # rates, since the gradient of several views has less noise
     for step in range(steps):
         order = order or run.rng.permutation(_round_of_frames(len(frames))).tolist()
-        if step == first_round:
-            bound = settings.finetune.apart * run.loss
         if step == round(settings.finetune.topology_at * steps):
-            if _above(run.loss, bound):
-                break
             run.change_topology()
         loss = run.step(order.pop(), larger * _rate(step / steps, settings.finetune))
         for _ in range(settings.finetune.views if on_step else 0):
             on_step(step, loss)
     run.finish()
-    if _above(run.loss, bound):
-        views.exposure.forget(frames)
-        return False
     run.limit_sizes()
     views.exposure.go_on(frames[-1])
-    return True
 
 
 def views_to_draw(group: GroupModel, settings: TrainSettings) -> int:
     """Views for the fine-tuning of a group; a short one behind a keyframe has those of `frames_min` frames."""
     least = 0 if group.known else settings.finetune.frames_min
     return round(settings.finetune_steps * max(group.frames, least))
-
-
-def _above(loss: float, bound: float) -> bool:
-    """Whether the loss is above the bound, or no number."""
-    return loss > bound or math.isnan(loss)
 
 
 def _rate(done: float, settings: FinetuneSettings) -> float:

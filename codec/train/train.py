@@ -230,14 +230,11 @@ class _Run:
             nominal, g = steps_for(quality, subject.radius), track.models[t].gaussians()
             subject.steps = measured_steps(g, quality, nominal, cameras, backend=self.views.backend)
         graph, steps = subject.tracker.graph, subject.steps
-        searched, usual = float(np.mean(track.searched)), self.settings
-        self.progress.total -= usual.finetune_steps * len(frames)
-        for settings in (usual.of_fast_motion(len(frames), searched), usual) if searched else (usual,):
-            model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), settings)
-            self.progress.total += views_to_draw(model, settings)
-            on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
-            if finetune(model, self.views, frames, settings, radius=subject.tracker.radius, on_step=on_step):
-                break
+        settings = self.settings.of_fast_motion(float(np.mean(track.searched)))
+        model = GroupModel(graph, subject.canonical, track.models, track.poses, steps, track.moved(), settings)
+        self.progress.total += views_to_draw(model, settings) - self.settings.finetune_steps * len(frames)
+        on_step = self._report(f"fine-tune {frames[0]}-{frames[-1]}")
+        finetune(model, self.views, frames, settings, radius=subject.tracker.radius, on_step=on_step)
         return model
 
 

@@ -176,24 +176,19 @@ class TrainSettings:
             motion_field=replace(self.motion_field, tracking=tracked),
         )
 
-    def of_fast_motion(self, frames: int, share: float) -> TrainSettings:
-        """The settings of a group of so many frames, of which a search has found this share: they change their light
-        and shape as fast. What a search finds is many quantization steps off, and coefficients are faster; but Adam
-        goes on along the gradient of a frame until that frame comes again. With more steps a frame fewer frames have
-        enough of them.
-        """
+    def of_fast_motion(self, share: float) -> TrainSettings:
+        """The settings of a group of which a search has found this share of the frames: they change their light and
+        shape as fast, and more of each is its own."""
         f = self.finetune
-        steps, canonical = 1 + f.fast_steps * share, 1 + f.fast_canonical * share
+        canonical = 1 + f.fast_canonical * share
         finetune = replace(
             f.with_frequencies(1 + f.fast_frequencies * share),
-            coefficient_rate=(1 + f.fast_rate * share / frames) * f.coefficient_rate,
             canonical_means_rate=canonical * f.canonical_means_rate,
             canonical_rate_share=canonical * f.canonical_rate_share,
-            frames_min=f.frames_min / steps,
+            frames_min=f.frames_min / (1 + f.fast_steps * share),
             warmup=f.fast_warmup * share,
-            apart=f.fast_apart,
         )
-        return replace(self, finetune=finetune, finetune_steps=round(steps * self.finetune_steps))
+        return replace(self, finetune=finetune, finetune_steps=round((1 + f.fast_steps * share) * self.finetune_steps))
 
 
 PRESETS = {

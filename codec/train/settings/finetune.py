@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields, replace
 
 from ...model.attributes import BY_NAME, FREQUENCIES_OF
@@ -23,12 +22,10 @@ class FinetuneSettings:
 
     frequencies: dict[str, int] = field(default_factory=temporal_frequencies)
     frequencies_frames: int = FREQUENCIES_OF  # frames that `frequencies` is for
-    fast_frequencies: float = 3.0  # times as many besides, where all frames were searched for (`Tracker.searched`)
-    fast_rate: float = 20.0  # so many times, over the frames of the group, as fast coefficients besides, there
+    fast_frequencies: float = 1.0  # times as many besides, where all frames were searched for (`Tracker.searched`)
     fast_steps: float = 4.0  # times as many steps a frame besides, there, since more of each frame is its own
     fast_canonical: float = 1.0  # times as fast canonical attributes besides, there
     fast_warmup: float = 0.1  # share of the steps in which rates rise, there: at once they undo what was tracked
-    fast_apart: float = 4.0  # `apart` there; the group then has the usual settings
     warmup: float = 0.0  # the same elsewhere: what the first steps undo, they also free
     free_min: float = 0.5  # quantization steps: a residual from the start, so that a resting Gaussian stays free
     dead_zone: float = 0.1  # quantization steps more than half of one, below which a coefficient is not coded
@@ -54,7 +51,6 @@ class FinetuneSettings:
     rate_every: int = 8  # steps: the rate term has every coefficient, an image few; its weight grows by as much
     canonical_rate_every: int = 24  # steps for which the gradient of the canonical bits, and their noise, are held
     loss_smoothing: float = 0.05  # share of one step in the running mean of the loss
-    apart: float = math.inf  # times the loss of the first round of frames, above which the model has fallen apart
 
     def with_frequencies(self, times: float) -> FinetuneSettings:
         """The same with so many times the frequencies."""
