@@ -127,7 +127,7 @@ VARIANTS = {
     "no mask term": Variant(run_with(mask_lambda=0.0), (LUMBERJACK,)),
     "no rigidity": Variant(run_with(rigidity=0.0)),
     "nodes alone": Variant(run_with(motion_field=MOTIONS["nodes"]), tuple(FRAMES), equal=True),
-    **by_seeds("nodes alone, ", motion_field=MOTIONS["nodes"]),
+    **by_seeds("nodes alone ", motion_field=MOTIONS["nodes"]),
     "field alone": Variant(  # the nodes have no variables of their own; it learns as fast as behind a search
         all_of(
             stage_with("finetune", node_rotation_rate=0.0, node_translation_rate=0.0),

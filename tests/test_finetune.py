@@ -185,6 +185,15 @@ def test_few_views_have_dearer_bits_and_a_faster_field(capture):
     assert [f.searched_rates * f.grid_rate for f in fields] == pytest.approx([slow.searched_rates * slow.grid_rate] * 3)
 
 
+def test_many_views_need_no_prior_and_no_dropout(capture):
+    cameras, k = len(capture.indices("train")), TINY.keyframe
+    few, many = (dataclasses.replace(TINY, few_views=n * cameras).of_capture(capture) for n in (2, 0.5))
+    assert [few.harmonics_lambda, few.keyframe.dropout] == [TINY.harmonics_lambda, k.dropout]
+    assert [many.harmonics_lambda, many.keyframe.dropout] == [TINY.harmonics_lambda / 4, k.dropout / 16]
+    room = TINY.of_capture(capture_of(turning(300, frames=3), masks=False))
+    assert [room.harmonics_lambda, room.keyframe.dropout] == [TINY.harmonics_lambda, 0.0]
+
+
 @pytest.mark.parametrize("drift", [0.2, 0.0])
 def test_a_camera_whose_brightness_drifts_is_followed(capture, drift):
     """In each frame, up to what all cameras share; one that does not drift is the same in all frames."""

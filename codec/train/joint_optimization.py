@@ -75,7 +75,7 @@ class _Finetuner:
         for target, by_exposure in zip(targets, result.grad_exposure, strict=True):
             self.views.exposure.learn_in(self.frames[t], target.index, by_exposure, decay)
         residuals, canonical, by_rotations = group.gradients(frame, result.grads)
-        add_harmonics_prior(canonical, group.key.params, self.views, self.settings, f.views)
+        add_harmonics_prior(canonical, group.key.params, self.settings, f.views)
         self._step_nodes(t, frame, result.grads["means"], by_rotations, decay)
         if self.settings.rate_lambda and self.rng.integers(f.rate_every) == 0:
             weight = f.rate_every * self._bit_weight()

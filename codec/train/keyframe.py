@@ -127,8 +127,6 @@ class _Run:
         self.model, self.views, self.frame, self.settings = model, views, frame, settings
         self.steps, self.radius, self.losses = steps, radius, []
         self.rng = np.random.default_rng([settings.seed, frame])
-        few = k.dropout * min(1.0, k.dropout_views / len(views.train_cameras)) ** 4
-        self.dropout = few if views.capture.has_alpha else 0.0
         self.statistics = Statistics(len(model), k.mse_min)
         self._started: _View | None = None
         self._opacity_decay = self._decay_of_opacities()
@@ -139,7 +137,7 @@ class _Run:
         """Starts one view, and meanwhile takes the step along the one before."""
         s, views = self.settings, self.views
         target = views.draw(self.frame, picture_scale(step / self.steps, views.largest_side, s.keyframe))
-        params = _without_some(self.model.params, self.dropout * step / self.steps, self.rng)
+        params = _without_some(self.model.params, s.keyframe.dropout * step / self.steps, self.rng)
         pending = start_photometric_loss(params, [target], s, self.rng, views.backend)
         self.finish()
         self._started = _View(step, target, pending)
@@ -157,7 +155,7 @@ class _Run:
         views.exposure.learn(view.target.index, result.grad_exposure[0], decay)
         if view.step >= k.appearance_from * self.steps:
             views.extrinsics.learn(view.target.index, model.params, result.grads, decay)
-        add_harmonics_prior(result.grads, model.params, views, self.settings)
+        add_harmonics_prior(result.grads, model.params, self.settings)
         if k.opacity_decay:
             add_opacity_decay(result.grads, model.params, self._opacity_decay)
         means_decay = (k.means_rate_end / k.rates["means"]) ** progress

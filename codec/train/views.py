@@ -267,11 +267,11 @@ def _weights(settings: TrainSettings) -> LossWeights:
 
 
 def add_harmonics_prior(
-    grads: dict[str, torch.Tensor], params: dict, views: Views, settings: TrainSettings, pictures: int = 1
+    grads: dict[str, torch.Tensor], params: dict, settings: TrainSettings, pictures: int = 1
 ) -> None:
     """Adds to the gradients of `pictures` those of half the square of the harmonics."""
-    shN, many = params["shN"], len(views.train_cameras) / settings.harmonics_views
-    grads["shN"].add_(shN, alpha=pictures * settings.harmonics_lambda / max(1.0, many) ** 2 / len(shN))
+    shN = params["shN"]
+    grads["shN"].add_(shN, alpha=pictures * settings.harmonics_lambda / len(shN))
 
 
 def view_losses(

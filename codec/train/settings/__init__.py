@@ -85,13 +85,11 @@ class TrainSettings:
         mask_lambda: weight of the alpha loss where the capture has masks.
         depth_lambda: weight of the depth loss where the capture has depth images.
         harmonics_lambda: weight of half the square of the harmonics, mean over the Gaussians: they cost bits.
-        harmonics_views: training cameras up to which it has that weight; with more, which say more of them themselves,
-            it falls with their square.
         turned_harmonics: harmonics turn with the nodes; otherwise they stay in the world.
         cut_ratio: a frame whose image loss exceeds that of the frame before by this factor starts anew.
         rigidity: weight of the as-rigid-as-possible term.
         rate_lambda: share by which the image loss may rise where bits fall by one share.
-        few_views: training cameras below which views are few (`of_capture`).
+        few_views: training cameras below which views are few, and above which they are many (`of_capture`).
         quality: quantization that the rate term assumes (0 to 100).
         seed: of every random number.
         cache_bytes: of decoded pictures held in memory, with no effect on the result.
@@ -108,7 +106,6 @@ class TrainSettings:
     mask_lambda: float = 0.1
     depth_lambda: float = 0.1
     harmonics_lambda: float = 0.15
-    harmonics_views: float = 10.0
     turned_harmonics: bool = True
     cut_ratio: float = 1.5
     rigidity: float = 0.3
@@ -146,13 +143,20 @@ class TrainSettings:
     def of_capture(self, capture) -> TrainSettings:
         """The settings for a capture. Few views contradict little of what a frame changes for its own pictures alone:
         the fewer there are, the dearer is a bit, and the faster learns the field, which moves all that is near
-        together. Where there are no masks, they are those of a room, whose field would drag what stands still along.
+        together. Many say themselves what harmonics are worth, and which Gaussians stand alone. Where there are no
+        masks, they are those of a room, whose field would drag what stands still along.
         """
-        few, field = max(1.0, self.few_views / max(1, len(capture.indices("train")))), self.motion_field
+        views = max(1, len(capture.indices("train")))
+        few, many, field = max(1.0, self.few_views / views), max(1.0, views / self.few_views), self.motion_field
         settings = replace(self, rate_lambda=few * self.rate_lambda)
         if not capture.has_alpha:
             return settings._of_room()
-        return replace(settings, motion_field=field.faster(min(few**2, field.searched_rates)))
+        return replace(
+            settings,
+            harmonics_lambda=self.harmonics_lambda / many**2,
+            keyframe=replace(self.keyframe, dropout=self.keyframe.dropout * min(1.0, self.few_views / views) ** 4),
+            motion_field=field.faster(min(few**2, field.searched_rates)),
+        )
 
     def _of_room(self) -> TrainSettings:
         """The settings for a capture without masks."""
@@ -162,11 +166,11 @@ class TrainSettings:
             motion_steps=round(room.motion_steps * self.motion_steps),
             finetune_steps=round(room.finetune_steps * self.finetune_steps),
             rigidity=room.rigidity * self.rigidity,
-            harmonics_views=room.harmonics_views,
             cut_ratio=room.cut_ratio * self.cut_ratio,
             keyframe=replace(
                 self.keyframe,
                 price=room.price * self.keyframe.price,
+                dropout=0.0,
                 opacity_decay=room.opacity_decay,
                 position_noise=room.position_noise,
             ),

@@ -131,8 +131,7 @@ class KeyframeSettings:
     rates: LearningRates = field(default_factory=keyframe_rates)
     means_rate_end: float = 1.6e-5  # radii, at the last step
     rate_decay: float = 0.3  # all other rates at the last step, times those at the first
-    dropout: float = 0.4  # share of the Gaussians that the last step leaves out, with masks and few views
-    dropout_views: float = 10.0  # with more, the share falls with the fourth power of their number
+    dropout: float = 0.4  # share of the Gaussians that the last step leaves out, where views are few
     appearance_from: float = 0.3  # share of the steps; exposure, poses and SH wait for colours that are about right
     gaussians_share: float = 0.8  # of gaussians_max; the rest is left for tracking
     full_size_from: float = 0.4  # share of the steps; before it pictures are smaller

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 
 from ...render.optimizer import AdamSettings
@@ -70,7 +69,6 @@ class RoomSettings:
     rigidity: float = 1 / 3  # times that of a subject
     cut_ratio: float = 5 / 3  # times that of a subject, since few views of a room fit its keyframe far too well
     drift_ratio: float = 3.6  # times that of a subject, for the same reason
-    harmonics_views: float = math.inf  # here more of them gain nothing for other views
     price: float = 2.0  # of a Gaussian, times that of a subject: few views gain more by one than others do
     opacity_decay: float = 0.003  # of a keyframe: no mask removes what floats before the cameras
     position_noise: float = 3.0  # of a keyframe, for the same reason
