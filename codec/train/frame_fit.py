@@ -69,7 +69,7 @@ class FrameFit:
             decay: multiplies all learning rates.
             full: the view has its full size, and counts in the statistics.
             stiff: nodes hold together, and slow: the Gaussians' own attributes follow slowly, where the velocity is
-                not known (`TrackingSettings.stiff_rigidity`, `slow_rates`).
+                not known (`TrackingSettings.stiff_rigidity`, `slow_rates`, `searched_slow_rates`).
         """
         t, s = self.tracker, self.tracker.settings.tracking
         pose, by_field = self._pose()
@@ -85,7 +85,8 @@ class FrameFit:
         free = grads
         if not self._all_move:
             free = {n: g * self._moving.view(-1, *[1] * (g.dim() - 1)) for n, g in grads.items()}
-        self.own.step(free, s.rates.scaled(t.radius, decay * (s.slow_rates if slow else 1.0)))
+        slow_rates = s.searched_slow_rates if t.searched else s.slow_rates
+        self.own.step(free, s.rates.scaled(t.radius, decay * (slow_rates if slow else 1.0)))
         if self._largest is not None:
             self.own.limit_sizes(self._largest)
         return result.image_loss

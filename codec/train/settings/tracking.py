@@ -100,7 +100,8 @@ class TrackingSettings:
     # Without a known velocity, or with that of a search, first rounds: stiff nodes and slow attributes, or else
     # far-moved Gaussians take the colours of what they lie over.
     stiff_rigidity: float = 8.0  # times `rigidity`
-    slow_rates: float = 0.03  # times `rates`
+    slow_rates: float = 0.1  # times `rates`, where the velocity is not known
+    searched_slow_rates: float = 0.03  # the same, behind a search
     mask_factor: float = 3.0  # times mask_lambda: the silhouette does not depend on light
     gradient_quantile: float = 0.995  # of the screen gradients in a keyframe: the reference for densification
     stored_factor: int = 2  # times gaussians_max: all Gaussians of a group, with those already removed
