@@ -184,15 +184,15 @@ class TrainSettings:
         """The settings of a group of which a search has found this share of the frames: they change their light and
         shape as fast, and more of each is its own."""
         f = self.finetune
-        canonical = 1 + f.fast_canonical * share
+        steps, canonical = 1 + f.fast_steps * share, 1 + f.fast_canonical * share
         finetune = replace(
             f.with_frequencies(1 + f.fast_frequencies * share),
             canonical_means_rate=canonical * f.canonical_means_rate,
             canonical_rate_share=canonical * f.canonical_rate_share,
-            frames_min=f.frames_min / (1 + f.fast_steps * share),
+            frames_min=f.frames_min / steps,
             warmup=f.fast_warmup * share,
         )
-        return replace(self, finetune=finetune, finetune_steps=round((1 + f.fast_steps * share) * self.finetune_steps))
+        return replace(self, finetune=finetune, finetune_steps=round(steps * self.finetune_steps))
 
 
 PRESETS = {
