@@ -96,6 +96,29 @@ def test_a_motion_out_of_reach_of_the_gradient_is_searched_for():
     assert search(tracker_of(near), 1, TINY.motion_search.ratio) is None, "a search takes seconds"
 
 
+def test_a_limb_that_swings_is_found_where_parts_do_not():
+    body, rod, end = blob(300), blob(120, seed=1), np.array([1.3, 0.0, 0.8])
+    rod = dataclasses.replace(rod, means=(rod.means * [0.15, 0.15, 0.8] + [1.3, 0, 0]).astype(np.float32))
+    turn = np.array([0.8, 0.0, 0.0])
+    swung = moved(rod, turn, end - quat_to_matrix(rotvec_to_quat(turn)) @ end)
+    first, second = concatenate([body, rod]), concatenate([body, swung])
+    capture = capture_of(GaussianSequence(25.0, [DenseGroup([first, second], None)]))
+    rough = dataclasses.replace(first, sh0=first.sh0 + 0.3 * np.random.default_rng(0).standard_normal((420, 3)))
+
+    def missed(limb_ratio):
+        motion_search = dataclasses.replace(TINY.motion_search, limb_ratio=limb_ratio)
+        tracker = started(rough, capture, dataclasses.replace(TINY, motion_search=motion_search))
+        tracker.moving[:] = True
+        pose = search(tracker, 1, motion_search.ratio) or tracker.pose
+        apart = tracker.graph.carry(tracker.graph.means, pose.next())[0].numpy() - second.means
+        return [float(np.linalg.norm(x, axis=1).mean()) for x in (apart[:300], apart[300:])]
+
+    of_body, of_rod = missed(TINY.motion_search.limb_ratio)
+    assert of_body < 0.05
+    assert of_rod < 0.2
+    assert missed(np.inf)[1] > 0.5, "or the search for limbs has nothing to do"
+
+
 def test_a_motion_that_explains_little_of_an_error_is_none():
     """Few views fit any frame far better than the next one, and some small motion always fits a little better."""
     first, turn, shift = blob(300), np.array([0.0, 0.012, 0.0015]), np.array([0.0135, -0.0045, 0.003])

@@ -3,8 +3,11 @@
 In: a tracker before it fits a frame. Out: its pose with another step to that frame, where one fits much better than
 constant velocity does. First the whole subject is one rigid body, then it has some parts, which are bodies of their
 own. Small pictures of some views are compared. From several turns (the starts) a few steps of the gradient bring all
-parts to the nearest fit; of these motions each part takes the one with which the pictures fit best. What moves besides
-is left to the fit of the frame.
+parts to the nearest fit; of these motions each part takes the one with which the pictures fit best.
+
+Where that leaves much, limbs have swung out of reach, which the gradient hides behind the rest. Small cells without
+which the pictures fit better are lost; those beside each other are one limb, which is turned about either end of its
+longest axis to all directions. What moves besides is left to the fit of the frame.
 """
 
 from __future__ import annotations
@@ -20,11 +23,13 @@ from ..model.rotations import quat_multiply, quat_to_rotvec, rotate, rotvec_to_q
 from ..render.backend import RenderLoss
 from ..render.optimizer import Adam
 from .deformation_graph import Pose
-from .model import quat_product
+from .model import REMOVED_LOGIT, quat_product
 from .views import start_photometric_loss
 
 if TYPE_CHECKING:
     from .tracking import Tracker
+
+END = 1.5  # standard deviations from the middle of a limb to its end: sqrt(3) for a rod
 
 
 def search(tracker: Tracker, frame: int, ratio: float) -> Pose | None:
@@ -37,19 +42,49 @@ def search(tracker: Tracker, frame: int, ratio: float) -> Pose | None:
     usual, before = whole.loss(whole.still), whole.loss_before()
     if usual < ratio * before:
         return None
-    pose = whole.best_pose(usual)
-    parts = _Bodies(tracker, pose or tracker.pose, frame, s.parts)
-    pose = parts.best_pose(parts.loss(parts.still)) or pose
-    if pose is None:
-        return None
+    rigid = whole.best_pose(usual) or tracker.pose
+    parts = _Bodies(tracker, rigid, frame, s.parts)
+    found = parts.best_pose(parts.loss(parts.still)) or rigid
+    least = _loss(tracker, found, frame)
+    if least > s.limb_ratio * before:
+        limbs = _with_limbs(tracker, rigid, frame)
+        if (loss := _loss(tracker, limbs, frame)) < s.gain * least:
+            found, least = limbs, loss
+    return found if usual - least > s.gain_min * before else None
+
+
+def _loss(tracker: Tracker, pose: Pose, frame: int) -> float:
+    """Loss behind the step of `pose`."""
     there = _Bodies(tracker, pose, frame, 1)
-    return pose if usual - there.loss(there.still) > s.gain_min * before else None
+    return there.loss(there.still)
+
+
+def _with_limbs(tracker: Tracker, pose: Pose, frame: int) -> Pose:
+    """`pose` with another step, in which limbs that are lost are where they fit best."""
+    s = tracker.settings.motion_search
+    for _ in range(s.limb_rounds):
+        cells = _Bodies(tracker, pose, frame, s.cells)
+        cells.join(cells.limbs())
+        motion = cells.still
+        for limb in range(1, len(motion)):
+            motion = cells.with_limb(motion, limb)
+        pose = cells.pose(motion)
+    parts = _Bodies(tracker, pose, frame, s.parts)
+    fitted = parts.fitted(parts.still)
+    return parts.pose(fitted) if parts.loss(fitted) < parts.loss(parts.still) else pose
 
 
 def _starts(turn: float) -> np.ndarray:
     """Motions [7, 6] of one part: none, and by `turn` radians either way about each axis."""
     turns = np.concatenate([np.zeros((1, 3)), turn * np.eye(3), -turn * np.eye(3)])
     return np.pad(turns, ((0, 0), (0, 3))).astype(np.float32)
+
+
+def _directions(count: int) -> np.ndarray:
+    """[count, 3] unit vectors, spread evenly (a Fibonacci lattice)."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle, across = np.pi * (1 + 5**0.5) * np.arange(count), np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], 1)
 
 
 class _Bodies:
@@ -59,7 +94,6 @@ class _Bodies:
 
     def __init__(self, tracker: Tracker, pose: Pose, frame: int, parts: int):
         self.tracker, self.settings, self._pose, self._frame = tracker, tracker.settings.motion_search, pose, frame
-        self.still = np.zeros((parts, 6), np.float32)
         views = tracker.views
         places = np.stack([views.camera(i, frame).center for i in views.train_cameras])
         chosen = sorted(farthest_points(places, min(self.settings.views, len(places))))
@@ -70,11 +104,75 @@ class _Bodies:
         self._middle = means[tracker.moving].median(0).values
         self._reach = self.settings.reach * float((means[tracker.moving] - self._middle).norm(dim=1).median())
         self._moving = tracker.moving & self._near(means)
-        means = means[self._moving]
-        self._seeds = means[torch.from_numpy(farthest_points(means.numpy(), parts)).long()]
+        self._means = means[self._moving]
+        self._seeds = self._means[torch.from_numpy(farthest_points(self._means.numpy(), parts)).long()]
+        self.join(np.arange(len(self._seeds)))
+
+    def join(self, part: np.ndarray) -> None:
+        """Makes one part of several: `part` says of each which one it belongs to from here on."""
+        self._of_seed, count = torch.from_numpy(part), int(part.max()) + 1
         self._part = self._nearest(self._params["means"])
-        count = torch.bincount(self._part[self._moving], minlength=parts).clamp(min=1)[:, None]
-        self._centers = torch.zeros(parts, 3).index_add(0, self._part[self._moving], means) / count
+        of_moving = self._part[self._moving]
+        members = torch.bincount(of_moving, minlength=count).clamp(min=1)[:, None]
+        self._centers = torch.zeros(count, 3).index_add(0, of_moving, self._means) / members
+        self.still = np.zeros((count, 6), np.float32)
+
+    def limbs(self) -> np.ndarray:
+        """For each part the limb that it belongs to, from 1, of those without which the pictures fit better; limbs lie
+        apart from each other. 0: it is where it should be."""
+        from scipy.spatial import cKDTree
+
+        part = self._part[self._moving].numpy()
+        present = self._loss(self._params, self._frame).loss
+        worth = [self._loss(self._without(k), self._frame).loss - present for k in range(len(self.still))]
+        lost = sorted((k for k in range(len(worth)) if worth[k] < 0 and (part == k).any()), key=worth.__getitem__)
+        points = {k: self._means[part == k].numpy() for k in lost}
+        trees = {k: cKDTree(points[k]) for k in lost}
+        link = self.settings.link * np.median(cKDTree(self._means.numpy()).query(self._means.numpy(), 2)[0][:, 1])
+        limb = np.zeros(len(worth), int)
+        for k in lost:
+            if limb[k] or limb.max() == self.settings.limbs_max:
+                continue
+            limb[k], grown = limb.max() + 1, [k]
+            while grown:
+                here = points[grown.pop()]
+                beside = [o for o in lost if not limb[o] and trees[o].query(here)[0].min() < link]
+                limb[beside] = limb[k]
+                grown += beside
+        return limb
+
+    def with_limb(self, motion: np.ndarray, limb: int) -> np.ndarray:
+        """`motion`, or the same with this part where it fits best of all directions."""
+        least, s = self.loss(motion), self.settings
+        best, only = motion, np.zeros((len(motion), 1), np.float32)
+        only[limb] = 1
+        tried = [motion + only * turn for turn in self._turns(limb)]
+        for start in sorted(tried, key=self.loss)[: s.limb_starts]:
+            found = self.fitted(start, only)
+            if (loss := self.loss(found)) < least:
+                best, least = found, loss
+        return best
+
+    def _turns(self, part: int) -> list[np.ndarray]:
+        """Motions [6] of a part: none, and about either end of its longest axis, to directions that are not too far."""
+        center, turns = self._centers[part].numpy().astype(float), [np.zeros(6, np.float32)]
+        points = self._means[self._part[self._moving] == part].numpy() - center
+        _, sizes, axes = np.linalg.svd(points, full_matrices=False)
+        half = END * sizes[0] / np.sqrt(len(points))
+        for arm in (half * axes[0], -half * axes[0]):  # from the end to the center
+            for direction in half * _directions(self.settings.directions):
+                axis = np.cross(arm, direction)
+                angle = np.arctan2(np.linalg.norm(axis), arm @ direction)
+                if 0 < angle < self.settings.limb_turn:
+                    turn = angle / np.linalg.norm(axis) * axis
+                    turns.append(np.r_[turn, (direction - arm) / self.tracker.radius].astype(np.float32))
+        return turns
+
+    def _without(self, part: int) -> dict[str, torch.Tensor]:
+        """The Gaussians without those of a part."""
+        gone = self._moving & (self._part == part)
+        opacities = torch.where(gone, REMOVED_LOGIT, self._params["logit_opacities"])
+        return {**self._params, "logit_opacities": opacities}
 
     def _near(self, points: torch.Tensor) -> torch.Tensor:
         """[P] bool, which of `points` [P, 3] are not of a far background."""
@@ -82,7 +180,7 @@ class _Bodies:
 
     def _nearest(self, points: torch.Tensor) -> torch.Tensor:
         """Part of each of `points` [P, 3]."""
-        return torch.cdist(points, self._seeds).argmin(1)
+        return self._of_seed[torch.cdist(points, self._seeds).argmin(1)]
 
     def _loss(self, params: dict, frame: int) -> RenderLoss:
         t = self.tracker
@@ -110,8 +208,8 @@ class _Bodies:
         moved = {"means": means, "quats": quat_product(turn.contiguous(), p["quats"])}
         return {**p, **{n: torch.where(self._moving[:, None], x, p[n]) for n, x in moved.items()}}
 
-    def fitted(self, motion: np.ndarray) -> np.ndarray:
-        """The motion that some steps of the gradient reach from `motion`."""
+    def fitted(self, motion: np.ndarray, only: np.ndarray | float = 1.0) -> np.ndarray:
+        """The motion that some steps of the gradient reach from `motion`; `only`: [parts, 1], 1 for those that move."""
         t, s = self.tracker, self.settings
         values, adam = {"motion": motion.copy()}, Adam(t.views.backend, t.settings.tracking.node_adam)
         for step in range(s.steps):
@@ -123,7 +221,7 @@ class _Bodies:
             torque = torch.linalg.cross(arm, by_means)
             torque += 0.5 * quat_product(by_quats, params["quats"], inverse_b=True)[:, 1:]
             by = torch.zeros(len(motion), 6).index_add(0, self._part, torch.cat([torque, t.radius * by_means], 1))
-            adam.step(values, {"motion": by.numpy()}, {"motion": s.rate * s.rate_decay ** (step / s.steps)})
+            adam.step(values, {"motion": only * by.numpy()}, {"motion": s.rate * s.rate_decay ** (step / s.steps)})
         return values["motion"]
 
     def chosen(self, start: float, found: list[np.ndarray]) -> np.ndarray:

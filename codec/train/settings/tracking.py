@@ -125,6 +125,14 @@ class MotionSearchSettings:
     parts: int = 8  # rigid bodies of the second search
     reach: float = 4.0  # times the median distance of what moves from its middle: farther is background
     gain: float = 0.9  # a motion is taken if its loss is this share of the best one so far
+    limb_ratio: float = 2.0  # times the loss of the frame before, from which limbs are searched for
+    limb_rounds: int = 2  # of that search, each with cells of its own
+    cells: int = 24  # of which those that are lost make the limbs
+    link: float = 1.3  # spacings of the Gaussians within which cells are of one limb
+    limbs_max: int = 4  # in one round
+    directions: int = 48  # to which a limb is turned
+    limb_turn: float = 2.0  # radians, of the farthest
+    limb_starts: int = 4  # directions from which the gradient goes on
     gain_min: float = 0.45  # times the loss of the frame before: what it must take away in the end
 
 
