@@ -482,3 +482,11 @@ def test_report_is_json(tmp_path):
     facts = json.loads(json.dumps(report.to_json()))
     assert facts["bytes"] == (tmp_path / "a.gsv").stat().st_size
     assert facts["kb_per_frame"] == pytest.approx(facts["bytes"] / 6 / 1000)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_the_unit_of_a_scene_changes_nothing(unit):
+    g = blob(800)
+    other = replace(g, means=np.float32(unit) * g.means, log_scales=g.log_scales + np.float32(np.log(unit)))
+    usual, in_unit = (coded(DenseGroup([x]), 50)[0].payload for x in (g, other))
+    assert len(in_unit) == pytest.approx(len(usual), rel=0.03)

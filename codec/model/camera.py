@@ -150,7 +150,8 @@ def cameras_around(
     low_pass: float = LOW_PASS,
 ) -> list[Camera]:
     """Cameras in Fibonacci directions around the box of the 1st to 99th percentile of `points` ([N, 3]); even ones have
-    its bounding sphere just in frame, odd ones stand at half that distance.
+    its bounding sphere just in frame, odd ones stand at half that distance. Their near planes are at `NEAR`, or at a
+    hundredth of their distance where that is less, so that scenes of any unit are seen.
 
     Args:
         size: width and height; focal: focal length in widths; turn: of all directions about z, radians;
@@ -163,7 +164,7 @@ def cameras_around(
     K = np.array([[f, 0, size / 2], [0, f, size / 2], [0, 0, 1]])
     cameras = []
     for i, direction in enumerate(fibonacci_directions(count, turn)):
-        eye = center + direction * distance * (0.5 if i % 2 else 1)
-        viewmat = look_at(eye, center, (0, 0, 1))
-        cameras.append(Camera(f"{name}{i:02}", K, viewmat, size, size, split="test", low_pass=low_pass))
+        away = distance * (0.5 if i % 2 else 1)
+        viewmat, near = look_at(center + direction * away, center, (0, 0, 1)), min(NEAR, 0.01 * away)
+        cameras.append(Camera(f"{name}{i:02}", K, viewmat, size, size, split="test", near=near, low_pass=low_pass))
     return cameras

@@ -30,7 +30,7 @@ def up_vector(axis: str) -> np.ndarray:
 
 def orbit_camera(g: Gaussians, up: str, turn: float, width: int, height: int, near: float, low_pass: float) -> Camera:
     """A camera around the 1-99 % box of `g` with its bounding sphere in frame; `turn` in turns, `near` plane in world
-    units, `low_pass` in px^2."""
+    units, at most half of the distance, `low_pass` in px^2."""
     low, high = np.percentile(g.means, [1, 99], axis=0) if len(g) else (np.zeros(3), np.ones(3))
     centre, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
     u = up_vector(up)
@@ -39,7 +39,8 @@ def orbit_camera(g: Gaussians, up: str, turn: float, width: int, height: int, ne
     half = np.radians(FIELD_OF_VIEW) / 2
     angle = 2 * np.pi * turn
     direction = np.cos(angle) * side + np.sin(angle) * ahead + 0.2 * u
-    eye = centre + direction / np.linalg.norm(direction) * radius / np.sin(half)
+    distance = radius / np.sin(half)
+    eye, near = centre + direction / np.linalg.norm(direction) * distance, min(near, distance / 2)
     f = min(width, height) / 2 / np.tan(half)
     K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
     return Camera("orbit", K, look_at(eye, centre, u), width, height, near=near, low_pass=low_pass)
