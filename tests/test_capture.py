@@ -101,6 +101,20 @@ def test_near_plane_is_the_files_or_a_share_of_the_distance(rig):
     assert {c.low_pass for c in save().cameras} == {PIXEL_LOW_PASS}
 
 
+def test_a_world_of_map_coordinates_is_moved(rig):
+    """Single precision has half a metre there."""
+    _, data, save = rig
+    usual = save()
+    for f in data["frames"]:
+        for row, shift in zip(f["transform_matrix"], (500_000, 5_000_000, 100, 0), strict=True):
+            row[3] += shift
+    with pytest.warns(UserWarning, match=r"\(500000.0, 5000000.0, 100.0\) is the origin"):
+        moved = save()
+    for a, b in zip(usual.cameras, moved.cameras, strict=True):
+        np.testing.assert_allclose(a.viewmat, b.viewmat, atol=1e-8)
+        assert a.near == pytest.approx(b.near)
+
+
 def test_frame_range_and_scale(rig):
     capture = rig[2]().frames(1, None).scaled(0.5)
     assert capture.frame_count == 1

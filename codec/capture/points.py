@@ -21,7 +21,7 @@ class Points:
     """Sparse points of the scene, as it is in frame 0 of the capture.
 
     Attributes:
-        means: [N, 3] f32, world units.
+        means: [N, 3] float, world units.
         colors: [N, 3] u8 sRGB.
     """
 
@@ -46,7 +46,7 @@ def checked(source: Path, means: np.ndarray, colors: np.ndarray) -> Points:
     if not finite.any():
         raise CaptureError(f"{source}: no points, expected sparse points of the scene; delete the file to go without")
     shades = np.rint(colors[finite]).clip(0, 255).astype(np.uint8)
-    return Points(np.ascontiguousarray(means[finite], np.float32), np.ascontiguousarray(shades))
+    return Points(np.ascontiguousarray(means[finite], np.float64), np.ascontiguousarray(shades))
 
 
 def read_ply_points(path: Path) -> Points:

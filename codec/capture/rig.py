@@ -6,6 +6,7 @@ calibration of one camera. Where the footage is a smaller copy of the calibrated
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Callable, Sequence
@@ -27,6 +28,7 @@ from .video import Video
 
 FPS = 30.0  # where nothing says it
 NEAR_SHARE = 0.2  # of the depth at which the optical axes meet: nothing that is nearer is part of the scene
+ROUNDED = 0.1  # pixels by which single precision may move what is as far away as the cameras are apart
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
 Track = Sequence[Camera]  # one camera in each frame of its feed; a single entry holds for all frames
 
@@ -162,6 +164,14 @@ def assemble(
         CaptureError: the feeds have no frames.
     """
     tracks, feeds, frame_count = _same_length(tracks, feeds)
+    if (origin := _origin(tracks)).any():
+        warnings.warn(
+            f"{name}: cameras so far from the origin of the world that single precision would blur the scene; it is "
+            f"moved, so that {tuple(origin.tolist())} is the origin, in the stream, too",
+            stacklevel=4,
+        )
+        tracks = [[c.seen_from(origin) for c in track] for track in tracks]
+        points = points and replace(points, means=points.means - origin)
     tracks = _as_drawn(_still(tracks))
     lenses = [Undistortion() for _ in tracks]
     pinholes = [[lens.camera(c) for c in track] for lens, track in zip(lenses, tracks, strict=True)]
@@ -215,6 +225,19 @@ def _find_masks(feeds: Sequence[Feed]) -> None:
     )
     for feed in feeds:
         feed.background, feed.has_alpha = color, True
+
+
+def _origin(tracks: Sequence[Track]) -> np.ndarray:
+    """[3] f64, the origin in which places have digits enough: that of the world, unless it is as far as in coordinates
+    of a map. Then a round place near the cameras."""
+    centers = np.array([c.center for track in tracks for c in track])
+    middle = centers.mean(0)
+    apart = np.linalg.norm(centers - middle, axis=1).max()
+    focal = max(track[0].K[0, 0] for track in tracks)
+    if np.finfo(np.float32).eps / 2 * np.linalg.norm(middle) * focal <= ROUNDED * apart or apart == 0:
+        return np.zeros(3)
+    unit = 10.0 ** (math.ceil(math.log10(apart)) + 1)
+    return unit * np.rint(middle / unit)
 
 
 def _as_drawn(tracks: Sequence[Track]) -> list[Track]:

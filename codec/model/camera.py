@@ -47,6 +47,12 @@ class Camera:
         """[3] f64, position in the world."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
+    def seen_from(self, origin: np.ndarray) -> Camera:
+        """The same view in a world whose origin is at `origin` ([3], world units) of this one."""
+        viewmat = self.viewmat.copy()
+        viewmat[:3, 3] += viewmat[:3, :3] @ origin
+        return replace(self, viewmat=viewmat)
+
     def resized(self, width: int, height: int) -> Camera:
         """The same view on another pixel grid."""
         K = self.K.copy()
