@@ -164,14 +164,7 @@ def assemble(
         CaptureError: the feeds have no frames.
     """
     tracks, feeds, frame_count = _same_length(tracks, feeds)
-    if (origin := _origin(tracks)).any():
-        warnings.warn(
-            f"{name}: cameras so far from the origin of the world that single precision would blur the scene; it is "
-            f"moved, so that {tuple(origin.tolist())} is the origin, in the stream, too",
-            stacklevel=4,
-        )
-        tracks = [[c.seen_from(origin) for c in track] for track in tracks]
-        points = points and replace(points, means=points.means - origin)
+    tracks, points = _near_origin(name, tracks, points)
     tracks = _as_drawn(_still(tracks))
     lenses = [Undistortion() for _ in tracks]
     pinholes = [[lens.camera(c) for c in track] for lens, track in zip(lenses, tracks, strict=True)]
@@ -225,6 +218,20 @@ def _find_masks(feeds: Sequence[Feed]) -> None:
     )
     for feed in feeds:
         feed.background, feed.has_alpha = color, True
+
+
+def _near_origin(name: str, tracks: Sequence[Track], points: Points | None) -> tuple[Sequence[Track], Points | None]:
+    """Tracks and points of the capture `name`, in a world whose origin is near enough; a warning says if it is another
+    one."""
+    if not (origin := _origin(tracks)).any():
+        return tracks, points
+    warnings.warn(
+        f"{name}: cameras so far from the origin of the world that single precision would blur the scene; it is "
+        f"moved, so that {tuple(origin.tolist())} is the origin, in the stream, too",
+        stacklevel=5,
+    )
+    tracks = [[c.seen_from(origin) for c in track] for track in tracks]
+    return tracks, points and replace(points, means=points.means - origin)
 
 
 def _origin(tracks: Sequence[Track]) -> np.ndarray:

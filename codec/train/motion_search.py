@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from ..farthest_point_sampling import farthest_points
+from ..model.camera import fibonacci_directions
 from ..model.rotations import quat_multiply, quat_to_rotvec, rotate, rotvec_to_quat
 from ..render.backend import RenderLoss
 from ..render.optimizer import Adam
@@ -80,13 +81,6 @@ def _starts(turn: float) -> np.ndarray:
     return np.pad(turns, ((0, 0), (0, 3))).astype(np.float32)
 
 
-def _directions(count: int) -> np.ndarray:
-    """[count, 3] unit vectors, spread evenly (a Fibonacci lattice)."""
-    z = 1 - (2 * np.arange(count) + 1) / count
-    angle, across = np.pi * (1 + 5**0.5) * np.arange(count), np.sqrt(1 - z * z)
-    return np.stack([across * np.cos(angle), across * np.sin(angle), z], 1)
-
-
 class _Bodies:
     """The moving Gaussians of a tracker a frame after `pose` at its velocity, without a far background behind them, as
     `parts` rigid bodies, and small views of `frame`. A motion [parts, 6] has for each a rotation vector about its
@@ -120,25 +114,20 @@ class _Bodies:
     def limbs(self) -> np.ndarray:
         """For each part the limb that it belongs to, from 1, of those without which the pictures fit better; limbs lie
         apart from each other. 0: it is where it should be."""
+        from scipy.sparse.csgraph import connected_components
         from scipy.spatial import cKDTree
 
-        part = self._part[self._moving].numpy()
+        part, limb = self._part[self._moving].numpy(), np.zeros(len(self.still), int)
         present = self._loss(self._params, self._frame).loss
-        worth = [self._loss(self._without(k), self._frame).loss - present for k in range(len(self.still))]
-        lost = sorted((k for k in range(len(worth)) if worth[k] < 0 and (part == k).any()), key=worth.__getitem__)
-        points = {k: self._means[part == k].numpy() for k in lost}
-        trees = {k: cKDTree(points[k]) for k in lost}
-        link = self.settings.link * np.median(cKDTree(self._means.numpy()).query(self._means.numpy(), 2)[0][:, 1])
-        limb = np.zeros(len(worth), int)
-        for k in lost:
-            if limb[k] or limb.max() == self.settings.limbs_max:
-                continue
-            limb[k], grown = limb.max() + 1, [k]
-            while grown:
-                here = points[grown.pop()]
-                beside = [o for o in lost if not limb[o] and trees[o].query(here)[0].min() < link]
-                limb[beside] = limb[k]
-                grown += beside
+        worth = [self._loss(self._without(k), self._frame).loss - present for k in range(len(limb))]
+        lost = sorted((k for k in range(len(limb)) if worth[k] < 0 and (part == k).any()), key=worth.__getitem__)
+        if lost:
+            means = self._means.numpy()
+            link = self.settings.link * np.median(cKDTree(means).query(means, 2)[0][:, 1])
+            points = [means[part == k] for k in lost]
+            beside = [[tree.query(p)[0].min() < link for p in points] for tree in map(cKDTree, points)]
+            label = connected_components(np.array(beside), directed=False)[1]
+            limb[lost] = np.where(label < self.settings.limbs_max, label + 1, 0)
         return limb
 
     def with_limb(self, motion: np.ndarray, limb: int) -> np.ndarray:
@@ -159,8 +148,9 @@ class _Bodies:
         points = self._means[self._part[self._moving] == part].numpy() - center
         _, sizes, axes = np.linalg.svd(points, full_matrices=False)
         half = END * sizes[0] / np.sqrt(len(points))
+        directions = fibonacci_directions(self.settings.directions) * (1, -1, 1)  # mirrored, as figures were measured
         for arm in (half * axes[0], -half * axes[0]):  # from the end to the center
-            for direction in half * _directions(self.settings.directions):
+            for direction in half * directions:
                 axis = np.cross(arm, direction)
                 angle = np.arctan2(np.linalg.norm(axis), arm @ direction)
                 if 0 < angle < self.settings.limb_turn:
