@@ -1,15 +1,15 @@
 """Ablation: captures are trained without one loss or tool at a time.
 
 lumberjack is the bundled capture, a subject with masks; stage and basketball (in the data folder, at half their size)
-are full rooms, into one of which a ball drops; the others are stress cases, with their budget.
-bench/results/ablation.json has one entry per capture and variant, all of the same preset and, where it names none, of
-seed 0; seeds say which differences mean nothing, and there are more of them where nodes alone come close. `psnr` is
+are full rooms, and a ball drops into one of them; the others are stress cases, with their budget.
+bench/results/ablation.json has one entry per capture and variant, all of the same preset and, if the variant names no
+seed, of seed 0. Seeds show which differences are chance; there are more seeds where nodes alone come close. `psnr` is
 that of the model before coding, `psnr_coded` that of the decoded stream; both are measured on the test cameras, of the
-subject where there are masks. A variant is a change of the training settings, so that each entry can be repeated by any
-caller of the training; but for V3's recipe (`baselines/v3.py`), which has a hash grid for each frame and a packing of
-its own. What moves Gaussians is compared at equal time and bytes: a variant that is faster or slower than the whole
-recipe is trained again with more steps a frame, or fewer, and it is coded at three qualities, `curve`, on which
-`psnr_at_bytes` is where the whole recipe's bytes lie.
+subject if there are masks. A variant is a change of the training settings, so any caller of the training can repeat an
+entry. The exception is V3's recipe (`baselines/v3.py`), which has a hash grid for each frame and a packing of its own.
+Motion models are compared at equal time and bytes: a variant that is faster or slower than the whole recipe is trained
+again with more or fewer steps per frame, and coded at three qualities (`curve`). `psnr_at_bytes` is the PSNR of this
+curve at the bytes of the whole recipe.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from .stress_scenes import drawn
 WHOLE = "whole recipe"
 LUMBERJACK, STAGE, BASKETBALL, FAST, FEW = "lumberjack", "stage", "basketball", "fast motion", "4 cameras"
 FRAMES = {LUMBERJACK: (0, 10), STAGE: (7, 15), BASKETBALL: (0, 8), FAST: (0, 12), FEW: (0, 30)}  # the ball comes at 10
-EQUAL = 0.05  # share by which times may differ
+EQUAL = 0.05  # largest relative difference of equal times
 SEEDS = {
     1: tuple(FRAMES),
     2: (LUMBERJACK, FAST, FEW),
     **dict.fromkeys((3, 4, 5), (LUMBERJACK,)),
-}  # besides 0
-RUNS = 3  # until they do not, at most; the nearest one counts
-CURVE = (-5.0, 5.0)  # qualities besides, from the one that was asked for
+}  # seed -> captures, besides seed 0
+RUNS = 3  # runs, at most, until times are equal; the run with the nearest time counts
+CURVE = (-5.0, 5.0)  # further qualities, relative to the requested one
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,10 @@ class Trained:
     """A sequence that a recipe has trained.
 
     Attributes:
-        models: Gaussians of each frame. groups: frames in each group. seconds: of training.
-        code: bytes and decoded frames of the stream, of a quality.
+        models: Gaussians of each frame.
+        groups: number of frames in each group.
+        seconds: time of training.
+        code: quality -> bytes of the stream, decoded frames.
     """
 
     models: list[Gaussians]
@@ -71,7 +73,7 @@ def ours(capture: Capture, settings: TrainSettings) -> Trained:
 
 
 def v3(capture: Capture, settings: TrainSettings) -> Trained:
-    """V3's, with the steps of a frame that the settings have."""
+    """V3's training and coding, with the steps per frame of the settings."""
     from .baselines.v3 import train_v3
 
     steps, start = (settings.motion_steps, settings.finetune_steps), time.perf_counter()
@@ -84,10 +86,10 @@ class Variant:
     """A change of the settings.
 
     Attributes:
-        captures: those that use what it takes away.
-        equal: compared at equal time and bytes: the steps of a frame are scaled until training takes as long as the
+        captures: captures that use the removed loss or tool.
+        equal: compared at equal time and bytes: the steps per frame are scaled until training takes as long as the
             whole recipe, and the stream is coded at `CURVE`, too.
-        recipe: what trains and codes.
+        recipe: function that trains and codes.
     """
 
     change: Callable[[TrainSettings], TrainSettings]
@@ -128,7 +130,7 @@ VARIANTS = {
     "no rigidity": Variant(run_with(rigidity=0.0)),
     "nodes alone": Variant(run_with(motion_field=MOTIONS["nodes"]), tuple(FRAMES), equal=True),
     **by_seeds("nodes alone ", motion_field=MOTIONS["nodes"]),
-    "field alone": Variant(  # the nodes have no variables of their own; it learns as fast as behind a search
+    "field alone": Variant(  # nodes have no variables of their own; the field learns as fast as after a search
         all_of(
             stage_with("finetune", node_rotation_rate=0.0, node_translation_rate=0.0),
             stage_with("tracking", node_rotation_rate=0.0, node_translation_rate=0.0),
@@ -154,7 +156,7 @@ VARIANTS = {
     "no matched features": Variant(stage_with("initialization", triangulate=False), (STAGE,)),
     "no plane sweep": Variant(stage_with("initialization", use_plane_sweep=False), (STAGE,)),
     "no shell of far points": Variant(stage_with("far_shell", points=0), (STAGE,)),
-    "no node graph": Variant(  # every Gaussian for itself, at the rate of a node
+    "no node graph": Variant(  # every Gaussian moves on its own, at the learning rate of a node
         stage_with(
             "tracking",
             node_rotation_rate=0.0,
@@ -216,8 +218,9 @@ def _entries(capture: Capture, names: Sequence[str], settings: TrainSettings) ->
 def _trained(
     capture: Capture, variant: Variant, settings: TrainSettings, seconds: float | None
 ) -> tuple[TrainSettings, Trained]:
-    """Trained with the settings; of the runs with more or fewer steps a frame the one that takes about `seconds`. The
-    keyframe's time does not depend on them: from the second run on, both are found from the last two."""
+    """Trains with the settings; of several runs with more or fewer steps per frame, returns the one that takes about
+    `seconds`. The keyframe's time does not depend on these steps: from the second run on, the last two runs give the
+    time per step and of the keyframe."""
     runs, factor, before, earlier = [], 1.0, 0.0, 0.0
     while len(runs) < RUNS:
         scaled = _with_steps(settings, factor)
@@ -233,7 +236,7 @@ def _trained(
 
 
 def _with_steps(settings: TrainSettings, factor: float) -> TrainSettings:
-    """The settings with `factor` times the steps of a frame."""
+    """The settings with `factor` times the steps per frame."""
     steps = {name: round(factor * getattr(settings, name)) for name in ("motion_steps", "finetune_steps")}
     return replace(settings, **steps)
 
@@ -257,8 +260,8 @@ def _measured(capture: Capture, trained: Trained, settings: TrainSettings, quali
 
 
 def _at_bytes(capture: Capture, trained: Trained, quality: float, entry: dict, kb: float) -> dict:
-    """kB/frame and PSNR at other qualities beside those of `entry`, and the PSNR at `kb` of the line through them over
-    the logarithm of bytes (its ends go on straight)."""
+    """kB/frame and PSNR of `entry` and at the qualities of `CURVE`, and the PSNR at `kb`: linear in the logarithm of
+    bytes, also beyond the ends."""
     curve = [(entry["kb_per_frame"], entry["psnr_coded"])]
     for step in CURVE:
         size, decoded = trained.code(quality + step)

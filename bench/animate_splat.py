@@ -2,10 +2,10 @@
 
 usage: python -m bench.animate_splat IN.ply OUT [--frames N] [--fps F] [--amount A] [--jitter J] [--up=-y] [--seed S]
 
-For measuring the codec without training. The subject bends, twists and swings one side, all by more the higher up; its
-shading changes slowly, and each attribute has correlated noise from frame to frame, as a trainer of single frames
-leaves it. Properties of the file that do not move are copied. Equal arguments give equal values, so that results can
-be compared: neither the formulas nor the order of random numbers may change.
+For measuring the codec without training. The subject bends, twists and swings one side, all growing with height; its
+shading changes slowly, and each attribute has correlated noise from frame to frame, as after training of single frames.
+Properties of the file that do not move are copied. Equal arguments give equal values, so that results can be compared:
+neither the formulas nor the order of random numbers may change.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from gscodec.splats.ply import FIELDS
 AXES = ("x", "-x", "y", "-y", "z", "-z")
 JITTER = {"quats": 0.004, "log_scales": 0.01, "logit_opacities": 0.03, "sh0": 0.004}
 MEANS_JITTER = 0.02  # of the mean extent of a Gaussian
-KEEP = 0.7  # of the noise from one frame to the next
+KEEP = 0.7  # share of the noise that stays from one frame to the next
 LIGHT = np.array([0.6, 0.6, 0.5])
 
 
@@ -39,7 +39,7 @@ class Motion:
         amount: factor on the angles of the motion.
         jitter: factor on the noise.
         up: world axis that points away from the floor, one of AXES.
-        seed: of the noise.
+        seed: seed of the noise.
     """
 
     fps: float = 30.0

@@ -1,7 +1,7 @@
-"""A figure of 16 joints that walks, bends and waves, as splats with its rig: as a scan of a person with a skeleton.
+"""A figure of 16 joints that walks, bends and waves, as splats with its rig, like a scan of a person with a skeleton.
 
-The skin is capsules around bones; each point of it blends the joints smoothly (linear blend skinning), and besides
-breathes and sways by a few millimetres that no joint says. Equal arguments give equal values.
+The skin is capsules around bones. Each point blends the joints smoothly (linear blend skinning), and also breathes and
+sways by a few millimetres, independently of the joints. Equal arguments give equal values.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SKELETON = {
 NAMES = list(SKELETON)
 JOINTS = np.array([place for _, place, _ in SKELETON.values()], np.float32)
 PARENTS = np.array([NAMES.index(p or "pelvis") for p, _, _ in SKELETON.values()], np.uint8)
-SWAY = 0.004  # metres that the skin moves besides
+SWAY = 0.004  # metres, motion of the skin that no joint causes
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def wave(frames: int, fps: float = 25.0) -> np.ndarray:
 
 
 def skin(count: int, seed: int = 0) -> tuple[Gaussians, np.ndarray]:
-    """`count` Gaussians on capsules around the bones in the pose of rest, and their weights [N, J]."""
+    """`count` Gaussians on capsules around the bones in the rest pose, and their weights [N, J]."""
     rng = np.random.default_rng(seed)
     bones = [(j, int(p)) for j, p in enumerate(PARENTS) if p != j]
     radius = np.array([SKELETON[NAMES[j]][2] for j, _ in bones])
@@ -161,7 +161,7 @@ def pose(g: Gaussians, weights: np.ndarray, poses: np.ndarray, *, sway: float = 
 
 
 def figure(count: int = 6000, frames: int = 60, gop: int = 30, fps: float = 25.0) -> Figure:
-    """The walking figure in groups of `gop` frames, each of which continues the one before."""
+    """The walking figure in groups of `gop` frames; each group continues the previous one."""
     g, weights = skin(count)
     poses = walk(frames, fps)
     posed = pose(g, weights, poses, fps=fps)
@@ -172,7 +172,7 @@ def figure(count: int = 6000, frames: int = 60, gop: int = 30, fps: float = 25.0
 
 
 def write_rig(rig: Rig, path: Path) -> None:
-    """The .npz that `encode --rig` takes."""
+    """Writes the .npz that `encode --rig` reads."""
     parents = np.where(rig.parents == np.arange(len(rig.parents)), -1, rig.parents.astype(int))
     np.savez_compressed(
         path,

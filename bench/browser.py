@@ -74,10 +74,10 @@ class Browser:
         self.page.goto(url)
 
     def eval(self, script: str):
-        """Value of a JavaScript expression, of a promise once it is resolved.
+        """Value of a JavaScript expression; a promise is awaited.
 
         Raises:
-            playwright.sync_api.Error: it threw.
+            playwright.sync_api.Error: the expression throws.
         """
         return self.page.evaluate(script)
 

@@ -2,8 +2,8 @@
 
 usage: python -m bench.capture_tracks NAME WHOLE TRACKS.gsv ONE.gsv
 
-WHOLE is the capture without masks; both streams were encoded from its frames, with the same options. NAME says what it
-is. bench/results/tracks.json holds what docs/tracks.md says.
+WHOLE is the capture without masks; both streams were encoded from its frames, with the same options. NAME is the name
+of the capture. bench/results/tracks.json holds the figures of docs/tracks.md.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from .machine import RESULTS, update_entries
 
 
 def entries(name: str, capture: Capture, paths: dict[str, Path]) -> Iterator[dict]:
-    """What each of the streams has and shows; `paths`: "tracks" and "one"."""
+    """Size and quality of each stream; `paths`: "tracks" and "one"."""
     for kind, path in paths.items():
         scene, size = open_scene(path), path.stat().st_size
         found = evaluate_capture(scene.frame, capture, size=size, with_vmaf=False)
@@ -39,7 +39,7 @@ def entries(name: str, capture: Capture, paths: dict[str, Path]) -> Iterator[dic
 
 
 def _later(scene: Scene, name: str | None = None) -> float:
-    """kB a frame of all groups behind the first ones; of the track `name` alone if it is given."""
+    """kB per frame of all groups after the first ones; only of the track `name`, if it is given."""
     first = max(t.stream.groups[0]["frames"] for t in scene.tracks)
     own = [t for t in scene.tracks if name in (None, t.placement.name)]
     later = sum(g["size"] for t in own for g in t.stream.groups if g["start_frame"] > 0)

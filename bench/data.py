@@ -1,4 +1,4 @@
-"""The data folder: captures and splats that are too large for the repository, where GSCODEC_DATA says."""
+"""The data folder, named by GSCODEC_DATA: captures and splats that are too large for the repository."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gscodec.errors import UsageError
 
 
 def data_folder() -> Path:
-    """The data folder; a script ends with a sentence if GSCODEC_DATA is not set."""
+    """The data folder; ends the script with an error message if GSCODEC_DATA is not set."""
     if not os.environ.get("GSCODEC_DATA"):
         sys.exit("error: GSCODEC_DATA is not set, expected the folder with the captures and splats")
     return Path(os.environ["GSCODEC_DATA"])

@@ -1,9 +1,9 @@
-"""What depth images are worth with few cameras (`python -m bench.depth --help`): one frame of a procedural scene,
-trained alone without them, with the points that they give to start from, with their term of the loss, and with both.
+"""Gain of depth images with few cameras (`python -m bench.depth --help`): one frame of a procedural scene, trained
+alone without them, with initial points from them, with their term of the loss, and with both.
 
-The weight of the term was chosen on the scenes of `VALIDATION` (`--weights`), the reported ones are others. PSNR and
-depth are those of cameras that were not trained on: `depth_error` is the mean of |expected depth - depth| / depth over
-the pixels of the scene, with the exact depth of the tracer.
+The weight of the term was chosen on the scenes of `VALIDATION` (`--weights`); other scenes are reported. PSNR and depth
+are those of test cameras: `depth_error` is the mean of |expected depth - depth| / depth over the pixels of the scene,
+with the exact depth of the tracer.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .train import every_frame_alone, part
 
 TEST = 6  # cameras, between the training ones
 SIZE = 160  # pixels
-NOISE = 0.005  # of the depth, as good sensors have it
+NOISE = 0.005  # of the depth, as in good sensors
 BUDGET = {"gaussians_max": 6000, "initial_points": 3000}  # for pictures of this size
 FRAME = 3
 VALIDATION = {
@@ -41,7 +41,7 @@ VARIANTS = {"without": (False, False), "start": (True, False), "loss": (False, T
 
 
 def room() -> list:
-    """Things that stand around the subject, on a floor."""
+    """Crates around the subject, on a floor."""
     crates = [placed(False, (0.25, 0.2, 0.35), (np.cos(a), 1.1 * np.sin(a), -0.3), SHIRT) for a in (0.4, 2.2, 4.0, 5.4)]
     return [*crates, placed(False, (2.2, 2.2, 0.05), (0, 0, -0.75), (0.7, 0.65, 0.55))]
 
@@ -50,7 +50,7 @@ def measure(scene: Scene, cameras: int, variant: str, weight: float | None = Non
     """Quality on the test cameras of one keyframe.
 
     Args:
-        weight: of the depth term; None: that of the settings.
+        weight: weight of the depth term; None: that of the settings.
     """
     start, loss = VARIANTS[variant]
     base = replace(train_settings("fast"), **BUDGET)
@@ -80,7 +80,7 @@ def quality(scene: Scene, model: Gaussians) -> dict:
 
 
 def entries(scenes: dict[str, Scene], counts: list[int], weights: list[float | None]) -> Iterator[dict]:
-    """One entry a scene, number of cameras, variant and weight."""
+    """One entry per scene, number of cameras, variant and weight."""
     for name, scene in scenes.items():
         for cameras in counts:
             for variant in VARIANTS:

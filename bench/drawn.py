@@ -1,8 +1,8 @@
 """A moving scene of Gaussians -> a capture: its pictures, drawn from a rig of cameras around it and kept as PNG files.
 
 So any splats that `animate_splat` moves, or that others trained, become a capture of any size with exact calibration
-and test cameras between the training ones. What is drawn is what a Gaussian model can show, so that such a capture says
-how much of it training finds, and not how well Gaussians stand for the world.
+and test cameras between the training ones. A Gaussian model can show all of these pictures. So such a capture measures
+how much of the model training finds, and not how well Gaussians represent the world.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from gscodec.splats import open_sequence
 
 from .animate_splat import Motion, animate_splat
 
-HEIGHTS = (-0.15, 0.15, 0.55)  # of the rings of cameras, in distances from the subject
-FIELD = 0.9  # of the shorter side of the picture that the subject's bounding sphere fills
+HEIGHTS = (-0.15, 0.15, 0.55)  # of the rings of cameras, over the distance from the subject
+FIELD = 0.9  # share of the shorter side of the picture that the subject's bounding sphere fills
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Rig:
 
     Attributes:
         train, val, test: number of cameras; val and test cameras stand between the others.
-        width, height: of the pictures.
-        focal: in widths of the picture.
+        width, height: size of the pictures, pixels.
+        focal: focal length, in widths of the picture.
         up: world axis that points away from the floor.
     """
 
@@ -73,7 +73,7 @@ class Rig:
 
 
 def draw(sequence: GaussianSequence, name: str, rig: Rig, folder: Path) -> Capture:
-    """The capture that `rig` takes of a sequence, RGBA, its pictures drawn into `folder` unless they are there."""
+    """The capture that `rig` takes of a sequence, RGBA; missing pictures are drawn into `folder`."""
     cameras = rig.cameras(sequence.frame(0).means)
     file = lambda camera, t: folder / cameras[camera].name / f"{t:04}.png"  # noqa: E731
     for camera in cameras:
@@ -85,7 +85,7 @@ def draw(sequence: GaussianSequence, name: str, rig: Rig, folder: Path) -> Captu
             _write(file(i, t), render_rgba(shown, cameras[i]))
     read = lambda camera, t: read_image(file(camera, t))  # noqa: E731
     capture = Capture(name, sequence.fps, cameras, sequence.frame_count, True, read)
-    return capture.with_low_pass(PIXEL_LOW_PASS)  # as of any other pictures
+    return capture.with_low_pass(PIXEL_LOW_PASS)  # as for any other pictures
 
 
 def animated_capture(splat: Path, work: Path, frames: int, rig: Rig) -> Capture:
@@ -100,7 +100,7 @@ def animated_capture(splat: Path, work: Path, frames: int, rig: Rig) -> Capture:
     if not (done := folder / ".done").exists():
         animate_splat(splat, folder, frames, Motion(up=rig.up))
         done.touch()
-    pictures = work / f"{folder.name}-{hashlib.sha256(repr(rig).encode()).hexdigest()[:8]}"  # another rig's are others
+    pictures = work / f"{folder.name}-{hashlib.sha256(repr(rig).encode()).hexdigest()[:8]}"  # one folder per rig
     return draw(open_sequence(folder), splat.stem, rig, pictures)
 
 

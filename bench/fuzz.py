@@ -2,10 +2,10 @@
 
 usage: python -m bench.fuzz [--seconds 180] [--targets units,group,demux] [--dry]
 
-Each target runs in libFuzzer for its share of the time: most of it goes below the checksums, to `units` and `group`.
-No sanitizer is needed, since the code has no unsafe block; arithmetic is checked, and so are the time and memory of one
-input. Any Rust toolchain and C++ compiler will do. A finding ends the run with the file that shows it. Counts add up
-over runs, per state of the code (git tree of gsv/src).
+Each target runs in libFuzzer for its share of the time: most of it goes to `units` and `group`, below the checksums. No
+sanitizer is needed, since the code has no unsafe block; arithmetic is checked, and so are the time and memory of one
+input. Any Rust toolchain and C++ compiler will do. A finding ends the run with the file that reproduces it. Counts add
+up over runs, per state of the code (git tree of gsv/src).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .machine import RESULTS, ROOT, update_entries
 FUZZ = ROOT / "codec" / "native" / "fuzz"
 SHARES = {"units": 0.8, "group": 0.15, "demux": 0.05}  # of the time
 LENGTHS = {"units": 1024, "group": 4096, "demux": 8192}  # bytes of an input
-SECONDS_OF_INPUT, MEGABYTES = 120, 512  # of one input; more is a finding. Seconds by the clock: of a busy machine
+SECONDS_OF_INPUT, MEGABYTES = 120, 512  # of one input; more is a finding. Wall-clock seconds, of a busy machine
 COVERAGE = ("level=4", "inline-8bit-counters", "pc-table")
 
 
@@ -36,8 +36,8 @@ def host() -> str:
 
 
 def build(target: str) -> None:
-    """Builds a target with counters of coverage and checked arithmetic."""
-    compares = ("trace-compares",) if target != "units" else ()  # of no use where the bytes are arithmetic code
+    """Builds a target with coverage counters and checked arithmetic."""
+    compares = ("trace-compares",) if target != "units" else ()  # of no use for bytes of arithmetic code
     coverage = [f"-Cllvm-args=-sanitizer-coverage-{option}" for option in COVERAGE + compares]
     flags = ["--cfg", "fuzzing", "-Cpasses=sancov-module", *coverage, "-Ccodegen-units=1", "-Cdebug-assertions"]
     command = ["cargo", "build", "--release", "--quiet", "--locked", "--target", host(), "--bin", target]

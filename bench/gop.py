@@ -25,7 +25,7 @@ from .train import CASES, coded, evaluate, held_out, sequence, shown
 
 HELD_OUT = ("cam08", "cam12")
 RESULTS = Path("bench/results/gop.json")
-KEY = ("capture", "preset", "gop", "random_access")  # of an entry
+KEY = ("capture", "preset", "gop", "random_access")  # identity of an entry
 
 
 def walk(data: Path) -> Capture:

@@ -1,4 +1,4 @@
-"""Result files: what was measured, and on which machine, at which commit, beside how much other work."""
+"""Result files: results with their machine, commit and the load by other processes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def machine() -> dict:
 
 
 def peak_gib() -> float | None:
-    """The most memory that this process has used so far, GiB; None where the system does not tell."""
+    """Peak memory of this process, GiB; None: the system does not report it."""
     status = Path("/proc/self/status")
     lines = status.read_text().splitlines() if status.exists() else []
     kib = [int(line.split()[1]) for line in lines if line.startswith("VmHWM")]
@@ -34,7 +34,7 @@ def peak_gib() -> float | None:
 
 
 def commit() -> str:
-    """Short hash of the checkout, "+" if it has changes besides results and charts; empty outside of one."""
+    """Short hash of the checkout, with "+" if it has changes besides results and charts; empty outside a checkout."""
     git = lambda *a: subprocess.run(["git", *a], cwd=ROOT, capture_output=True, text=True).stdout.strip()  # noqa: E731
     return git("rev-parse", "--short", "HEAD") + (
         "+" if git("status", "--porcelain", "-uno", "--", ".", ":!bench/results", ":!bench/charts") else ""
@@ -42,8 +42,8 @@ def commit() -> str:
 
 
 def write_result(path: Path, result: dict) -> None:
-    """Writes to `path`, complete or not at all, `result` and how it was measured: machine, commit, seconds since the
-    last result of this process, and the cores that other processes kept busy meanwhile."""
+    """Writes `result` to `path`, complete or not at all, with machine, commit, seconds since the last result of this
+    process, and the number of cores that other processes kept busy meanwhile."""
     _write(path, {"machine": machine(), "commit": commit(), **_SINCE_THE_LAST_RESULT.lap(), **result})
 
 
@@ -53,11 +53,11 @@ def update_entries(
     key: Callable[[dict], object],
     whole: Callable[[list[dict]], dict] = lambda entries: {"entries": entries},
 ) -> Iterator[dict]:
-    """Yields `entries` and puts each into the list "entries" of the JSON `path` as it comes, with how it was measured:
-    machine, commit, seconds, and the cores that other processes kept busy meanwhile. Other entries stay as they are.
+    """Yields `entries` and puts each into the list "entries" of the JSON `path` as it comes, with machine, commit,
+    seconds, and the number of cores that other processes kept busy meanwhile. Other entries stay as they are.
 
     Args:
-        key: of an entry; an older entry with the same key is replaced.
+        key: entry -> its key; an older entry with the same key is replaced.
         whole: list of entries -> content of the file.
     """
     clock, entries = _Clock(), iter(entries)
@@ -69,14 +69,14 @@ def update_entries(
 
 
 class _Clock:
-    """Time of this process and of the processes beside it, since the last lap."""
+    """Time of this process and of all other processes since the last lap."""
 
     def __init__(self):
         self._last = self._now()
 
     @staticmethod
     def _now() -> tuple[float, float, float]:
-        """Seconds by the clock, of all cores busy (0 where the system does not tell), and of this process."""
+        """Wall-clock seconds, busy seconds of all cores (0: the system reports none), CPU seconds of this process."""
         stat, busy = Path("/proc/stat"), 0.0
         if stat.exists():
             user, nice, system, *_ = (int(x) for x in stat.read_text().split()[1:9])
@@ -94,7 +94,7 @@ _SINCE_THE_LAST_RESULT = _Clock()
 
 
 def stamp(entries: Iterable[dict]) -> str:
-    """One line for a chart: on what machines its entries were measured, and at which commits."""
+    """One line for a chart: the machines and the commits of its entries."""
     measured = [e["measured"] for e in entries if "measured" in e]
     machines = sorted({f"{m['cpu']}, {m['cores']} cores" for m in measured})
     return "; ".join([*machines, "commit " + ", ".join(sorted({m["commit"] for m in measured}))])

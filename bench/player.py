@@ -13,9 +13,9 @@ Streams lie in FOLDER; a missing one is encoded first, which is not measured:
 bench/results/player.json has an entry for each stream:
   first_picture_ms       from the start of the navigation; page and stream come from this machine, nothing is cached
   first_picture_slow_ms  the same over 2 Mbit/s with 40 ms to the first byte of each answer, throttled by Chromium
-  first_picture_bytes    received by then over that link
-  fps_clock              frames per second where 60, the display's limit, are asked for; median of 3 x 2 s
-  fps_free               frames per second where all frames are asked for in order, without the display's clock
+  first_picture_bytes    bytes received by then over that link
+  fps_clock              frames per second if 60, the display's limit, are requested; median of 3 x 2 s
+  fps_free               frames per second if all frames are requested in order, without the display's clock
   project_ms, blend_ms   medians per frame: evaluation and projection; the slower one of the raster workers
   decode, evaluate       ms per frame to decode a group and to evaluate its frames, wasm and native, one core each
   memory_mb              largest proportional set size of the page's process while the stream plays once
@@ -170,7 +170,7 @@ def first_pictures(browsers: Browsers, url: str, link: dict | None = None) -> tu
 
 
 def clocked(browser: Browser, url: str, seconds: int = 2) -> float:
-    """Frames per second where 60 are asked for."""
+    """Frames per second if 60 are requested."""
     browser.page.add_init_script(KEEP)
     browser.goto(f"{url}?size={SIZE}")
     browser.wait(FIRST)

@@ -2,12 +2,12 @@
 
 usage: python -m bench.player_decode FOLDER [statue_all] [demo] ...       writes bench/results/player_decode.json
 
-Streams are those of bench.player, made where they are missing. The page decodes the first group again and again, alone
-and shared in turn, from bytes that it has. A time is from the request to when every worker has its tiles ready to be
-drawn: it includes what they do twice, messages, and the wait for the slowest one. Then frames are drawn: a time is that
-of the slowest worker that projects. Medians, which other work on the machine moves; the ratios are of one run.
-The ratio of shares is of one instance that decodes all of the group and then what each of two workers does: what two
-idle cores could gain, less messages.
+Streams are those of bench.player; missing ones are made. The page decodes the first group repeatedly, by one worker and
+shared by all in turn, from bytes that it has. A decoding time is from the request until every worker has its tiles
+ready to be drawn: it includes duplicate work, messages, and the wait for the slowest worker. Then frames are drawn: a
+projection time is that of the slowest worker. Times are medians, which other work on the machine changes; the ratios
+are of one run. For the ratio of shares, one instance decodes the whole group and then the share of each of two workers:
+the possible gain of two idle cores, without messages.
 """
 
 from __future__ import annotations

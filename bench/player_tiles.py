@@ -2,12 +2,12 @@
 
 usage: GSCODEC_DATA=... python -m bench.player_tiles FOLDER        writes bench/results/player_tiles.json
 
-The scene is that of bench.tiles: 13 copies of the statue in one group, and a camera that sees about a tenth of
-them. One page opens it as it is, with the tiles in view only, another is told to take all. Bytes are those received
-before the first picture, the first 64 kB of the file included. A time of decoding is from the request to when every
-worker has its tiles ready to be drawn, from bytes that are in the page; median of several runs, the two in turn.
-Then the camera moves over a third of the scene in four seconds: `move` has the bytes by then and the longest time
-between two pictures, `move_of_whole` that of the page that has all.
+The scene is that of bench.tiles: 13 copies of the statue in one group, and a camera that sees about a tenth of them.
+One page opens it as usual, with only the tiles in view; another page takes all tiles. Bytes are those received before
+the first picture, the first 64 kB of the file included. A decoding time is from the request until every worker has its
+tiles ready to be drawn, from bytes in the page; median of several runs, both pages in turn. Then the camera moves over
+a third of the scene in four seconds: `move` has the bytes received by then and the longest time between two pictures;
+`move_of_whole` has those of the page with all tiles.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ OPEN = """async ([partly, stream]) => {
     return { bytes: source.received, gaussians: player.engine.gaussians(0), ranged: source.ranged };
 }"""
 
-# decodes group 0 anew from the bytes that are here; ms
+# decodes group 0 again from the bytes in the page; ms
 DECODE = """async () => {
     const { engine } = document.querySelector("gsv-player");
     while (engine.groups.get(0)?.state !== "ready") await new Promise((done) => setTimeout(done, 20));
@@ -76,7 +76,7 @@ MOVE = """async ([steps, from, way]) => {
 
 
 def million(folder: Path) -> tuple[Path, float]:
-    """The file of the scene, whose camera sees a tenth of it, made where it is missing, and how wide the scene is."""
+    """The file of the scene (made if it is missing), whose camera sees a tenth of it, and the width of the scene."""
     path, width = folder / "million.gsv", folder / "million.width"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
@@ -102,14 +102,14 @@ def camera(eye: np.ndarray, slope: float) -> Camera:
 
 
 def open_page(browsers: Browsers, url: str, partly: bool) -> tuple[Browser, dict]:
-    """A page that shows the view, and what it has received."""
+    """A page that shows the view, and its received bytes and Gaussians."""
     browser = browsers.start("--disable-gpu")
     browser.goto(f"{url}?size={SIZE}x{SIZE}&autoplay=off&camera=tenth&src=none.gsv")
     return browser, browser.page.evaluate(OPEN, [partly, url + "stream.gsv"])
 
 
 def picture(browser: Browser) -> np.ndarray:
-    """[H, W, 3] u8: what the page shows."""
+    """[H, W, 3] u8: the picture in the page."""
     script = f"""{PLAYER}.show(0).then(() => {{
         const canvas = {PLAYER}.shadowRoot.querySelector("canvas");
         return Array.from(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data);

@@ -22,14 +22,14 @@ from gscodec.model.camera import PIXEL_LOW_PASS, Camera, look_at
 SAMPLES = 3  # rays along each side of a pixel
 FOCAL = 1.9  # image widths
 DISTANCE = 3.0
-HEIGHTS = (-0.3, 0.5, 1.3)  # of the rings of cameras
+HEIGHTS = (-0.3, 0.5, 1.3)  # of the rings of cameras, metres
 AMBIENT = 0.45
 OPENGL = np.diag([1.0, -1, -1, 1])  # OpenCV camera axes -> OpenGL's
-WAVES = 3  # sines of which the motion of a handheld camera is made
+WAVES = 3  # sines in the motion of a handheld camera
 PERIODS = (7.0, 30.0)  # frames, of these sines
-ROLL = 20  # frames, the period of an exposure that rolls
-BACKDROP = 0.35  # grey behind the subject where its masks are wrong
-EXPOSURES = 5  # moments of a picture whose shutter is open for some time
+ROLL = 20  # frames, the period of the rolling exposure
+BACKDROP = 0.35  # grey behind the subject, if masks have errors
+EXPOSURES = 5  # moments that are averaged while the shutter is open
 
 
 @dataclass(frozen=True)
@@ -64,20 +64,19 @@ class Scene:
     """One capture.
 
     Attributes:
-        shapes: what is there at a frame, or at a moment between two.
-        light: at a frame.
-        exposure: of the images of each training camera, a range (lowest, highest) of gains.
-        rolling: amplitude of a gain of each training camera that rises and falls over `ROLL` frames, each by its own
-            phase.
-        shutter: share of a frame's time for which the shutter is open: what moves is blurred.
+        shapes: frame, or moment between two frames -> the shapes.
+        light: frame -> the light.
+        exposure: range (lowest, highest) of the gains of the training cameras.
+        rolling: amplitude of a gain of each training camera that oscillates over `ROLL` frames, each by its own phase.
+        shutter: share of a frame's time for which the shutter is open: moving shapes are blurred.
         pose_noise: degrees and metres by which the calibration of each training camera is wrong.
-        handheld: degrees and metres (root mean square) by which each camera shakes, each in its own way.
-        orbit: degrees a frame by which all cameras go around the subject.
-        masks: the views have alpha. Without them a background of one colour is cut out, as it is of files.
-        noise: standard deviation of the noise of the sensor, over a black level of three times that; 0: there is none.
-        mask_errors: share of the masks of training cameras that lack a piece, and of those that have one too many; all
+        handheld: degrees and metres (root mean square) by which each camera shakes, independently of the others.
+        orbit: degrees per frame by which all cameras go around the subject.
+        masks: the views have alpha. False: a background of one colour is cut out, as from files.
+        noise: standard deviation of the noise of the sensor, over a black level of three times that; 0: no noise.
+        mask_errors: share of the training cameras' masks with a missing disc, and share with an extra disc; all masks
             are grown or shrunk by up to a pixel, before a grey background.
-        depth_noise: standard deviation of the noise of the depth images, a share of the depth; None: there are none.
+        depth_noise: standard deviation of the noise of the depth images, a share of the depth; None: no depth images.
     """
 
     shapes: Callable[[float], list[Shape]]
@@ -98,7 +97,7 @@ class Scene:
     depth_noise: float | None = None
 
     def capture(self, name: str) -> Capture:
-        """The scene as its cameras see it."""
+        """The capture of the scene by its cameras."""
         rig = _rig(self.train, self.test, self.size)
         rng = np.random.default_rng(0)
         wrong = [_error(*self.pose_noise, rng) if c.split == "train" else np.eye(4) for c in rig]
@@ -144,7 +143,7 @@ class Scene:
 
     def _exposed(self, camera: Camera, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """[H, W, 4] f32, premultiplied, the mean over the time for which the shutter is open, and the depth [H, W] in
-        the middle of it."""
+        the middle of that time."""
         count = EXPOSURES if self.shutter else 1
         times = frame + self.shutter * (np.arange(count) - (count - 1) / 2) / count
         traced = [trace(self.shapes(t), self.light(t), camera) for t in times]
@@ -152,7 +151,7 @@ class Scene:
 
 
 def _wrong(alpha: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
-    """A mask as tools make it: a rim that is off, and at times a disc that is missing, or one beside the subject."""
+    """A mask with errors of masking tools: a shifted rim, and, each at random, a missing disc and an extra disc."""
     import cv2
 
     size = int(rng.integers(-1, 2))
@@ -317,7 +316,7 @@ def _ball(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _box(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same for the cube from -1 to 1."""
+    """Like `_ball`, on the cube from -1 to 1."""
     d = np.where(np.abs(d) < 1e-9, np.float32(1e-9), d)
     a, b = (-1 - o) / d, (1 - o) / d
     enter, leave = np.minimum(a, b), np.maximum(a, b)
@@ -330,7 +329,7 @@ def _box(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pattern(x: np.ndarray, depth: float) -> np.ndarray:
-    """[R, 3] gains around 1: waves across the shape, other ones for each colour."""
+    """[R, 3] gains around 1: waves across the shape, different ones for each colour."""
     if not depth:
         return np.ones_like(x)
     waves = [np.sin(5 * x[:, 0] + 3 * x[:, 2] + c) * np.sin(6 * x[:, 1] - 4 * x[:, 2] + 2 * c) for c in range(3)]

@@ -1,9 +1,9 @@
 """Size, quality and time of gscodec and its peers on the same sequences: an entry of bench/results/rd.json per setting.
 
-size      all that decoding needs, side information and container included
+size      all bytes that decoding needs, side information and container included
 quality   codec PSNR of `gscodec eval` on every fifth frame
 time      frames in memory; encoding without training (one run), decoding to float attributes (median of 3)
-A peer that orders its Gaussians once for the whole curve does so untimed.
+If a peer orders its Gaussians once for the whole curve, that is not timed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CODECS = (OURS, *BASELINES)
 DECODE_RUNS = 3
 EVERY = 5  # PSNR is measured on every 5th frame
 WITHIN = {"videogs": (39, 45), "videogs-raw": (39, 45)}  # peer -> range of PSNR of the BD-rate
-USUAL = (39, 52)  # of the others
+USUAL = (39, 52)  # the range of the other peers
 ONE_POINT = ("sog", "spz")
 VIDEO = ("videogs", "videogs-raw", "x265", "svt-av1", "gsav", "webp")  # SH degree 0 and more than one frame
 Group = DenseGroup | ParametricGroup
@@ -45,12 +45,12 @@ Group = DenseGroup | ParametricGroup
 
 @dataclass(frozen=True)
 class Coded:
-    """A sequence, or the measured frames of it, through a codec.
+    """A coded sequence, or its measured frames.
 
     Attributes:
         size: bytes.
         frames: number of frames coded.
-        encode_s, decode_s: seconds for all of them.
+        encode_s, decode_s: seconds for all these frames.
         decoded: frame -> Gaussians.
     """
 
@@ -118,7 +118,7 @@ def _loaded(group: Group) -> Group:
 
 
 def _ours(sequence: GaussianSequence, groups: list[Group], setting: dict) -> Coded:
-    """The sequence through gscodec; motion is fitted to dense groups, which counts as encoding."""
+    """The sequence, coded by gscodec; motion is fitted to dense groups, which counts as encoding."""
     settings, first = EncodeSettings(**setting), [group.frame(0) for group in groups]
     fitting = {"random_access": settings.random_access, "quality": settings.quality}
     most, longest = max(map(len, first)), max(map(len, groups))
@@ -148,7 +148,7 @@ def _timed_decoding(decode: Callable[[], list[Gaussians]]) -> tuple[list[Gaussia
 
 
 def _peer(baseline: Baseline, groups: list[Group], picked: list[int], setting: dict) -> Coded:
-    """The sequence through a peer; one that codes frames alone gets only the frames `picked`."""
+    """The sequence, coded by a peer; a peer that codes each frame alone gets only the frames `picked`."""
     shown = [[group.visible(t) for t in range(len(group))] for group in groups]
     numbers = range(sum(map(len, shown)))
     if baseline.per_frame:

@@ -81,7 +81,7 @@ def lamp(location, size, energy, color):
 
 
 def build():
-    """The room; returns what moves: (two heads, the ring)."""
+    """Builds the room; returns the moving objects: two heads and the ring."""
     shapes, quarter = bpy.ops.mesh, math.pi / 2
     add(shapes.primitive_plane_add, material("checker", ((0.5, 0.45, 0.4), (0.2, 0.25, 0.3)), 2.5, 0.3), size=9)
     wall = material("voronoi", ((0.25, 0.3, 0.2), (0.65, 0.65, 0.5)), 3, 0.7)
@@ -103,7 +103,7 @@ def build():
 
 
 def move(things, frame):
-    """Moves what moves to where it is at a frame."""
+    """Moves the moving objects to their poses at a frame."""
     first, second, ring = things
     first.rotation_euler = (0, 0, 0.12 * frame)
     second.rotation_euler = (0.1 * frame, 0, -0.3 + 0.05 * frame)

@@ -38,11 +38,11 @@ CASES = ("splats", "training", "posed")
 QUALITIES = (30.0, 40.0, 50.0, 60.0)
 SPLATS, TRAINED = {"count": 6000, "frames": 60, "gop": 30}, {"count": 4000, "frames": 12, "gop": 12, "fps": 12.5}
 CAMERAS, HELD_OUT, SIZE = 15, 3, 160
-MEASURED = 6  # frames of a sequence of which the PSNR is taken
+MEASURED = 6  # frames of a sequence in which PSNR is measured
 
 
 def write_stream(path: Path, groups: list, quality: float, rig: Rig | None, random_access: int) -> dict:
-    """Codes dense or trained groups; returns the bytes of the file and of what moves it."""
+    """Codes dense or trained groups; returns the bytes of the file and of its motion."""
     first = groups[0].frame(0)
     config = stream_config(fps=25, sh_degree=first.sh_degree, gaussians=len(first), frames=len(groups[0]), up="y")
     settings = EncodeSettings(quality, refine=0, random_access=random_access)
@@ -68,7 +68,7 @@ def splats(work: Path) -> Iterator[dict]:
 
 
 def posed(work: Path) -> Iterator[dict]:
-    """The stream of the walk in the poses of `wave`, against the figure in these poses."""
+    """The stream of the walk, posed by `wave`, compared with the figure in these poses."""
     f, frames = figure(**SPLATS), SPLATS["frames"]
     write_stream(work / "walk.gsv", f.sequence.groups, 50.0, f.rig, frames)
     g, weights = skin(SPLATS["count"])
@@ -127,7 +127,7 @@ def training(work: Path) -> Iterator[dict]:
 
 
 def whole(entries: list[dict]) -> dict:
-    """With the change of the size at equal PSNR of each case whose entries are all there, and of one commit."""
+    """The result file, with the change of the size at equal PSNR of each case with all entries, of one commit."""
     saved = {}
     for case in ("splats", "training"):
         own = [e for e in entries if e["case"] == case]

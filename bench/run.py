@@ -64,7 +64,7 @@ def statue(data: Path, folder: Path) -> dict:
 
 
 def statue40(data: Path, folder: Path) -> dict:
-    """40 frames of it: the second group is predicted from the first."""
+    """40 frames of the statue: the second group is predicted from the first."""
     return measure("statue40", animated(data, folder, 40), folder, "--quality", "52")
 
 

@@ -64,8 +64,8 @@ def _lumberjack(data: Path, folder: Path) -> None:
 
 def lasting(groups: Iterable[ParametricGroup]) -> Iterator[ParametricGroup]:
     """Each group without the Gaussians that do not live in all of its frames. A Gaussian whose parent is left out has
-    none."""
-    place = np.full(1, -1, np.int32)  # [N + 1] index among the kept Gaussians of the group before; -1: left out, last
+    no parent."""
+    place = np.full(1, -1, np.int32)  # [N + 1] index among Gaussians kept in the group before; -1: left out; [N]: -1
     for group in groups:
         count = len(group.canonical)
         lasts = np.ones(count, bool) if group.lifetimes is None else (group.lifetimes == [0, len(group)]).all(1)

@@ -1,5 +1,5 @@
 """Where each figure of README.md and docs/ comes from: its file in bench/results, the command that makes it, the commit
-at which it was measured, without changes of its own, and the cores that other work kept busy meanwhile.
+at which it was measured, without uncommitted changes, and the number of cores that other work kept busy meanwhile.
 
 usage: python -m bench.sources        writes the table into docs/figures.md; a test compares both
 """
@@ -15,7 +15,7 @@ from .machine import RESULTS, ROOT
 
 PAGE = ROOT / "docs" / "figures.md"
 HEAD = "| figures | file in bench/results | command | commit | busy beside |\n|---|---|---|---|---|\n"
-FILES = {  # what -> file, command
+FILES = {  # figures -> file, command
     "bundled lumberjack": ("demo.json", "python -m bench.run demo"),
     "statue, 20 frames": ("statue.json", "python -m bench.run statue"),
     "statue, 40 frames": ("statue40.json", "python -m bench.run statue40"),
@@ -29,7 +29,7 @@ FILES = {  # what -> file, command
 
 
 def table() -> str:
-    """The table in markdown, one row a figure or group of figures."""
+    """The table in markdown, one row per figure or group of figures."""
     return HEAD + "".join(f"| {' | '.join(row)} |\n" for row in _rows())
 
 
@@ -81,7 +81,7 @@ def _commits(results: list[dict]) -> str:
 
 
 def with_table(page: str) -> str:
-    """The text of the page with the table as it should be."""
+    """The text of the page with the current table."""
     return re.sub(re.escape(HEAD) + r"(\|.*\n)*", lambda _: table(), page)
 
 

@@ -1,5 +1,5 @@
-"""What sparse points are worth at the start of training: those that a capture brings, here triangulated from its own
-training cameras, and none (`python -m bench.sparse_points --help`)."""
+"""Gain of sparse points at the start of training: points that a capture brings, here triangulated from its own training
+cameras, against none (`python -m bench.sparse_points --help`)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ VALIDATION = {
     "basketball": ("cam05", "cam13", "cam20", "cam27"),
     "lumberjack": ("cam03", "cam09", "cam17"),
     "stage": ("cam03", "cam08"),
-}  # of the training cameras, held out: the test cameras choose nothing
+}  # training cameras that are held out: test cameras must not choose anything
 
 
 def measure(capture: Capture, preset: str, frame: int) -> dict:
@@ -28,7 +28,7 @@ def measure(capture: Capture, preset: str, frame: int) -> dict:
     from gscodec.train.settings import train_settings
 
     settings, start = train_settings(preset), time.process_time()
-    own = replace(settings.initialization, triangulate=False)  # those of `capture`, or none
+    own = replace(settings.initialization, triangulate=False)  # the points of `capture`, or none
     (alone,), seconds = every_frame_alone(capture, [frame], replace(settings, initialization=own))
     model = alone.canonical
     cpu = round(time.process_time() - start, 1)

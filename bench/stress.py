@@ -1,14 +1,14 @@
 """Stress test: each case of stress_scenes.py, trained as a sequence and with frames alone, both coded and decoded.
 
 bench/results/stress.json has one entry per case. PSNR is that of the subject on the test cameras, over the frames that
-show it; all of it is of decoded streams, coded as `gscodec encode` does where no quality is named. The frames alone
-have the Gaussians of the preset, and as many steps as it takes until twice as many gain less than `CONVERGED_DB`.
-`lost` is their PSNR minus that of the sequence. `verdict` is "fails" on
+show it, of decoded streams; these are coded as by `gscodec encode` without a quality. The frames alone have the
+Gaussians of the preset, and enough steps that twice as many gain less than `CONVERGED_DB`. `lost` is their PSNR minus
+that of the sequence. `verdict` is "fails" on
   - a crash, a value that is not finite, or more Gaussians than the budget allows,
   - a mean PSNR below the floor of the case, or a frame more than `FRAME_DB` below the floor,
   - `lost` above `ALLOWED_DB` in the mean, or above `ALLOWED_FRAME_DB` in a frame,
   - more than `STATIC_SHARE` of the bytes of the frames alone where nothing moves.
-Where every frame is a keyframe the sequence is frames alone: the verdict says "equal by identity" then.
+If every frame is a keyframe, the sequence equals frames alone: the verdict then says "equal by identity".
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ BUDGETS = {  # case -> changes of the budget
     },
     "real room": {"gaussians_max": 20_000, "initial_points": 10_000},
 }
-ALONE_MOST = 12  # frames of a case that are trained alone: all of a short one
-FACTORS = (1, 2, 4, 8)  # of the steps of a frame alone, until it has converged
+ALONE_MOST = 12  # frames of a case, at most, that are trained alone: all frames of a short case
+FACTORS = (1, 2, 4, 8)  # on the steps of a frame alone, until it has converged
 CONVERGED_DB = 0.1
 ALLOWED_DB, ALLOWED_FRAME_DB = 1.0, 2.5
 FRAME_DB = 3.0
@@ -54,7 +54,7 @@ def measure(names: list[str], out: Path, frames: int | None = None) -> Iterator[
     """Entries of the cases `names`, which also go into the result file `out` as they come.
 
     Args:
-        frames: at most so many of each case; None: all.
+        frames: largest number of frames of each case; None: all.
     """
     return update_entries(out, (_entry(name, CASES[name], frames) for name in names), lambda e: e["case"])
 
@@ -131,7 +131,7 @@ def compare(capture: Capture, **budget) -> dict:
 
 
 def _alone(capture: Capture, ours: dict, there: list[int], settings, encoding: EncodeSettings) -> dict:
-    """What frames alone reach, coded, and what the sequence (`ours`) has lost against them in the frames `there`."""
+    """Results of frames alone, coded, and PSNR that the sequence (`ours`) has lost against them in frames `there`."""
     chosen = range(0, capture.frame_count, -(-capture.frame_count // ALONE_MOST))
     settings = _converged(capture, next((t for t in chosen if t in there), chosen[0]), settings)
     alone, seconds = train.every_frame_alone(capture, chosen, settings)
@@ -154,11 +154,11 @@ def _alone(capture: Capture, ours: dict, there: list[int], settings, encoding: E
 
 
 def _converged(capture: Capture, frame: int, settings):
-    """The settings with as many steps of a keyframe as `frame` needs, by its training views."""
+    """The settings with the steps of a keyframe at which `frame` has converged on its training views."""
     from gscodec.metrics.evaluate import evaluate_capture
 
     part, best = train.part(capture, range(frame, frame + 1)), None
-    settings = replace(settings, budget=replace(settings.budget, small_pixels=0.0))  # FACTORS alone says how many
+    settings = replace(settings, budget=replace(settings.budget, small_pixels=0.0))  # FACTORS alone sets the steps
     for factor in FACTORS:
         longer = replace(settings, keyframe_steps=factor * settings.keyframe_steps)
         (alone,), _ = train.every_frame_alone(capture, [frame], longer)

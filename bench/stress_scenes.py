@@ -126,7 +126,7 @@ def basketball(frames: int) -> Capture:
 
 
 def drawn(capture: Capture) -> Capture:
-    """The capture, its pictures drawn and kept, so that training is timed without that."""
+    """The capture with its pictures drawn and kept, so that training times do not include drawing."""
     for camera in range(len(capture.cameras)):
         for t in range(capture.frame_count):
             capture.view(camera, t)
@@ -139,10 +139,10 @@ class Stress:
 
     Attributes:
         capture: frames -> the capture.
-        frames: how many are measured.
-        floor: PSNR of the subject, coded, on the test cameras, dB, below which the mean must not fall. It is what a
-            picture of such a capture needs to be of use, 30 dB, less where the condition itself hides it: `why`.
-        why: the floor is below 30.
+        frames: number of measured frames.
+        floor: least mean PSNR of the subject, coded, on the test cameras, dB. A useful picture of such a capture needs
+            30 dB; the floor is lower if the condition itself prevents them (`why`).
+        why: reason for a floor below 30.
         still: nothing moves.
     """
 
@@ -185,7 +185,7 @@ SCENES = {
     "no masks": Scene(on_a_floor, masks=False),
     "no masks with noise": Scene(on_a_floor, masks=False, noise=0.01),
 }
-FLOORS = {  # of those below 30 dB: PSNR, and why
+FLOORS = {  # floors below 30 dB: PSNR, and the reason
     "exposure by camera": (27.0, "test cameras have a brightness that no training camera has"),
     "rolling exposure": (28.0, "what all cameras share of it cannot be told from light"),
     "motion blur": (27.0, "the pictures themselves are blurred by another motion in each view"),

@@ -3,7 +3,7 @@
 usage: GSCODEC_DATA=... python -m bench.tiles [PAYLOAD]        writes bench/results/tiles.json
 
 One frame of the statue at the default quality, or the independent group in the file PAYLOAD. The million Gaussians are
-13 copies of its integers, so only bytes and times of theirs count: their rotations follow other neighbours.
+13 copies of its integers, so only their bytes and times are valid: their rotations follow other neighbours.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def touched(tile: dict, planes: np.ndarray) -> bool:
 
 
 def view(q: QuantizedGroup) -> dict:
-    """Bytes and time of a view of a tenth of the copies, beside all of them."""
+    """Bytes and time of a view of a tenth of the copies, compared with all of them."""
     payload, _ = _native.encode_group(copies(q))
     whole = _native.DecodedGroup(payload, LEVEL)
     planes = planes_of_view(*lens_of_view(whole, 0.1))
@@ -157,7 +157,7 @@ def view(q: QuantizedGroup) -> dict:
 
 
 def damage(payload: bytes) -> list[dict]:
-    """What a flipped bit costs, in each unit in turn."""
+    """Cost of one flipped bit, in each tile unit in turn: share of Gaussians kept, reported tiles."""
     sound, rows = _native.DecodedGroup(payload, LEVEL), []
     for u in _native.units(payload):
         if u["type"] != "tile":

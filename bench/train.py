@@ -8,7 +8,7 @@ model         our training before coding, without a size
 gscodec       the same decoded from the stream, with still_gaussians and still_bits (still.py)
 alone         a keyframe for every frame with the keyframe budget of the preset: the reference for tracking
 alone-coded   the same decoded from our stream, every frame a group of its own
-full          a keyframe for every frame with all the steps and Gaussians that help (FULL): what the pictures allow
+full          a keyframe for every frame with all the steps and Gaussians that help (FULL): the limit of the pictures
 v3            V3's recipe, with steps for about the time of our preset medium on lumberjack (baselines/v3.py)
 v3-coded      the same through V3's packing (baselines/videogs.py)
 """
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from gscodec.encode.encode import EncodeReport
 
 RECIPES = ("gscodec", "alone", "full", "v3")
-FULL = {"keyframe_steps": 12_000, "gaussians_max": 156_250}  # of any picture; a keyframe may have 125,000 of them
+FULL = {"keyframe_steps": 12_000, "gaussians_max": 156_250}  # for any picture; a keyframe may have 125,000 Gaussians
 FULL_PRICE = 2e-5  # `KeyframeSettings.price`
 V3_PACKING = {"qp": 25, "raw": True}  # its default qp, and the better of its two scripts
 V3_GOP = 20  # frames in a group of V3
@@ -55,11 +55,11 @@ class Case:
         folder: in the data folder.
         test: names of the test cameras instead of the capture's own, which are then left out.
         scale: factor on the size of the images.
-        frames: the first frames that are used; None: all.
+        frames: number of frames, from the first; None: all.
         splat: a static splat of the data folder instead, which `animate_splat` moves and `drawn.py` draws.
-        vmaf: it is measured too.
-        rig: that draws it.
-        rounds: times that its frames follow each other: a walk that ends where it began.
+        vmaf: VMAF is measured too.
+        rig: the rig that draws the splat.
+        rounds: number of repetitions of its frames: a walk that ends where it began.
         back: every second round goes backwards: a motion that does not end where it began.
     """
 
@@ -107,8 +107,7 @@ CASES = {
 
 
 def repeated(capture: Capture, rounds: int, *, back: bool = False) -> Capture:
-    """The frames of a capture so many times, one after the other; `back`: every second time from the last to the
-    first."""
+    """The capture with its frames repeated `rounds` times; `back`: every second round runs backwards."""
     count = capture.frame_count
 
     def at(t: int) -> int:
@@ -144,8 +143,8 @@ class Run:
         case: name in CASES.
         recipe: name in RECIPES.
         frames: "A:B" or "A:B:STEP", None: all.
-        quality: of the stream; None: the one that is found.
-        also: qualities at which the same training is coded, too (recipe gscodec).
+        quality: quality of the stream; None: the encoder finds it.
+        also: further qualities at which the same training is coded (recipe gscodec).
     """
 
     case: str
@@ -271,7 +270,7 @@ def sequence(
 
 
 def shown(groups: list[ParametricGroup]) -> list[Gaussians]:
-    """The Gaussians of each frame that live in it."""
+    """The living Gaussians of each frame."""
     return [group.visible(t) for group in groups for t in range(len(group))]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 @contextmanager
 def part_file(path: Path) -> Iterator[Path]:
-    """Yields NAME.part to write to; when the block ends well it becomes `path`, which it replaces."""
+    """Yields NAME.part to write to; if the block succeeds, NAME.part is renamed to `path`, which it replaces."""
     part = path.with_name(path.name + ".part")
     try:
         yield part
@@ -24,13 +24,13 @@ def part_file(path: Path) -> Iterator[Path]:
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Arrays by name as an .npz file."""
+    """Writes arrays, by name, to an .npz file."""
     with part_file(path) as part, part.open("wb") as f:
         np.savez(f, **arrays)
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray] | None:
-    """The mirror of `write_arrays`; None where there is no such file, or a damaged one."""
+    """Inverse of `write_arrays`; None if the file is missing or damaged."""
     try:
         with np.load(path) as z:
             return dict(z)

@@ -1,6 +1,6 @@
-"""Errors by blame: who has to act decides the type (the message says what, where, what was expected and what to do).
+"""Error types: the type says who has to act; the message says what is wrong, where, what was expected, what to do.
 
-All derive from `GscodecError`, which the command line prints as one sentence; anything else is a bug of ours.
+All derive from `GscodecError`, which the command line prints as one sentence; any other exception is a bug of gscodec.
 """
 
 import importlib
@@ -8,11 +8,11 @@ from types import ModuleType
 
 
 class GscodecError(Exception):
-    """Base of everything that a user can cause and mend."""
+    """Base of all errors that a user can cause and fix."""
 
 
 class BitstreamError(GscodecError):
-    """A .gsv file is damaged or not one: names the byte offset, the unit and what was expected there."""
+    """A file is damaged or not a .gsv file: names the byte offset, the unit and what was expected there."""
 
 
 class LimitError(GscodecError):
@@ -28,15 +28,15 @@ class UsageError(GscodecError):
 
 
 def require(module: str, purpose: str, extra: str = "encode") -> ModuleType:
-    """The optional module `module`, imported when it is needed, since the player's side installs without it.
+    """Imports the optional module `module` only when it is needed: the player's side installs without it.
 
     Args:
         module: import name, e.g. "cv2".
-        purpose: what needs it, the start of the message, e.g. "reading a video".
-        extra: the extra of the package that has it.
+        purpose: operation that needs the module, the start of the message, e.g. "reading a video".
+        extra: optional extra of the package that installs the module.
 
     Raises:
-        UsageError: it is not installed; names the extra that has it.
+        UsageError: the module is not installed; names the extra that installs it.
     """
     try:
         return importlib.import_module(module)

@@ -1,11 +1,11 @@
-"""Where to put the nodes of a point set; the trainer and the encoder choose alike."""
+"""Farthest point sampling: places the nodes of a point set. The trainer and the encoder share it."""
 
 import numpy as np
 
 
 def farthest_points(points: np.ndarray, count: int, sizes: np.ndarray | float = 1.0) -> np.ndarray:
-    """[count] indices of `points` [N, 3], each the farthest from those before it, in its own `sizes` ([N], any unit);
-    starts nearest to the centre."""
+    """Indices [count] of `points` [N, 3]: each is the farthest point from those chosen before it, with distances
+    divided by its own `sizes` ([N], any unit). The first is the point nearest to the centre."""
     points = points - points.mean(0)
     square = (points**2).sum(1)
     chosen, distance = [], np.full(len(points), np.inf)

@@ -1,5 +1,5 @@
-"""What made a result: program, inputs and settings. A second run goes on with a first one's work only if all are equal,
-and names what has changed where they are not."""
+"""Fingerprint of a result: program, inputs and settings. A second run continues the work of a first run only if all are
+equal; otherwise it names the differences."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def program() -> dict:
 
 
 def inputs(source: Path) -> dict:
-    """Path of the input, and size and time of change of each of its files."""
+    """Path of the input; size and modification time of each of its files."""
     source = Path(source).resolve()
     files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
     root = source if source.is_dir() else source.parent
@@ -30,7 +30,7 @@ def inputs(source: Path) -> dict:
 
 
 def differences(before: dict, now: dict, where: str = "") -> list[str]:
-    """What differs between two fingerprints, one phrase each, e.g. "settings.quality was 50, is 80"."""
+    """Differences between two fingerprints, one phrase each, e.g. "settings.quality was 50, is 80"."""
     found = []
     for key in sorted({*before, *now}):
         name = f"{where}{key}"

@@ -4,10 +4,10 @@ from .errors import UsageError
 
 
 def frame_range(text: str | None, count: int) -> range:
-    """ "A:B" of `count` frames, either end optional, as Python slices; None is all of them.
+    """ "A:B" of `count` frames: a Python slice, either end optional; None means all frames.
 
     Raises:
-        UsageError: not of that form, or it holds no frame.
+        UsageError: the text has another form, or the range holds no frame.
     """
     if text is None:
         return range(count)

@@ -1,4 +1,4 @@
-"""The PLY container: header and element tables. splats/ and capture/ know what the properties mean.
+"""The PLY container: header and element tables. splats/ and capture/ interpret the properties.
 
 Plain numpy, so that the player's side can read and write it. Reading stops at the first element with a list property
 (the faces of a mesh): splats do not need it.

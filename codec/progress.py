@@ -1,4 +1,4 @@
-"""One progress bar on stderr, with an ETA; silent when stderr is not a terminal, but for a line every now and then."""
+"""One progress bar on stderr, with an ETA; if stderr is not a terminal, a line every `LINE_EVERY` seconds instead."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Bar:
             print(f"{stage}: {done}/{total}, about {left:.0f} s left", file=sys.stderr, flush=True)
 
     def say(self, message: str) -> None:
-        """A line above the bar."""
+        """Prints a line above the bar."""
         if self._terminal:
             self._rich.console.print(message)
         else:

@@ -1,4 +1,4 @@
-"""Work side by side in threads: numpy and the native kernels release the interpreter while they compute."""
+"""Parallel work in threads: numpy and the native kernels release the interpreter lock while they compute."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ Result = TypeVar("Result")
 
 
 def each_frame(make: Callable[[int], Result], frames: int) -> list[Result]:
-    """`make(t)` of every frame, in order; the calls must not depend on each other."""
+    """Results of `make(t)` for every frame, in order; the calls must not depend on each other."""
     with ThreadPoolExecutor(max(1, min(frames, os.cpu_count() or 1))) as pool:
         return list(pool.map(make, range(frames)))
 
 
 def prefetched(items: Iterable[Result]) -> Iterator[Result]:
-    """`items`; the next one is made while one is used."""
+    """Yields `items`; the next item is computed while the caller uses the current one."""
     items, end = iter(items), object()
     with ThreadPoolExecutor(1) as pool:
         coming = pool.submit(next, items, end)

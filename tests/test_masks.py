@@ -117,7 +117,7 @@ def test_the_command_takes_plates_and_keeps_what_was_edited(tmp_path):
     assert "6 masks from plates, the first one is" in done.stdout
     fails(run("masks", tmp_path), "000.png: there are masks already; delete them, or say --overwrite to replace them")
     done = run("masks", tmp_path, "--moving", "--overwrite")
-    assert "6 masks from what moves" in done.stdout
+    assert "6 masks from moving objects" in done.stdout
 
 
 def test_what_cannot_be_masked_is_said(tmp_path):

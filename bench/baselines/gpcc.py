@@ -3,11 +3,11 @@
 It is on the PATH as tmc3 or named by the environment variable TMC3; https://github.com/MPEGGroup/mpeg-pcc-tmc13 builds
 with cmake. Its times contain the start of the program and its .ply files.
 
-A Gaussian is a point at a whole number with 8-bit attributes, as MPEG's exploration of Gaussian splats starts from.
-TMC13 reads one colour and one reflectance a point, so that a frame takes several runs: colours with opacities, log
-scales, rotations (xyz with w), and one for each harmonic. The points are the same in all, and counted once. Octree and
-RAHT with the options of the common test conditions for lossless geometry and lossy attributes, sparse points; two
-Gaussians in one place would be one point, so that the second moves to the next free place.
+A Gaussian is a point at integer coordinates with 8-bit attributes, the starting point of MPEG's exploration of Gaussian
+splats. TMC13 reads one colour and one reflectance per point, so that a frame takes several runs: colours with
+opacities, log scales, rotations (xyz with w), and one for each harmonic. The points are the same in all runs, and
+counted once. Octree and RAHT with the options of the common test conditions for lossless geometry and lossy attributes,
+sparse points. Two Gaussians in one place would be one point, so the second moves to the next free place.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ GEOMETRY = "trisoupNodeSizeLog2=0 mergeDuplicatedPoints=0 positionQuantizationSc
 SPARSE = "inferredDirectCodingMode=3 maxNumQtBtBeforeOt=6 minQtbtSizeLog2=0 planarModeIdcmUse=32"
 CONTEXTS = "neighbourAvailBoundaryLog2=8 intra_pred_max_node_size_log2=6 rahtPredictionSearchRange=2500"
 POINTS, ATTRIBUTES = 2, (4, 7)  # types of units of the byte stream that hold points, or attributes
-STEPS = 255  # of an attribute
+STEPS = 255  # quantization steps of an attribute
 NEEDED = "the G-PCC baseline needs tmc3; build it from https://github.com/MPEGGroup/mpeg-pcc-tmc13"
 
 
@@ -85,7 +85,7 @@ def _runs(channels: int) -> list[range]:
 
 
 def _apart(places: np.ndarray) -> np.ndarray:
-    """The whole numbers [N, 3], each moved until it has a place of its own."""
+    """The integer positions [N, 3], each moved until it has a place of its own."""
     random = np.random.default_rng(0)
     while True:
         _, first = np.unique(places @ (1 << np.array([0, 20, 40])), return_index=True)

@@ -1,9 +1,9 @@
 """The public part of GSAV (OpsiClear's gscodec): attributes as one lossless VP9 atlas, in Morton order.
 
 14 channels of 8 bit (position high bytes, scales, asin of the rotation, opacity, colour as YCbCr) lie side by side in
-the luma; zstd codes the low bytes of the positions. The only rate control is `snap`: a code that differs from that of
-the frame before by at most `snap` is replaced by it. Ranges are those of the group, the order is that of its first
-frame.
+the luma; zstd codes the low bytes of the positions. The only rate control is `snap`: a code that differs from the code
+in the previous frame by at most `snap` is replaced by that code. Ranges are those of the group, the order is that of
+its first frame.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Programs of others that a baseline calls."""
+"""External programs that a baseline calls."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def run_tool(name: str, variable: str, needed: str, arguments: Iterable[str | Pa
     """Runs the program `name` of the PATH, or the one that the environment variable names.
 
     Args:
-        needed: what needs it and where it comes from, the start of a sentence.
+        needed: start of the error message: the baseline that needs the program, and the program's source.
 
     Raises:
         UsageError: it is not installed, or it failed.

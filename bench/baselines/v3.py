@@ -2,12 +2,12 @@
 
 As in its public code: a hash grid of 16 levels x 4 features with 2^15 entries and an MLP of 64 x 2 map the position of
 a Gaussian to its translation and rotation while the attributes are fixed; then all attributes are fine-tuned. The
-public code takes 800 and 2,000 steps; here as many, in the same proportion, as should take 13.4 s a frame of
-lumberjack, about the time of our preset medium: 90 and 225 took 8.2 s. The residual-entropy term of the public code has
-almost no gradient and is left out; the rate is that of videogs.py.
+public code takes 800 and 2,000 steps. Here the steps, in the same proportion, are chosen to take 13.4 s per frame of
+lumberjack, about the time of our preset medium: 90 and 225 steps took 8.2 s. The residual-entropy term of the public
+code has almost no gradient and is left out; the rate is that of videogs.py.
 
-Learning rates are tuned for 90 and 225 steps on the bundled capture: psnr_fg after 3 frames was 22.0 dB with the
-first guess and is 26.7, after 6 frames 26.3, where the keyframe has 26.5. The field of a frame starts from that of the
+Learning rates are tuned for 90 and 225 steps on the bundled capture: psnr_fg after 3 frames was 22.0 dB with the first
+guess and is 26.7 dB, after 6 frames 26.3 dB; the keyframe has 26.5 dB. The field of a frame starts from that of the
 frame before: the public description leaves this open, and it raises the PSNR by 0.7 dB after 5 frames.
 """
 
@@ -27,7 +27,7 @@ from gscodec.train.model import Model
 from gscodec.train.settings import TrainSettings
 from gscodec.train.views import Views, photometric_loss
 
-POINTS = 8000  # of the keyframe, to start from
+POINTS = 8000  # initial points of the keyframe
 STEPS = (158, 395)  # per frame, motion and fine-tuning, in the proportion 800 : 2000
 FIELD_RATES = {"grid": 2e-2, "mlp": 2e-3}
 FINE_SHARE = 1.0  # of the keyframe's learning rates
@@ -54,9 +54,9 @@ class MotionField(torch.nn.Module):
 
 
 def train_v3(capture, frames: range, settings: TrainSettings, steps: tuple[int, int] = STEPS) -> list:
-    """Gaussians of each frame: a keyframe for the first, then one frame from the other, by `steps` of motion and of
-    fine-tuning."""
-    settings = replace(settings.of_capture(capture), sh_degree=0)  # its packing has no more
+    """Gaussians of each frame: a keyframe for the first, then each frame from the one before, by `steps` of motion and
+    of fine-tuning."""
+    settings = replace(settings.of_capture(capture), sh_degree=0)  # its packing has no higher harmonics
     views = Views(capture, settings, CpuBackend())
     model, radius = initial_model(capture, frames[0], settings.initial_points or POINTS, settings)
     train_keyframe(model, views, frames[0], settings, steps=settings.keyframe_steps, radius=radius)

@@ -1,4 +1,4 @@
-"""A static codec over all frames of a group at once: the maps of maps.py as lossless WebP images, as SOG has them.
+"""A static codec over all frames of a group at once: the maps of maps.py as lossless WebP images, as in SOG.
 
 Each map holds the frames of the group one below the other, so that one dictionary and one predictor serve all of them.
 Nothing is predicted from frame to frame. Positions have 16 bits, all else `bits`.
@@ -16,8 +16,8 @@ from gscodec.model.gaussians import Gaussians
 from .maps import LOSSLESS, pack, unpack
 
 SETTINGS = {f"{b} bit": {"bits": b} for b in (4, 5, 6, 7, 8)}
-LOSSLESS_QUALITY = 101  # OpenCV's word for it
-SIDE_MAX = 16383  # of a WebP image
+LOSSLESS_QUALITY = 101  # OpenCV's value for lossless
+SIDE_MAX = 16383  # of a WebP image, pixels
 
 
 def encode(frames: Sequence[Gaussians], bits: int) -> dict[str, bytes]:
@@ -35,7 +35,7 @@ def encode(frames: Sequence[Gaussians], bits: int) -> dict[str, bytes]:
 
 
 def _images(maps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Maps of three channels; four of a rotation and one of the opacity are two images and one, padded with zeros."""
+    """Maps of three channels: one of rotation xyz; one of rotation w, opacity and zeros; the others as they are."""
     wide = dict(maps)
     quats, opacity = wide.pop("quats"), wide.pop("logit_opacities")
     none = np.zeros_like(opacity)

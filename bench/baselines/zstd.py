@@ -1,7 +1,7 @@
 """zstd on plain quantized planes: the size of a sequence without a model.
 
-Positions have 2 x `bits`, all else `bits`, ranges are over the group. Frames are differences from the one before, split
-in a low and a high byte plane.
+Positions have 2 x `bits`, all else `bits`, ranges are over the group. Frames are differences from the previous frame,
+split into a low and a high byte plane.
 """
 
 from __future__ import annotations

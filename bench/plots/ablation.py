@@ -8,7 +8,7 @@ import re
 from ..machine import stamp
 
 WHOLE = "whole recipe"
-MORE_SEEDS = re.compile(r"seed ([2-9]|\d\d)$")  # one is enough to see what chance does
+MORE_SEEDS = re.compile(r"seed ([2-9]|\d\d)$")  # one seed is enough to show the effect of chance
 PANELS = {"psnr_coded": "PSNR decoded, dB", "kb_per_frame": "kB a frame", "flicker": "flicker"}
 LESS, MORE = "#1f5fb4", "#c76f14"
 

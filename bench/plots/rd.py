@@ -30,7 +30,7 @@ SEQUENCES = {
     "playbot": "playbot (SH 2)",
     "fruit": "fruit (SH 3)",
 }
-SAVED_AGAINST = {"zstd": "zstd", "x265": "x265"}  # the strongest, and the anchor of MPEG
+SAVED_AGAINST = {"zstd": "zstd", "x265": "x265"}  # the strongest peer, and the anchor of MPEG
 PSNR_MIN = 35  # dB, the lowest quality shown
 LABEL_GAP = 0.062  # between two names, in heights of the axes
 
@@ -77,7 +77,7 @@ def time_chart(result: dict):
 
 
 def frames_chart(result: dict):
-    """Bytes of single frames beside SOG's and SPZ's at the same PSNR (matplotlib)."""
+    """Bytes of single frames, compared with SOG's and SPZ's at the same PSNR (matplotlib)."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.5, 0.8 + 0.65 * max(len(result["shares"]), 2)), layout="constrained")

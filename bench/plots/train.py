@@ -15,7 +15,7 @@ LOOK = {  # recipe -> name, colour
     "v3": ("V3's recipe", "#9a9a9a"),
     "v3-coded": ("V3's recipe and packing", "#555555"),
 }
-BUSY_MOST = 0.5  # cores that other work keeps busy beside a time that is drawn
+BUSY_MOST = 0.5  # largest number of cores that other work kept busy while a drawn time was measured
 SPAN_X, SPAN_Y = 1.6, 0.25  # margin around the points: a factor, dB
 PANELS = {"seconds_per_frame": "training, seconds a frame", "kb_per_frame": "kB a frame"}
 
@@ -44,7 +44,7 @@ def train_chart(result: dict):
 
 
 def _time_says_nothing(entry: dict) -> bool:
-    """Whether its time is that of another quality of the same training, or was taken beside other work."""
+    """Whether its time belongs to another quality of the same training, or other work ran beside it."""
     return bool(entry["quality"]) or entry.get("measured", {}).get("busy_beside", 0.0) > BUSY_MOST
 
 
@@ -62,7 +62,7 @@ def _panel(axes, entries: Sequence[dict], key: str) -> None:
         x, y, presets = zip(*points, strict=True)
         ours = recipe == "gscodec"
         axes.plot(x, y, marker="o", color=color, label=name, linewidth=2.4 if ours else 1.2, zorder=3 if ours else 2)
-        if recipe == "full":  # of no preset
+        if recipe == "full":  # it has no preset
             continue
         for at, preset in zip(zip(x, y, strict=True), presets, strict=True):
             axes.annotate(preset, at, (4, -9), textcoords="offset points", fontsize=7, color=color)

@@ -10,7 +10,7 @@ from .color import decorrelate
 
 
 def channel_values(g: Gaussians) -> dict[str, np.ndarray]:
-    """attribute -> [N, C]: colours as Y, Co, Cg, of quats the vector part; shN only where the degree is above 0."""
+    """attribute -> [N, C]: colours as Y, Co, Cg; quats as their vector part; shN only if the SH degree is above 0."""
     out = {}
     for a in ATTRIBUTES:
         values = getattr(g, a.name)

@@ -1,6 +1,6 @@
 """Colour decorrelation of SH coefficients (spec 13.5): Y, Co, Cg.
 
-`STEP_WEIGHTS` makes one nominal step mean the same squared error in RGB whichever channel it hits.
+With `STEP_WEIGHTS`, one nominal step causes the same squared error in RGB in each channel.
 """
 
 import numpy as np

@@ -12,7 +12,8 @@ class HilbertLayout:
     """The map of a layer.
 
     Attributes:
-        width, height: in cells. side: of a tile.
+        width, height: size of the map in cells.
+        side: side of a tile in cells.
         x, y: [N] column and row of each Gaussian.
     """
 
@@ -24,7 +25,7 @@ class HilbertLayout:
 
     @staticmethod
     def of(tiles: list[int], side: int) -> HilbertLayout:
-        """The map of a layer whose tiles, of `side` x `side` cells, have so many Gaussians."""
+        """The map of a layer; `tiles`: number of Gaussians in each tile of `side` x `side` cells."""
         cells = side * side
         index = np.concatenate([np.arange(n) + cells * t for t, n in enumerate(tiles)] or [np.zeros(0, int)])
         used = cells * (len(tiles) - 1) + tiles[-1] if tiles else 0
@@ -34,7 +35,7 @@ class HilbertLayout:
         return HilbertLayout(1 << bits, (1 << bits) * -(-used // square), side, x, y + (index // square << bits))
 
     def arrange(self, values: np.ndarray) -> np.ndarray:
-        """[N] of the Gaussians -> [H, W]; cells without one are 0."""
+        """Values [N] of the Gaussians -> plane [H, W]; cells without a Gaussian are 0."""
         plane = np.zeros((self.height, self.width), values.dtype)
         plane[self.y, self.x] = values
         return plane
@@ -45,7 +46,7 @@ class HilbertLayout:
 
 
 def _hilbert(t: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray]:
-    """Column and row of each step of the curve that fills a square of 2^bits x 2^bits cells."""
+    """Column and row of each step of the Hilbert curve that fills a square of 2^bits x 2^bits cells."""
     x, y = np.zeros_like(t), np.zeros_like(t)
     for j in range(bits):
         s = 1 << j

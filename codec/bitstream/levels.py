@@ -1,4 +1,4 @@
-"""Levels of the stream (spec 5): the caps that a decoder may count on, as the native decoder enforces them."""
+"""Levels of the stream (spec 5): the caps that a decoder may rely on; the native decoder enforces them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def smallest_level(*, gaussians: int = 0, frames: int = 1, nodes: int = 0, symbo
     """The lowest level whose caps cover the largest group of a stream.
 
     Raises:
-        LimitError: none does; the message names the cap.
+        LimitError: no level covers it; the message names the cap.
     """
     need = {"gaussians": gaussians, "frames": frames, "nodes": nodes, "symbols": symbols, "bytes": bytes}
     for level in LEVELS:

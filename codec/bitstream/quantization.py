@@ -1,9 +1,9 @@
-"""Quantization steps: data that the encoder picks, training simulates and the group header carries.
+"""Quantization steps: chosen by the encoder, simulated in training, sent in the group header.
 
-One number, `quality`, scales them all; the geometry steps follow the size of the subject, so that a capture in
-millimetres and one in metres get the same picture. Ratios between attributes: equal slopes of rendered error against
-bits, measured on the statue's middle frame (halving one step at a time). These are nominal; encoder and
-training measure what each scene needs for the same error (render/sensitivity.py).
+One number, `quality`, scales all steps. Geometry steps are proportional to the size of the subject, so that captures in
+millimetres and in metres give the same image. Ratios between attributes: equal slopes of rendered error against bits,
+measured on the statue's middle frame (halving one step at a time). These steps are nominal; encoder and training
+measure the steps that each scene needs for the same error (render/sensitivity.py).
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 from ..model.attributes import ATTRIBUTES
 
 QUALITY_DEFAULT = 50.0
-QUALITY_HALVES = 12.0  # so many points of quality halve every step (6 dB)
+QUALITY_HALVES = 12.0  # points of quality that halve every step (6 dB)
 PSNR_DEFAULT = 41.0  # against the input, at QUALITY_DEFAULT
-MODEL = 2.4  # measured error over what independent small errors would add up to
+MODEL = 2.4  # ratio of the measured error to the predicted sum of independent small errors
 RADIUS_MAX = 2.5  # times the median distance from the middle; a filled shape has about 2
 
 
@@ -27,7 +27,7 @@ class Steps:
 
     Attributes:
         by_attribute: attribute -> step.
-        node_translation: of the nodes, world units.
+        node_translation: step of node translations, world units.
     """
 
     by_attribute: dict[str, float]
@@ -45,15 +45,15 @@ def steps_for(quality: float, radius: float) -> Steps:
 
 
 def error_for(quality: float) -> float:
-    """Mean squared error of the picture (pixels 0 to 1) that `quality` stands for, as sensitivities predict it."""
+    """Mean squared error of the image (pixels 0 to 1) at `quality`, as predicted from sensitivities."""
     return 10 ** (-PSNR_DEFAULT / 10) / MODEL * 4.0 ** ((QUALITY_DEFAULT - quality) / QUALITY_HALVES)
 
 
 def trajectory_step(step: float, frames: int) -> float:
     """Step of temporal DCT coefficients where the canonical value has `step`.
 
-    An error of the canonical value shows in all T frames, one of an orthonormal coefficient once: at equal slopes of
-    rate against distortion the coefficient's step is sqrt(T) times as large.
+    An error of the canonical value counts in all T frames, an error of an orthonormal coefficient counts once: at equal
+    slopes of rate against distortion the coefficient's step is sqrt(T) times as large.
     """
     return float(np.float32(step * np.sqrt(frames)))
 

@@ -1,8 +1,8 @@
 """QuantizedGroup: the integers of a group, as the native coder takes them and the native decoder gives them back.
 
-Mirrored field by field by gsv::group::Group and its header; a test compares both. Clauses are those of spec/gsv.md.
-Planar arrays here, interleaved ones in Rust. All arrays are in the order of the stream: layer after layer, in each the
-survivors of the reference, then what the group codes itself in Morton order.
+gsv::group::Group and its header mirror it field by field; a test compares both. Clauses are those of spec/gsv.md.
+Arrays are planar here, interleaved in Rust. All arrays are in stream order: layer after layer; in each layer first the
+survivors of the reference, then the Gaussians that the group codes itself, in Morton order.
 """
 
 from __future__ import annotations
@@ -46,15 +46,16 @@ class QuantizedTrajectories:
 
 @dataclass(frozen=True)
 class QuantizedRig:
-    """What predicts the motion of the nodes: J joints with parents, and their poses (clauses 11.1, 11.2).
+    """Rig that predicts the motion of the nodes: J joints with parents, and their poses (clauses 11.1, 11.2).
 
     Attributes:
-        joints: [J, 3] i32 places in the pose of rest of the skeleton, in grid steps from the origin of the grid.
-        parents: [J] u8, parent of each joint, before it; its own index: a root.
-        bind: [J, 6] i32, the pose in which the group rests: rotation vector, translation of each joint, in steps.
-        weights: [M, J] u8, 0 to 64: which joints move each node; all 0: the rig does not move it.
+        joints: [J, 3] i32 positions in the rest pose of the skeleton, in grid steps from the origin of the grid.
+        parents: [J] u8, parent of each joint, which precedes it; a root has its own index.
+        bind: [J, 6] i32, pose in which the group rests: rotation vector and translation of each joint, in steps.
+        weights: [M, J] u8, 0 to 64, weight of each joint for each node; all 0: the rig does not move the node.
         poses: [T, 6, J] i32 temporal DCT coefficients of the poses of the joints.
-        rotation_step: radians. translation_step: world units.
+        rotation_step: radians.
+        translation_step: world units.
     """
 
     joints: np.ndarray
@@ -72,11 +73,12 @@ class QuantizedNodes:
 
     Attributes:
         positions: [M, 3] u32 on the grid, in Morton order.
-        coefficients: [K, 6, M] i32 temporal DCT coefficients: rotation vector, then translation; behind what the rig
-            predicts.
-        rotation_step: radians. translation_step: world units.
-        neighbors: nodes that carry one Gaussian.
-        rig: predicts the motion; None: nothing does.
+        coefficients: [K, 6, M] i32 temporal DCT coefficients of rotation vector, then translation; with a rig, of their
+            residual to its prediction.
+        rotation_step: radians.
+        translation_step: world units.
+        neighbors: number of nodes that carry one Gaussian.
+        rig: predicts the motion; None: no prediction.
     """
 
     positions: np.ndarray
@@ -93,21 +95,23 @@ class QuantizedGroup:
 
     Attributes:
         frames: T.
-        origin: [3] f32, world units, where the grid begins; grid_step: its spacing; grid_bits: bits of a coordinate.
+        origin: [3] f32, origin of the grid, world units.
+        grid_step: spacing of the grid, world units.
+        grid_bits: bits of a coordinate.
         positions: [N, 3] u32 on the grid.
         channels: attribute -> canonical integers, all attributes but means; shN only where the SH degree is above 0.
-        trajectories: attribute -> coefficients; an attribute that is missing does not change over time.
+        trajectories: attribute -> coefficients; a missing attribute does not change over time.
         nodes: deformation graph; None: there is none.
         lifetimes: [N, 2] u16, the frames [t0, t1) in which each Gaussian is shown; None: all frames.
-        layers: [L] Gaussians of each layer; None: one layer.
-        shifts: [L, 1 + A] low bits that a layer leaves out, of positions and of each attribute in the order of
-            `channels` in the table; None: none.
-        corrections: [L, 2] f32, added to log_scales and logit_opacities while the layers behind are missing; None: 0.
-        scale_exponents: [3, 3] i32, how the steps of quats fall with the decoded sizes (clause 13.1), in 1/32.
+        layers: [L] number of Gaussians in each layer; None: one layer.
+        shifts: [L, 1 + A] number of low bits that a layer leaves out, of positions and of each attribute of `channels`,
+            in the order of the attribute table; None: 0.
+        corrections: [L, 2] f32, added to log_scales and logit_opacities while the next layers are missing; None: 0.
+        scale_exponents: [3, 3] i32, exponents in 1/32: fall of the steps of quats with the decoded sizes (clause 13.1).
         tile_side_log2: a tile has up to 4^tile_side_log2 Gaussians (clause 7.2); predicted: as in the reference.
-        reference: how many groups back the group is that this one is predicted from; 0: independent.
-        parents: [N] i32, index of each Gaussian in that group, -1 for a birth; None where `reference` is 0.
-        turned_harmonics: the higher bands of SH turn with the nodes (clause 13.4); predicted: as in the reference.
+        reference: distance in groups back to the group that this one is predicted from; 0: independent.
+        parents: [N] i32, index of each Gaussian in the reference, -1 for a birth; None if `reference` is 0.
+        turned_harmonics: the higher bands of SH rotate with the nodes (clause 13.4); predicted: as in the reference.
     """
 
     frames: int

@@ -1,8 +1,8 @@
-"""Masks of pictures that have none, but a background of one colour: rendered before it, or painted over.
+"""Masks of pictures without masks but with a background of one colour, which was rendered or painted over.
 
-Noise of a sensor leaves no two neighbours alike, so that a border of one colour in nearly all cameras was made. What
-hangs together with the border in that colour is background, and so is every larger patch of it. A pixel at the rim of
-the subject is a mix of that colour and of what is beside it, whose share is its alpha.
+Sensor noise makes neighbouring pixels differ, so a border of one colour in nearly all cameras is artificial. Pixels of
+that colour are background if they are connected to the border or form a larger patch. A pixel at the rim of the subject
+is a mix of that colour and of the subject's colour beside it; the share of the subject is its alpha.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ import numpy as np
 from ..errors import require
 
 SAME = 1.0  # of 255: differences within a background of one colour
-ALIKE, LOSSY = 8.0, 20.0  # of 255: those by which a pixel is background; the same after lossy compression
-BORDER_MIN = 0.1  # of a picture's border in that colour
-PURE_MIN = 0.9  # of what is alike there has no noise
-PICTURES_MIN = 0.9  # of the pictures whose border is so
-PATCH = 2e-4  # of the picture: a patch of background that does not touch the border
-SHARE_MIN = 0.1  # of a mixed colour: below it what is beside it is the better guess
-RIM = 2  # pixels on each side, among which a pixel of the rim finds the colour of the subject
+ALIKE, LOSSY = 8.0, 20.0  # of 255: largest difference of a background pixel; the same after lossy compression
+BORDER_MIN = 0.1  # least share of a picture's border within SAME of that colour
+PURE_MIN = 0.9  # the same, as a share of the border pixels within ALIKE: the others have noise
+PICTURES_MIN = 0.9  # least share of the pictures with such a border
+PATCH = 2e-4  # of the picture: least area of a background patch that does not touch the border
+SHARE_MIN = 0.1  # alpha; below it, the subject's colour beside the pixel is the better estimate
+RIM = 2  # pixels on each side, in which a pixel of the rim finds the colour of the subject
 
 
 def background_of(pictures: Sequence[np.ndarray]) -> np.ndarray | None:
-    """[3] f32 colour of the background that pictures of different cameras, [H, W, 3] u8, have in common; None: they
-    have none, or show nothing else."""
+    """[3] f32 background colour that pictures of different cameras, [H, W, 3] u8, have in common; None: there is none,
+    or the pictures show nothing else."""
     color = border_color(pictures)
     if color is None or not any((np.abs(p - color) > ALIKE).any() for p in pictures):
         return None
@@ -47,7 +47,7 @@ def border_color(pictures: Sequence[np.ndarray]) -> np.ndarray | None:
 
 
 def cut_out(rgb: np.ndarray, color: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours [H, W, 3] u8, not premultiplied, and alpha [H, W] u8 of what stands before a background of `color`."""
+    """Colours [H, W, 3] u8, not premultiplied, and alpha [H, W] u8 of the subject before a background of `color`."""
     behind = _background(rgb, color)
     alpha, rgb = np.where(behind, 0, 255).astype(np.uint8), rgb.copy()
     rows, columns = (np.nonzero(~behind.all(axis))[0] for axis in (1, 0))
@@ -58,8 +58,8 @@ def cut_out(rgb: np.ndarray, color: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _background(rgb: np.ndarray, color: np.ndarray) -> np.ndarray:
-    """[H, W] bool. Lossy compression disturbs more of a background than the pixels next to the subject; it is then told
-    by a wider margin."""
+    """[H, W] bool: background pixels. If more of them are disturbed than lie next to the subject, compression was
+    lossy; then a wider margin applies."""
     cv2 = require("cv2", "masks from the background")
     behind = _patches(rgb, color, ALIKE)
     disturbed = behind & (cv2.inRange(rgb, *_around(color, SAME)) == 0)
@@ -68,12 +68,12 @@ def _background(rgb: np.ndarray, color: np.ndarray) -> np.ndarray:
 
 
 def _patches(rgb: np.ndarray, color: np.ndarray, most: float) -> np.ndarray:
-    """[H, W] bool: what differs by `most` from the colour, and hangs together with the border or is large."""
+    """[H, W] bool: patches that differ by `most` from the colour, and touch the border or are large."""
     cv2 = require("cv2", "masks from the background")
     _, labels, stats, _ = cv2.connectedComponentsWithStats(cv2.inRange(rgb, *_around(color, most)), connectivity=4)
     chosen = stats[:, cv2.CC_STAT_AREA] >= PATCH * labels.size
     chosen[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = True
-    chosen[0] = False  # what is unlike the background
+    chosen[0] = False  # pixels unlike the background
     return chosen[labels]
 
 
@@ -90,7 +90,7 @@ def _unmix(rgb: np.ndarray, alpha: np.ndarray, color: np.ndarray) -> None:
     side = 2 * RIM + 1
     weight = cv2.blur((inner > 0).astype(np.float32), (side, side))[y, x, None]
     near = cv2.blur(np.where(inner[..., None] > 0, rgb, 0).astype(np.float32), (side, side))[y, x]
-    near = np.where(weight > 1e-4, near / np.maximum(weight, 1e-4), rgb[y, x])  # what is thin has no inner pixels
+    near = np.where(weight > 1e-4, near / np.maximum(weight, 1e-4), rgb[y, x])  # thin parts have no inner pixels
     mixed, whole = rgb[y, x] - color, near - color
     share = np.clip((mixed * whole).sum(1) / np.maximum((whole * whole).sum(1), 1), 0, 1)
     alpha[y, x] = np.rint(255 * share)

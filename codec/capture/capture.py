@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from .rig import Feed
 
 MARGIN = 24  # pixels of background kept around the subject
-STILL = 1e-6  # a camera whose values change by less, relatively, stands still
+STILL = 1e-6  # relative change; a camera whose values change by less stands still
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Capture:
     """Synchronised images of cameras that stand still or move.
 
     Attributes:
-        name: of the folder, for messages and reports.
+        name: name of the folder, for messages and reports.
         fps: frames a second.
         cameras: undistorted pinhole cameras, as they are in frame 0; each has an image of every frame.
         frame_count: frames of this (possibly restricted) capture.
@@ -38,10 +38,10 @@ class Capture:
         has_depth: views of at least one camera have depth.
         read: (camera index, frame of the source) -> View at the source's size, undistorted; thread-safe.
         first_frame: source frame that is frame 0 here.
-        poses: (camera index, frame of the source) -> the camera in that frame, of which K (at the source's size) and
-            viewmat are used; thread-safe. None: no camera moves.
-        points: sparse points that came with the capture, None: there are none.
-        footage: what each camera has recorded; empty where the capture is not read from files.
+        poses: (camera index, frame of the source) -> the camera in that frame; only its K (at the source's size) and
+            its viewmat are used; thread-safe. None: no camera moves.
+        points: sparse points that came with the capture; None: there are none.
+        footage: the recorded footage of each camera; empty if the capture is not read from files.
     """
 
     name: str
@@ -103,7 +103,7 @@ class Capture:
         return [i for i, c in enumerate(self.cameras) if c.split == split]
 
     def frames(self, start: int | None, stop: int | None = None) -> Capture:
-        """The frames [start, stop) as a capture of its own; None means the first or the last, negative ends count back.
+        """The frames [start, stop) as a new capture. None: the first or the last frame; negative ends count back.
 
         Raises:
             UsageError: no frame is left.
@@ -115,7 +115,7 @@ class Capture:
         return replace(self, cameras=cameras, first_frame=self.first_frame + a, frame_count=b - a)
 
     def with_low_pass(self, low_pass: float) -> Capture:
-        """The capture for Gaussians that are drawn with another low-pass, px^2."""
+        """The capture with another low-pass of its cameras (variance, px^2)."""
         return replace(self, cameras=[replace(c, low_pass=low_pass) for c in self.cameras])
 
     def scaled(self, scale: float) -> Capture:
@@ -139,7 +139,7 @@ def differs(a: Camera, b: Camera, scale: float) -> bool:
     """Whether two cameras differ in pose, intrinsics or distortion by more than rounding errors (`STILL`).
 
     Args:
-        scale: length that errors of positions are relative to, world units.
+        scale: length, world units; errors of positions are relative to it.
     """
     if a.distortion.shape != b.distortion.shape or a.fisheye != b.fisheye:
         return True
@@ -149,7 +149,7 @@ def differs(a: Camera, b: Camera, scale: float) -> bool:
 
 
 def cropped(view: View, camera: Camera) -> tuple[View, Camera]:
-    """The part of a view with the subject and MARGIN pixels around it; the whole view without alpha or subject."""
+    """The part of a view with the subject and MARGIN pixels around it; without alpha or subject the whole view."""
     if view.alpha is None or not view.alpha.any():
         return replace(view, rgb=np.ascontiguousarray(view.rgb)), camera
     (height, width), alpha = view.alpha.shape, view.alpha

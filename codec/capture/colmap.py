@@ -3,8 +3,8 @@
 A folder has images/ and a model in sparse/0, sparse or colmap/sparse/0 (cameras and images, .bin or .txt). There are
 two kinds of captures:
 
-- One folder for each frame, in the order of their numbers (the layout of V3 and SpacetimeGaussians). The name of an
-  image is its camera's.
+- One folder for each frame, in the order of their numbers (the layout of V3 and SpacetimeGaussians). An image has the
+  name of its camera.
 - One folder with all frames. Images named CAMERA/FRAME are the frames of a camera, images without a folder are single
   frames.
 
@@ -31,8 +31,8 @@ from .images import SUFFIXES
 from .rig import Feed, Track, assemble, by_number, numbered, pinhole, rigid, usable
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0")
-# number and name of the camera model -> which parameter is fx, fy, cx, cy and then OpenCV's distortion: k1, k2, p1, p2,
-# k3 ... k6, or k1, k2, k3, k4 of a fisheye lens
+# number of the camera model -> its name, and the index of the parameter that is fx, fy, cx, cy and then OpenCV's
+# distortion: k1, k2, p1, p2, k3 ... k6, or k1, k2, k3, k4 of a fisheye lens
 LENSES = {
     0: ("SIMPLE_PINHOLE", (0, 0, 1, 2)),
     1: ("PINHOLE", (0, 1, 2, 3)),
@@ -86,7 +86,7 @@ class _Model:
             raise CaptureError(f"{self.folder} has no camera {i.lens}, which took image {image}")
         fx, fy, cx, cy, *distortion = lens.params
         unit = 0 < np.linalg.norm(i.quat) < np.inf
-        R = Rotation.from_quat(np.roll(i.quat, -1)).as_matrix() if unit else np.zeros((3, 3))  # which `rigid` refuses
+        R = Rotation.from_quat(np.roll(i.quat, -1)).as_matrix() if unit else np.zeros((3, 3))  # `rigid` refuses it
         terms = np.array(distortion + [0.0] * (4 - len(distortion)))
         try:
             K, viewmat = pinhole(fx, fy, cx, cy), rigid(R, i.translation)
@@ -96,7 +96,7 @@ class _Model:
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder of the model in `folder`, or in the first frame's."""
+    """The folder of the model in `folder`, or in the folder of the first frame."""
     if not folder.is_dir():
         return None
     return _model_in(folder) or next((m for f in frames_of(folder)[:1] if (m := _model_in(f))), None)
@@ -108,7 +108,7 @@ def _model_in(folder: Path) -> Path | None:
 
 
 def frames_of(root: Path) -> list[Path]:
-    """The folders of single frames, in order: those with an images/ folder in them."""
+    """The folders of single frames, in order: those that contain a folder images/."""
     return sorted((f for f in root.iterdir() if (f / "images").is_dir()), key=by_number)
 
 
@@ -116,7 +116,7 @@ def open_colmap(root: Path) -> Capture:
     """Reads the capture in `root`. All cameras are for training.
 
     Raises:
-        CaptureError: a model is damaged or of a lens that is not supported, or no camera can be used.
+        CaptureError: a model is damaged, its lens is not supported, or no camera can be used.
     """
     found = find_model(root)
     model = _read_model(found)
@@ -133,7 +133,7 @@ def _by_number(item: tuple[str, object]) -> list:
 
 
 def _frame_folders(frames: list[Path], first: _Model):
-    """`made` and `make` of `usable`, for one folder for each frame; `first`: the model of the first one."""
+    """The arguments `made` and `make` of `usable`, for one folder per frame; `first`: model of the first frame."""
     models = [first, *(_read_model(own) if (own := _model_in(f)) else None for f in frames[1:])]
 
     def make(name: str, image: str) -> tuple[Track, Feed]:
@@ -146,7 +146,7 @@ def _frame_folders(frames: list[Path], first: _Model):
 
 
 def _one_folder(root: Path, model: _Model):
-    """`made` and `make` of `usable`, for one folder with all frames."""
+    """The arguments `made` and `make` of `usable`, for one folder with all frames."""
     made: dict[str, list[str]] = {}
     for image in sorted(model.images, key=lambda i: by_number(Path(i))):
         made.setdefault(_name(image), []).append(image)
@@ -164,7 +164,7 @@ def _one_folder(root: Path, model: _Model):
 
 
 def _track(known: list[Camera | None], paths: list[Path]) -> Track:
-    """One camera in each frame (image of `paths`), from the frames where it is known.
+    """The camera in each frame (image of `paths`); a single entry if it stands still and a frame has no pose.
 
     Raises:
         CaptureError: it moves, and a frame has no pose.
@@ -180,7 +180,7 @@ def _track(known: list[Camera | None], paths: list[Path]) -> Track:
 
 
 def _name(image: str) -> str:
-    """The camera of an image: its folder, or its own name where it has no folder."""
+    """The name of an image's camera: the folder of the image, or the image's own name without a folder."""
     path = Path(image)
     return path.parent.as_posix() if path.parent.name else path.stem
 

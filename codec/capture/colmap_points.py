@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import CaptureError
 from .points import Points, checked
 
-RECORD = struct.Struct("<Q3d3BdQ")  # id, position, colour, error in pixels, images that see it
+RECORD = struct.Struct("<Q3d3BdQ")  # id, position, colour, error in pixels, number of images that see it
 TRACK = 8  # bytes for each of these images
 
 

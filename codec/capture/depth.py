@@ -1,8 +1,8 @@
 """One depth image -> [H, W] f32: integer or float images, and .npy arrays, times a unit.
 
-A value is a distance in the file's own unit, which the layout knows; 0, infinity and NaN say that there is none. The
-image may be smaller than the picture, as that of a sensor beside the camera is: its values are picked, never mixed,
-since the mean across an edge lies on neither side.
+A value is a distance in the file's own unit, which the layout knows; 0, infinity and NaN mean unknown. The image may be
+smaller than the picture, as from a sensor beside the camera. It is resampled by nearest neighbour, since the mean
+across an edge lies on neither side.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class DepthImages:
 
     Attributes:
         files: one for each frame.
-        unit: world units of one step of their values.
+        unit: world units per step of the values.
         along_ray: values are distances from the camera's centre; otherwise along its optical axis.
     """
 
@@ -63,7 +63,7 @@ def along_axis(distances: np.ndarray, K: np.ndarray) -> np.ndarray:
 
 
 def _values(path: Path) -> np.ndarray:
-    """[H, W] numbers as the file has them."""
+    """[H, W] numbers as stored in the file."""
     if not path.is_file():
         raise CaptureError(f"{path}: depth image is missing")
     if path.suffix.lower() == ".npy":
@@ -80,7 +80,7 @@ def _values(path: Path) -> np.ndarray:
 
 
 def _pixels(path: Path) -> np.ndarray:
-    """[H, W] the first channel of an image, integers as they are."""
+    """[H, W] the first channel of an image; integers stay integers."""
     oiio = require("OpenImageIO", "reading depth images")
     image = oiio.ImageInput.open(str(path))
     if image is None:

@@ -1,4 +1,4 @@
-"""Path -> Capture: which layout a folder has is seen from the files that only this layout has."""
+"""Path -> Capture: a layout is recognised by files that only this layout has."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def find_capture(path: Path) -> str | None:
 
 
 def open_capture(path: str | Path) -> Capture:
-    """Opens a capture in any layout that is known.
+    """Opens a capture in any known layout.
 
     Args:
         path: its folder, or the calibration file itself (transforms.json, *.qca.txt).

@@ -1,9 +1,9 @@
 """Dynamic 3D Gaussians (Luiten et al. 2024; CMU Panoptic Sports) -> Capture: train_meta.json, test_meta.json, ims/.
 
 Both files have lists by frame and camera: `k` ([3, 3] pixels), `w2c` ([4, 4] world-to-camera, OpenCV axes), `fn` (the
-image in ims/) and `cam_id`; `w` and `h` hold for all. init_pt_cld.npz has sparse points. Its authors draw nothing
-nearer than 1, since the cameras hang in a wall. seg/ marks people; they train the whole pictures, and so do we: masks
-are in masks/CAMERA/, as elsewhere.
+image in ims/) and `cam_id`; `w` and `h` hold for all. init_pt_cld.npz has sparse points. Its authors draw no Gaussian
+nearer than 1, since the cameras hang in a wall. seg/ marks people; the authors train the whole pictures, and so do we.
+Masks are in masks/CAMERA/, as in the other layouts.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """EasyVolcap and EasyMocap -> Capture: intri.yml and extri.yml (OpenCV's), images/CAMERA/* or videos/CAMERA.mp4.
 
-Cameras that stand still are the names of one pair of files in the folder. Cameras that move have a pair each in
-cameras/CAMERA/, whose names are the frames. Masks are masks/CAMERA/*. Depth images are depths/CAMERA/*, in world units
-along the ray of a pixel, as EasyVolcap's own loader takes them by default (`use_z_depth: False`).
+Cameras that stand still share one pair of files in the folder; its `names` are the cameras. Cameras that move have a
+pair each in cameras/CAMERA/; its `names` are the frames. Masks are masks/CAMERA/*. Depth images are depths/CAMERA/*, in
+world units along the ray of a pixel, as EasyVolcap's own loader takes them by default (`use_z_depth: False`).
 
 World-to-camera, OpenCV axes: K_name [3, 3] in pixels with pixel centres at integers, D_name or dist_name as in OpenCV,
-Rot_name [3, 3] or R_name (a rotation vector), T_name; W_name and H_name where the calibration was of another size.
+Rot_name [3, 3] or R_name (a rotation vector), T_name; W_name and H_name if the calibrated size is another one.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""How well the calibration of a capture holds: how far matched features lie from each other's epipolar lines (Hartley
-and Zisserman 2004, 11.4.3). Needs no model of the scene."""
+"""Calibration error of a capture: distance of matched features from their epipolar lines (Hartley and Zisserman 2004,
+11.4.3). Needs no model of the scene."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .capture import Capture
 from .images import View
 from .matching import matched_features
 
-LEAST = 40  # matches, fewer say nothing
+LEAST = 40  # matches; fewer do not tell the error
 
 
 def epipolar_error(
@@ -20,8 +20,8 @@ def epipolar_error(
     """Median distance of matched features from their epipolar lines, pixels; None: too few features match.
 
     Args:
-        cameras: indices of those that are compared.
-        look: as of `matched_features`.
+        cameras: indices of the compared cameras.
+        look: see `matched_features`.
 
     Raises:
         CaptureError: an image cannot be read.

@@ -21,11 +21,11 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr", ".tif", ".tiff")  # tried 
 
 @dataclass(frozen=True)
 class View:
-    """What a camera shows in one frame.
+    """The picture of a camera in one frame.
 
     Attributes:
         rgb: [H, W, 3] u8 sRGB, not premultiplied.
-        alpha: [H, W] u8, or None where the image covers everything.
+        alpha: [H, W] u8; None: all pixels are opaque.
         depth: [H, W] f32, world units along the optical axis, 0 where it is unknown; None: there is no depth image.
     """
 
@@ -93,13 +93,13 @@ def read_image(path: Path) -> View:
 
 
 def first_line(message: str) -> str:
-    """What OpenImageIO says of a file without pixels, without the libraries below it that say it again."""
+    """First line of OpenImageIO's error message; further lines repeat the error for the libraries below it."""
     return message.splitlines()[0] if message else "no pixels"
 
 
 def read_mask(path: Path, *, labels: bool = False) -> np.ndarray:
-    """[H, W] u8 coverage: the alpha channel of the file if it has one, else its first colour channel. Of `labels`, 255
-    where any channel is not 0."""
+    """[H, W] u8 coverage: the alpha channel of the file if it has one, else its first colour channel. With `labels`,
+    255 where any channel is not 0."""
     view = read_image(path)
     if labels:
         return np.where((view.rgb > 0).any(-1), 255, 0).astype(np.uint8)
@@ -124,8 +124,8 @@ def _divide(rgb: np.ndarray, alpha: np.ndarray, top: float) -> np.ndarray:
 
 
 def resample(view: View, op: Callable[[np.ndarray], np.ndarray], nearest: Callable[[np.ndarray], np.ndarray]) -> View:
-    """Applies a linear filter `op` (on [H, W, C] f32) to premultiplied colour and alpha, and divides again. `nearest`
-    picks depth, whose mean across an edge lies on neither side."""
+    """Applies a linear filter `op` (on [H, W, C] f32) to premultiplied colour and alpha, then divides by alpha. Depth
+    is resampled by `nearest`: the mean depth across an edge lies on neither side."""
     depth = None if view.depth is None else nearest(view.depth)
     if view.alpha is None:
         return View((np.clip(op(view.rgb.astype(np.float32)), 0, 255) + 0.5).astype(np.uint8), depth=depth)

@@ -1,9 +1,9 @@
-"""Where the subject of a picture is likely, for masks.py: what differs from the picture of an empty scene, or moves.
+"""Likely pixels of the subject, for masks.py: pixels that differ from a picture of the empty scene (a plate), or move.
 
-Without a picture of the empty scene (a plate), a pixel counts as moving that differs from the mean of an earlier and a
-later frame: a lamp that is faded in does not, unlike in a background model (Zivkovic 2004 was tried), and a figure that
-turns in place stays a figure. What is never near movement in enough other frames makes a plate of its own, with which
-such pixels are compared; where there is none, colours decide.
+Without a plate, a pixel moves if it differs from the mean of an earlier and a later frame. So a lamp that is faded in
+does not count as motion, unlike in a background model (Zivkovic 2004 was tried), and a figure that turns in place stays
+a figure. Where a pixel is away from motion in enough frames, their mean is its plate, and the pixel is compared with
+it; elsewhere colours decide.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from .images import SUFFIXES, View, read_image
 from .rig import numbered
 
 SIDE = 512  # pixels, longest side of the pictures in which masks are found
-CHANGE = 10.0  # of 255, least difference of a pixel that has changed
-SURE = 2.0  # times that: a pixel that has changed whatever its colour is like
-NOISE = 5.0  # standard deviations of the noise that are no change either
-LOUDEST = 40.0  # of 255, a change whatever the noise is
+CHANGE = 10.0  # of 255, least difference of a changed pixel
+SURE = 2.0  # times CHANGE; a pixel that differs by more is surely the subject, whatever its colour
+NOISE = 5.0  # standard deviations of the noise; a smaller difference is no change either
+LOUDEST = 40.0  # of 255; a larger difference is a change, whatever the noise
 LAG = 0.04  # seconds from a frame to the earlier and the later one
-WINDOW = 0.13  # seconds before and after a frame in which movement counts
-UNCOVERED = 0.15  # of the frames, in which a pixel must be away from movement to be known as background
-UNCOVERED_LEAST = 3  # frames
-CLOSE, GROW, SMALL = 0.03, 0.012, 0.002  # of the diagonal: gaps closed, margin; of the area: parts that are left out
-SHADOW = (0.45, 0.97)  # brightness of a shadow, times that of the plate
-SHADOW_TINT = 0.06  # difference of its channels, of that
+WINDOW = 0.13  # seconds before and after a frame in which motion counts
+UNCOVERED = 0.15  # least share of the frames in which a pixel is away from motion, to be known as background
+UNCOVERED_LEAST = 3  # least number of these frames
+CLOSE, GROW, SMALL = 0.03, 0.012, 0.002  # of the diagonal: gaps closed, margin; of the area: parts left out
+SHADOW = (0.45, 0.97)  # least and largest brightness of a shadow, as a share of the plate's
+SHADOW_TINT = 0.06  # largest difference between the channels of a shadow, as a share of its brightness
 BIN = 12  # levels of Lab in a bin of the colour histograms
-MOVES_ALL = 0.6  # share of a picture; if more of it moves, the camera does
+MOVES_ALL = 0.6  # share of a picture; if more pixels move, the camera moves
 
 
 class Footage(Protocol):
@@ -45,11 +45,11 @@ class Footage(Protocol):
     path: Path
 
     def picture(self, t: int) -> View:
-        """Frame `t`, without a mask that is no part of it."""
+        """Frame `t`, without the mask of a mask file."""
 
 
 class Likely(NamedTuple):
-    """[h, w] bool at `SIDE`: likely the subject, possibly the subject, and surely."""
+    """[h, w] bool each, at `SIDE`: pixels that are likely, possibly and surely the subject."""
 
     likely: np.ndarray
     possible: np.ndarray
@@ -70,7 +70,7 @@ def find_plate(folder: Path, camera: str) -> Path:
 
 
 def plate_finder(capture: Capture, index: int, plates: Path) -> Callable[[int], Likely]:
-    """t -> what differs from the plate of camera `index`, without its shadow.
+    """t -> pixels that differ from the plate of camera `index`, without the subject's shadow.
 
     Raises:
         CaptureError: the plate is missing or does not fit.
@@ -84,7 +84,7 @@ def plate_finder(capture: Capture, index: int, plates: Path) -> Callable[[int], 
 
 
 def unlike_finder(feed: Footage, plate: np.ndarray) -> Callable[[int], Likely]:
-    """t -> what differs from `plate`, [H, W, 3] u8 of the same camera, without its shadow."""
+    """t -> pixels that differ from `plate`, [H, W, 3] u8 of the same camera, without the subject's shadow."""
     empty = _small(plate)
 
     def find(t: int) -> Likely:
@@ -99,13 +99,13 @@ def unlike_finder(feed: Footage, plate: np.ndarray) -> Callable[[int], Likely]:
 
 
 def _shadow(ratio: np.ndarray) -> np.ndarray:
-    """[h, w] bool: all channels are darker, alike. `ratio`: [h, w, 3] brightness, times that of the plate."""
+    """[h, w] bool: all channels are darker by a similar factor. `ratio`: [h, w, 3] brightness over the plate's."""
     dark = ratio.mean(-1)
     return (dark > SHADOW[0]) & (dark < SHADOW[1]) & (np.ptp(ratio, -1) < SHADOW_TINT * dark)
 
 
 def moving_finder(feed: Footage, frames: int, fps: float) -> Callable[[int], Likely]:
-    """t -> what moves around frame t, as far as it does not look like what is there without it.
+    """t -> pixels that move around frame t and do not look like the background.
 
     Raises:
         CaptureError: the camera moves.
@@ -129,7 +129,7 @@ def moving_finder(feed: Footage, frames: int, fps: float) -> Callable[[int], Lik
 
 
 def _moving(feed: Footage, frames: int, fps: float) -> list[np.ndarray]:
-    """[h, w] u8 of each frame: pixels that move."""
+    """[h, w] u8 of each frame: moving pixels."""
     lag = min(max(1, round(LAG * fps)), (frames - 1) // 2)
     kept: dict[int, np.ndarray] = {}
 
@@ -152,7 +152,7 @@ def _moving(feed: Footage, frames: int, fps: float) -> list[np.ndarray]:
 
 
 def _uncovered(feed: Footage, possible: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """[h, w, 3] f32 mean of the frames in which a pixel is away from movement, [h, w] bool where they are enough."""
+    """[h, w, 3] f32 mean over the frames in which a pixel is away from motion; [h, w] bool: these are enough."""
     count = np.sum([~p for p in possible], 0)
     total = np.zeros((*count.shape, 3), np.float32)
     for t, p in enumerate(possible):
@@ -171,7 +171,7 @@ def _small(rgb: np.ndarray) -> np.ndarray:
 
 
 def _changed(change: np.ndarray) -> np.ndarray:
-    """[h, w] bool, by more than noise: the median of a picture that mostly stands still is noise."""
+    """[h, w] bool: change by more than noise, estimated by the median, since most of a picture stands still."""
     return change > np.clip(NOISE * 1.4826 * float(np.median(change)), CHANGE, LOUDEST)
 
 
@@ -192,7 +192,7 @@ def without_specks(mask: np.ndarray, share: float) -> np.ndarray:
 
 
 def _regions(changed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What has changed ([h, w] u8), and the same with its gaps closed and its holes filled."""
+    """Likely and possible subject, [h, w] bool, of changed pixels, u8: small gaps closed; large gaps and holes, too."""
     cv2 = require("cv2", "making masks")
     diagonal = float(np.hypot(*changed.shape))
     changed = without_specks(changed, 0.05 * SMALL)
@@ -207,7 +207,7 @@ def _regions(changed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _unlike_background(rgb: np.ndarray, possible: np.ndarray) -> np.ndarray:
-    """[h, w] bool: the colour is commoner where the subject may be than elsewhere, around a pixel."""
+    """[h, w] bool: colours around a pixel are more frequent in the possible subject than elsewhere."""
     import cv2
     from scipy.ndimage import gaussian_filter
 

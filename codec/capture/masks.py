@@ -1,8 +1,8 @@
-"""Masks for a capture that has none: from an empty plate of each camera, or from what moves. Writes files, which the
+"""Masks for a capture without masks: from an empty plate of each camera, or from motion. Writes mask files, which the
 reader of the layout finds and people may edit.
 
-mask_finders.py finds where the subject may be. These pixels and their colours are handed to GrabCut (Rother et al.
-2004), which draws the border at `SIDE` pixels; a guided filter (He et al. 2013) brings it to the size of the picture.
+mask_finders.py finds pixels that may be the subject. GrabCut (Rother et al. 2004) segments the subject from these
+pixels and their colours, at `SIDE` pixels; a guided filter (He et al. 2013) scales the mask to the size of the picture.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from ..errors import CaptureError, UsageError, require
 from .capture import Capture
 from .mask_finders import GROW, SMALL, Likely, disc, moving_finder, plate_finder, without_specks
 
-ROUNDS = 3  # of GrabCut
-FRAMES_LEAST = 3  # in which something can be seen to move
+ROUNDS = 3  # iterations of GrabCut
+FRAMES_LEAST = 3  # frames; fewer do not show motion
 
 
 def make_masks(
@@ -30,12 +30,12 @@ def make_masks(
     overwrite: bool = False,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> int:
-    """Writes a mask for every camera and frame to where the capture's reader looks for them, all or none.
+    """Writes a mask for every camera and frame, in the place where the capture's reader looks for it; all or none.
 
     Args:
-        plates: folder with CAMERA.png (or another image) of each camera; None: what moves is the subject.
-        overwrite: masks that are there may be replaced.
-        on_progress: called with cameras done and in all.
+        plates: folder with CAMERA.png (or another image) of each camera; None: moving pixels are the subject.
+        overwrite: existing masks may be replaced.
+        on_progress: called with (cameras done, all cameras).
 
     Returns:
         The number of files.
@@ -116,7 +116,7 @@ def mask_of(rgb: np.ndarray, found: Likely) -> np.ndarray:
 
 
 def _write_part(path: Path, alpha: np.ndarray) -> tuple[Path, Path]:
-    """Writes NAME.part; returns it and the name that it will have."""
+    """Writes NAME.part; returns its path and its final path."""
     cv2 = require("cv2", "making masks")
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")

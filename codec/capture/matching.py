@@ -1,4 +1,4 @@
-"""Features that are matched between neighbouring cameras of one frame: what calibration and colours are checked with.
+"""Feature matches between neighbouring cameras of one frame, with which calibration and colours are checked.
 
 SIFT (Lowe 2004) with the ratio test. A match far from its epipolar line is wrong whatever the calibration is, and is
 left out (Hartley and Zisserman 2004, 11.4.3).
@@ -16,21 +16,21 @@ from ..model.camera import Camera, meeting_point
 from .capture import Capture, blend
 from .images import View
 
-NEIGHBOURS = 2  # cameras that each one is compared with
-RATIO = 0.7  # of the best descriptor distance to the second best: a match is distinct (Lowe 2004)
-INLIER = 0.01  # of the image's width: farther from its epipolar line, a match is wrong whatever the calibration is
-INLIER_PIXELS = 3.0  # at least, four times the error from which poses are learned: else small pictures hide it
-FEATURES = 1500  # of one image at most
+NEIGHBOURS = 2  # cameras with which each camera is compared
+RATIO = 0.7  # largest ratio of the best to the second best descriptor distance: a match is distinct (Lowe 2004)
+INLIER = 0.01  # of the image's width; a match farther from its epipolar line is wrong, whatever the calibration
+INLIER_PIXELS = 3.0  # its lower bound, 4 times the error from which poses are learned: else small pictures hide it
+FEATURES = 1500  # per image, at most
 
 
 @dataclass(frozen=True)
 class Matches:
-    """What two cameras see both.
+    """Matched features of two cameras.
 
     Attributes:
-        first, second: the cameras, positions in the list that was asked for.
+        first, second: the cameras, as positions in the argument `cameras` of `matched_features`.
         p, q: [M, 2] f64, pixels of the first and of the second camera.
-        distances: [M] f64, from the epipolar line, pixels.
+        distances: [M] f64, distance from the epipolar line, pixels.
     """
 
     first: int
@@ -49,12 +49,12 @@ def matched_features(
     neighbours: int = NEIGHBOURS,
     features: int = FEATURES,
 ) -> list[Matches]:
-    """Matches of each camera with the `neighbours` that see the scene from most nearly the same side.
+    """Matches of each camera with the `neighbours` cameras whose viewing directions are the most similar.
 
     Args:
-        cameras: indices of those that are compared.
-        look: camera -> its picture at `frame`, where it is decoded already; None: as the capture gives it.
-        features: of one image at most.
+        cameras: indices of the compared cameras.
+        look: camera -> its picture at `frame`, if it is decoded already; None: the capture decodes it.
+        features: per image, at most.
 
     Raises:
         CaptureError: an image cannot be read.
@@ -79,7 +79,7 @@ def _pairs(cameras: list[Camera], neighbours: int) -> list[tuple[int, int]]:
 
 
 def _matches(cameras: list[Camera], found: list, a: int, b: int) -> Matches:
-    """Matches of two cameras, without those that are wrong anyway."""
+    """Matches of two cameras, without wrong ones."""
     import cv2
 
     (points_a, of_a), (points_b, of_b) = found[a], found[b]
@@ -95,7 +95,7 @@ def _matches(cameras: list[Camera], found: list, a: int, b: int) -> Matches:
 
 
 def _distances(a: Camera, b: Camera, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """[M] distances from each other's epipolar lines, pixels (Sampson's)."""
+    """[M] Sampson distances of matches from their epipolar lines, pixels."""
     R = b.viewmat[:3, :3] @ a.viewmat[:3, :3].T
     x, y, z = b.viewmat[:3, 3] - R @ a.viewmat[:3, 3]
     F = np.linalg.inv(b.K).T @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R @ np.linalg.inv(a.K)

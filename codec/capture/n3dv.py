@@ -1,9 +1,9 @@
-"""Neural 3D Video (Li et al. 2022) -> Capture: one camNN.mp4 a camera and poses_bounds.npy.
+"""Neural 3D Video (Li et al. 2022) -> Capture: one camNN.mp4 per camera and poses_bounds.npy.
 
 A row of poses_bounds.npy (LLFF, Mildenhall et al. 2019) has a [3, 5] matrix and two depths, which are not used. The
 matrix is camera-to-world with the axes down, right and back; its last column has height, width and focal length in
 pixels. Rows are in the order of the videos' names. The first camera is the test camera, as in papers on the dataset.
-Sparse points are those that 4DGS (Wu et al. 2024) leaves beside it: points3D_downsample2.ply, or the same without 2.
+Sparse points: points3D_downsample2.ply or points3D_downsample.ply, which 4DGS (Wu et al. 2024) writes beside it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def open_n3dv(poses: Path) -> Capture:
     """Reads poses_bounds.npy and the videos beside it.
 
     Raises:
-        CaptureError: the file is not an LLFF calibration, or has not one row a video, or no camera can be used.
+        CaptureError: the file is not an LLFF calibration with one row per video, or no camera can be used.
     """
     try:
         rows = np.load(poses, allow_pickle=False)

@@ -1,9 +1,10 @@
-"""A capture in two: what stands still, as one frame, and what does not, as a subject with masks.
+"""Splits a capture into a static background (the room, one frame) and a moving subject (all frames, with masks).
 
-Capture -> Parts, for a file of several tracks. Cameras must stand still. The still part is the median over time of each
-camera's pictures. By masks it is that of the pixels beside them, and what a mask always covers is filled in from around
-it: other cameras see it. By motion the subject is what differs from the median (mask_finders.py): whatever stands still
-for most of the time is in the still part, and both together are the pictures.
+Capture -> Parts, for a file of several tracks. Cameras must stand still. The room is the median over time of each
+camera's pictures. By masks: the median of the unmasked pixels; pixels that a mask covers in all frames are inpainted
+from around them, since other cameras see that place. By motion: the subject is the pixels that differ from the median
+(mask_finders.py). Objects that stand still most of the time are then in the room, and room and subject together give
+the pictures.
 """
 
 from __future__ import annotations
@@ -22,17 +23,18 @@ from .mask_finders import GROW, disc, unlike_finder
 from .masks import FRAMES_LEAST, mask_of
 
 WAYS = ("masks", "motion")
-SAMPLES = 31  # frames of which the median is taken
+SAMPLES = 31  # frames in the median
 NO_ROOM = "its images show the subject alone, so that nothing is known of the room; encode it without --tracks"
-FILL = 3.0  # pixels, radius of what fills a hole in
+FILL = 3.0  # pixels, radius of inpainting
 
 
 @dataclass(frozen=True)
 class Parts:
-    """A capture in two.
+    """The two parts of a capture.
 
     Attributes:
-        room: one frame without masks. subject: all frames, with masks.
+        room: the static background, one frame, without masks.
+        subject: all frames, with masks.
     """
 
     room: Capture
@@ -40,14 +42,15 @@ class Parts:
 
 
 def split_capture(capture: Capture, by: str) -> Parts:
-    """What stands still and what does not.
+    """Splits a capture into its static background and its subject.
 
     Args:
-        by: "masks", of people or other subjects, which come with the capture; "motion": what moves is the subject.
+        by: "masks": those of the capture, of people or other subjects; "motion": moving pixels are the subject.
 
     Raises:
-        UsageError: there is no such way.
-        CaptureError: a camera moves, there are no masks, or nothing is behind them; by motion, too few frames.
+        UsageError: `by` is neither.
+        CaptureError: a camera moves, there are no masks, or the images show the subject alone; by motion, too few
+            frames.
     """
     if by not in WAYS:
         raise UsageError(f"--tracks {by}: expected masks or motion")
@@ -63,7 +66,7 @@ def split_capture(capture: Capture, by: str) -> Parts:
 
 
 def _masked(capture: Capture) -> Capture:
-    """The capture, whose masks are files beside whole pictures."""
+    """The capture; raises CaptureError unless its masks are files beside whole pictures."""
     if not capture.has_alpha:
         raise CaptureError(
             f"{capture.name}: there are no masks; expected a mask for each picture (gscodec masks makes them), "
@@ -75,7 +78,7 @@ def _masked(capture: Capture) -> Capture:
 
 
 def _unmasked(capture: Capture) -> Capture:
-    """The whole pictures of a capture that is long enough to see what moves."""
+    """The capture with whole pictures, without masks; raises CaptureError if it is too short to detect motion."""
     if capture.frame_count < FRAMES_LEAST:
         raise CaptureError(
             f"{capture.name}: {capture.frame_count} frames, expected {FRAMES_LEAST} or more to see what moves"
@@ -88,7 +91,7 @@ def _unmasked(capture: Capture) -> Capture:
 
 
 def _unlike(capture: Capture, still: Callable[[int], np.ndarray]) -> Capture:
-    """The capture with masks of what differs from the still pictures."""
+    """The capture with masks of the pixels that differ from the still pictures."""
     finder = cache(lambda i: unlike_finder(_Footage(capture, i), still(i)))
     packed = cache(lambda i, t: _packed(mask_of(capture.view(i, t).rgb, finder(i)(t))))
 
@@ -126,10 +129,10 @@ def _unpacked(data: bytes) -> np.ndarray:
 
 
 def still_picture(capture: Capture, index: int) -> np.ndarray:
-    """[H, W, 3] u8: the median over time of what a camera shows beside its masks, holes filled in.
+    """[H, W, 3] u8: the median over time of a camera's unmasked pixels, holes inpainted.
 
     Raises:
-        CaptureError: a picture cannot be read, or the masks of all frames cover it all.
+        CaptureError: a picture cannot be read, or every pixel is masked in all frames.
     """
     cv2 = require("cv2", "filling in what masks cover")
     times = np.unique(np.linspace(0, capture.frame_count - 1, SAMPLES).round().astype(int)).tolist()
@@ -137,7 +140,7 @@ def still_picture(capture: Capture, index: int) -> np.ndarray:
     for t in times:
         view = capture.view(index, t)
         free = np.ones(view.rgb.shape[:2], bool) if view.alpha is None else ~_near(view.alpha > 0)
-        seen.append(np.where(free[..., None], view.rgb, 255))  # what is covered lies behind all else
+        seen.append(np.where(free[..., None], view.rgb, 255))  # masked pixels sort last
         count = count + free.astype(np.int32)
     ordered = np.sort(seen, axis=0)
     middle = (np.maximum(count - 1, 0) // 2)[None, ..., None]
@@ -151,7 +154,7 @@ def still_picture(capture: Capture, index: int) -> np.ndarray:
 
 
 def _near(mask: np.ndarray) -> np.ndarray:
-    """[H, W] bool with a margin around it: masks are never exact."""
+    """[H, W] bool: the mask and a margin around it, since masks are never exact."""
     import cv2
 
     return cv2.dilate(mask.astype(np.uint8), disc(GROW * float(np.hypot(*mask.shape)))) > 0

@@ -1,4 +1,4 @@
-"""Sparse points that a capture brings along, from which training starts: what all layouts share, .ply and .npz.
+"""Sparse points of a capture, from which training starts: the part that all layouts share, .ply and .npz.
 
 The points of COLMAP models are read in colmap_points.py. Positions are in the world of the cameras.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import CaptureError
 from ..ply_table import read_table
 
-GREY = 128  # colour of points of which none is known
+GREY = 128  # colour of points without a known colour
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,8 @@ def checked(source: Path, means: np.ndarray, colors: np.ndarray) -> Points:
 
     Args:
         source: the file, for messages.
-        means: [N, 3] any real type; colors: [N, 3] in 0..255.
+        means: [N, 3], any real type.
+        colors: [N, 3], 0..255.
 
     Raises:
         CaptureError: no point is left.

@@ -5,7 +5,7 @@ positions in mm, distortion k1 k2 p1 p2 k3 as in OpenCV. The rows of the rotatio
 the world, x right, y up, z back (OpenGL): x_cv = diag(1, -1, -1) R (X - T).
 
 The format is not documented; the matrix could also be its transpose, or have OpenCV axes. In a recording with four
-cameras, a point triangulated with this reading is reprojected within 9 px, with the other three within 134 to 470 px.
+cameras, a point triangulated in this reading is reprojected within 9 px, in the other three within 134 to 470 px.
 Four bolts in the floor are within 10 px and 10 mm of z = 0. The rest (10 of 1920 px) is the error of the calibration.
 """
 

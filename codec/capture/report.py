@@ -1,5 +1,5 @@
-"""What is in a capture, for people and scripts: what its reader has recognised, whether its calibration holds, by how
-much the colours of its cameras differ, and what is missing."""
+"""Report on a capture, for people and scripts: its content as the reader has recognised it, the error of its
+calibration, the colour differences between its cameras, and missing parts."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from .detect import find_capture, open_capture
 from .epipolar import LEAST
 from .matching import Matches, matched_features
 
-GOOD = 0.75  # pixels, median distance from the epipolar lines up to which a calibration is taken as it is
-SURE = 2.0  # pixels, a match that is nearer to its epipolar line shows the same point
+GOOD = 0.75  # pixels, median distance from the epipolar lines; up to it, a calibration is used unchanged
+SURE = 2.0  # pixels; a match closer than this to its epipolar line shows the same point
 PATCH = 5  # pixels, side of the square whose mean colour is compared
-DARKEST, BRIGHTEST = 10, 245  # of 255: outside, a value is noise or clipped
-FEW = 8  # cameras for training: fewer leave much between them open
+DARKEST, BRIGHTEST = 10, 245  # of 255; a value outside is noise or clipped
+FEW = 8  # training cameras; with fewer, the space between their views is hardly constrained
 
 
 def describe_capture(path: Path, frame: int = 0) -> tuple[Capture, dict]:
-    """Opens a capture and says what is in it.
+    """Opens a capture and describes it.
 
     Args:
-        frame: whose pictures are compared.
+        frame: the frame whose pictures are compared.
 
     Returns:
-        The capture, and its facts (JSON-able): name, layout, fps, frames, moves, masks (None, "alpha" or "files"),
-        points (None: there are none), depth (cameras that have depth images), epipolar_error (pixels, None: too few
-        matches), matches, colour_ratio (largest to smallest gain of a camera), left_out and missing (sentences),
-        cameras (a dictionary each).
+        The capture, and its facts (JSON-able): name, path, layout, fps, frames, moves, masks (None, "background",
+        "files" or "alpha"), points (number; None: there are none), depth (number of cameras with depth images),
+        epipolar_error (pixels, None: too few matches), matches (number), colour_ratio (largest to smallest gain of a
+        camera), left_out and missing (sentences), cameras (a dictionary each).
 
     Raises:
-        CaptureError, UsageError: as of `open_capture`.
+        CaptureError, UsageError: see `open_capture`.
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -94,11 +94,12 @@ def _camera(capture: Capture, frame: int, i: int, matches: list[Matches]) -> dic
 
 
 def colour_gains(count: int, matches: list[Matches], colours: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """[C, 3] log gain of each camera and channel, mean 0: by how much brighter it shows what others see, too. NaN where
-    too few matches tell.
+    """[C, 3] log gain of each camera and channel, mean 0: its brightness relative to the other cameras at matched
+    points. NaN: too few matches.
 
     Args:
-        count: cameras. colours: [M, 3] what the first and the second camera of each of `matches` show, 0..255.
+        count: number of cameras.
+        colours: for each of `matches`, [M, 3] colours in the first and in the second camera, 0..255.
     """
     rows, values = [], []
     for m, (a, b) in zip(matches, colours, strict=True):
@@ -119,8 +120,8 @@ def colour_gains(count: int, matches: list[Matches], colours: list[tuple[np.ndar
 
 
 def _looks(capture: Capture, frame: int, matches: list[Matches]) -> tuple[np.ndarray, list, list]:
-    """`colour_gains`; of each camera the share of its picture that its mask leaves; and its nearest and farthest depth
-    (1st and 99th percentile) and the share where it is known. None where it has no mask or depth."""
+    """`colour_gains`; for each camera the share of its picture inside its mask; and its nearest and farthest depth (1st
+    and 99th percentile) and the share of pixels with a known depth. None: no mask, or no depth."""
     cv2 = require("cv2", "comparing colours")
     colours = [[np.zeros((0, 3))] * 2 for _ in matches]
     shares: list[float | None] = []
@@ -130,7 +131,7 @@ def _looks(capture: Capture, frame: int, matches: list[Matches]) -> tuple[np.nda
         shares.append(None if view.alpha is None else round(float((view.alpha > 0).mean()), 4))
         depths.append(None if view.depth is None else _depth(view.depth))
         smooth = cv2.blur(view.rgb.astype(np.float32), (PATCH, PATCH))
-        if view.alpha is not None:  # colours beyond the edge of the subject mean nothing
+        if view.alpha is not None:  # colours beyond the edge of the subject are undefined
             smooth[cv2.erode(view.alpha, np.ones((PATCH, PATCH), np.uint8)) < 255] = 0
         for m, pair in zip(matches, colours, strict=True):
             for side, (camera, pixels) in enumerate(((m.first, m.p), (m.second, m.q))):
@@ -140,7 +141,7 @@ def _looks(capture: Capture, frame: int, matches: list[Matches]) -> tuple[np.nda
 
 
 def _depth(depth: np.ndarray) -> dict:
-    """What is known of the depth of a picture."""
+    """Nearest and farthest depth (1st and 99th percentile, world units) and share of the pixels with a known depth."""
     known = depth[depth > 0]
     near, far = (round(float(d), 4) for d in np.percentile(known, (1, 99))) if known.size else (None, None)
     return {"near": near, "far": far, "known": round(known.size / depth.size, 4)}
@@ -153,7 +154,7 @@ def _at(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 def _missing(capture: Capture, path: Path, facts: dict) -> list[str]:
-    """What the capture lacks or what is wrong with it, and what follows, one sentence each."""
+    """Missing or wrong parts of the capture and their consequences, one sentence each."""
     root, trained, out = path if path.is_dir() else path.parent, len(capture.indices("train")), []
     unmasked = [c.name for c, f in zip(capture.cameras, capture.footage, strict=True) if not f.has_alpha]
     if facts["masks"] is None:

@@ -1,7 +1,7 @@
-"""Calibrated cameras and what each has recorded -> Capture: the part that all layouts share.
+"""Calibrated cameras and their footage -> Capture: the part that all layouts share.
 
-A `Feed` is the footage of one camera: a video or one image file a frame, with or without mask files. A `Track` is the
-calibration of one camera. Where the footage is a smaller copy of the calibrated size, the camera is scaled to it.
+A `Feed` is the footage of one camera: a video or one image file per frame, with or without mask files. A `Track` is the
+calibration of one camera. If the footage is a smaller copy of the calibrated size, the camera is scaled to it.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from .points import Points
 from .undistort import Undistortion
 from .video import Video
 
-FPS = 30.0  # where nothing says it
-NEAR_SHARE = 0.2  # of the depth at which the optical axes meet: nothing that is nearer is part of the scene
-ROUNDED = 0.1  # pixels by which single precision may move what is as far away as the cameras are apart
+FPS = 30.0  # frames per second, if no file states them
+NEAR_SHARE = 0.2  # near plane over the depth at which the optical axes meet: nothing nearer is part of the scene
+ROUNDED = 0.1  # pixels, largest error of single precision for points as far away as the cameras are apart
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
-Track = Sequence[Camera]  # one camera in each frame of its feed; a single entry holds for all frames
+Track = Sequence[Camera]  # the camera in each frame of its feed; a single entry holds for all frames
 
 
 class Feed:
@@ -38,17 +38,18 @@ class Feed:
 
     Args:
         source: a video, or the image file of each frame.
-        masks: the mask file of each frame, or nothing; None for a frame that lacks its own.
-        mask_files: for each frame where its mask is read from, or would be.
-        labels: masks number what a pixel shows, 0 is the background.
+        masks: the mask file of each frame (None: the frame has no mask), or empty.
+        mask_files: path of each frame's mask, also of a mask that does not exist.
+        labels: masks are label images; label 0 is the background.
         depths: the depth images of the frames; None: the camera has none.
 
     Attributes:
-        path: of the video or the first image.
-        masks: the mask file of each frame, empty where there are none.
-        width, height: of the video or the first image; later images are checked against the camera.
-        has_alpha: views have an alpha channel, of their own, from masks or from the background; False drops their own.
-        background: [3] colour of what is no part of the subject, which is cut out; None: it is not.
+        path: path of the video or the first image.
+        masks: the mask file of each frame; empty: there are none.
+        width, height: size of the video or the first image; later images are checked against the camera.
+        has_alpha: views have an alpha channel: their own, from masks or from the background; False: their own channel
+            is dropped.
+        background: [3] colour of the background, which is cut out; None: it is not cut out.
 
     Raises:
         CaptureError: an image is missing or not readable, or only some frames have masks or depth images.
@@ -83,16 +84,16 @@ class Feed:
 
     @property
     def subject_alone(self) -> bool:
-        """Whether nothing is known of what is behind the subject, since its own alpha or its background is the mask."""
+        """Whether nothing is known behind the subject: the mask is the image's own alpha or found by the background."""
         return self.has_alpha and not self.masks
 
     @property
     def fps(self) -> float:
-        """Frames a second, as the video says."""
+        """Frames per second of the video; `FPS` for images."""
         return self._source.fps if isinstance(self._source, Video) else FPS
 
     def view(self, t: int) -> View:
-        """Frame `t` as it was recorded, with its mask and its depth, which may be distances along rays (`depths`)."""
+        """Frame `t` as it was recorded, with its mask and its depth along the optical axis or along rays (`depths`)."""
         view = self.picture(t)
         if self.depths:
             height, width = view.rgb.shape[:2]
@@ -108,19 +109,19 @@ class Feed:
         return replace(view, alpha=alpha)
 
     def picture(self, t: int) -> View:
-        """Frame `t` as it was recorded, without the mask of a file."""
+        """Frame `t` as it was recorded, without the mask of a mask file."""
         if isinstance(self._source, Video):
             return View(self._source.frame(t))
         view = read_image(self._source[t])
         return view if self.has_alpha else replace(view, alpha=None)
 
     def opaque(self) -> bool:
-        """Whether the first picture has an alpha channel, of its own, that says nothing."""
+        """Whether the first picture has an alpha channel of its own that is 255 everywhere."""
         if self.masks or not self.has_alpha:
             return False
         try:
             return bool((self.picture(0).alpha == 255).all())
-        except CaptureError:  # whoever needs the picture says so
+        except CaptureError:  # raised again where the picture is needed
             return False
 
     def name(self, t: int) -> Path:
@@ -132,7 +133,7 @@ def feed_of(source: Video | Sequence[Path], masks: Path, depths: DepthImages | N
     """The footage of a camera whose masks are files in a folder of its own, in the order of their numbers.
 
     Raises:
-        CaptureError: as of `Feed`.
+        CaptureError: see `Feed`.
     """
     if isinstance(source, Video):
         stems = [f"{t:06}" for t in range(source.frame_count)]
@@ -152,12 +153,13 @@ def assemble(
     *,
     points: Points | None = None,
 ) -> Capture:
-    """The capture of what `usable` found. It ends with the shortest feed; a camera whose feed is less than half as long
-    as the median is left out.
+    """The capture of the cameras that `usable` returned. It ends with the shortest feed; a camera whose feed is less
+    than half as long as the median is left out.
 
     Args:
-        tracks: each camera, with or without distortion. feeds: what each camera has recorded.
-        fps: frames a second; None: as the first feed says.
+        tracks: calibration of each camera, with or without distortion.
+        feeds: footage of each camera.
+        fps: frames per second; None: that of the first feed.
         points: sparse points that came with the capture.
 
     Raises:
@@ -195,8 +197,8 @@ def assemble(
 
 
 def _find_masks(feeds: Sequence[Feed]) -> None:
-    """Drops alpha channels that say nothing, which many tools write, and finds the background of pictures without
-    masks."""
+    """Drops alpha channels that are 255 everywhere, which many tools write, and finds the background of pictures
+    without masks."""
     if all(f.opaque() for f in feeds):
         for feed in feeds:
             feed.has_alpha = False
@@ -204,10 +206,10 @@ def _find_masks(feeds: Sequence[Feed]) -> None:
         return
     try:
         first = [f.picture(0).rgb for f in feeds]
-        if border_color(first) is None:  # of a room nothing else is read
+        if border_color(first) is None:  # a room: no second frame is read
             return
         color = background_of(first + [f.picture(len(f) // 2).rgb for f in feeds])
-    except CaptureError:  # whoever needs the picture says so
+    except CaptureError:  # raised again where the picture is needed
         return
     if color is None:
         return
@@ -221,8 +223,7 @@ def _find_masks(feeds: Sequence[Feed]) -> None:
 
 
 def _near_origin(name: str, tracks: Sequence[Track], points: Points | None) -> tuple[Sequence[Track], Points | None]:
-    """Tracks and points of the capture `name`, in a world whose origin is near enough; a warning says if it is another
-    one."""
+    """Tracks and points of the capture `name`, in a world whose origin is near enough; warns if the origin is moved."""
     if not (origin := _origin(tracks)).any():
         return tracks, points
     warnings.warn(
@@ -235,8 +236,8 @@ def _near_origin(name: str, tracks: Sequence[Track], points: Points | None) -> t
 
 
 def _origin(tracks: Sequence[Track]) -> np.ndarray:
-    """[3] f64, the origin in which places have digits enough: that of the world, unless it is as far as in coordinates
-    of a map. Then a round place near the cameras."""
+    """[3] f64, an origin at which single precision is enough for positions: that of the world, unless the cameras are
+    as far from it as in map coordinates. Then a rounded position near the cameras."""
     centers = np.array([c.center for track in tracks for c in track])
     middle = centers.mean(0)
     apart = np.linalg.norm(centers - middle, axis=1).max()
@@ -248,8 +249,8 @@ def _origin(tracks: Sequence[Track]) -> np.ndarray:
 
 
 def _as_drawn(tracks: Sequence[Track]) -> list[Track]:
-    """With the low-pass of pictures, and near planes where the layout says nothing: at `NEAR_SHARE` of the depth at
-    which the optical axes meet."""
+    """The tracks with the low-pass of pictures, and, where the layout has no near plane, a near plane at `NEAR_SHARE`
+    of the depth at which the optical axes meet."""
     meeting, out = meeting_point([track[0] for track in tracks]), []
     for track in tracks:
         depth = float(track[0].viewmat[2] @ [*meeting, 1])
@@ -297,7 +298,7 @@ def usable(source: Path, made: dict, make: Callable[[str, Any], tuple[Track, Fee
 
     Args:
         source: the calibration, for messages.
-        made: camera name -> what `make` needs.
+        made: camera name -> the second argument of `make`.
         make: (name, item of `made`) -> track and feed; raises CaptureError where the camera cannot be used.
 
     Returns:
@@ -320,7 +321,7 @@ def usable(source: Path, made: dict, make: Callable[[str, Any], tuple[Track, Fee
 
 
 def _fitted(track: Track, feed: Feed) -> tuple[Track, Feed]:
-    """The track at the size of its feed, which may be a smaller copy of what was calibrated."""
+    """The track at the size of its feed, which may be a smaller copy of the calibrated size."""
     if len(track) not in (1, len(feed)):
         raise CaptureError(f"{feed.path}: {len(feed)} frames, but poses of {len(track)}; expected one for each frame")
     for t, camera in enumerate(track):
@@ -359,7 +360,7 @@ def find_video(folders: Sequence[Path], name: str) -> Path:
 
 
 def _same_length(tracks: Sequence[Track], feeds: Sequence[Feed]) -> tuple[list[Track], list[Feed], int]:
-    """Without the cameras whose feed is far too short; and the number of frames that all the others have."""
+    """Tracks and feeds without the cameras whose feed is far too short; the number of frames of the shortest feed."""
     usual = sorted(map(len, feeds))[len(feeds) // 2]
     keep = [i for i, f in enumerate(feeds) if 2 * len(f) >= usual]
     for i, f in enumerate(feeds):

@@ -1,8 +1,8 @@
 """Contact sheet of a capture: the picture of each camera at one frame, and the rig from above and from the side.
 
-Masks are shown as they will be used: what they leave out is dark, and their border is drawn. Depth images are shown
-below the pictures, near ones bright, on one scale for all cameras; black is unknown. Training cameras are blue, test
-cameras orange. The sparse points of the capture are drawn into the rig.
+Masks are shown as they will be used: pixels outside are dark, and the border is drawn. Depth images are shown below the
+pictures, near is bright, on one scale for all cameras; black is unknown. Training cameras are blue, test cameras
+orange. The sparse points of the capture are drawn into the rig.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from .capture import Capture
 from .images import View
 
 WIDTH, PANEL, LINE, GAP = 1600, 620, 18, 6  # pixels
-THUMBNAIL = 400  # pixels, widest
+THUMBNAIL = 400  # pixels, largest width
 PAPER, INK, FAINT = (250, 250, 248), (40, 40, 40), (205, 205, 205)
 COLOURS = {"train": (46, 98, 180), "test": (222, 120, 20), "val": (120, 120, 120)}
 BORDER = (235, 30, 120)
-FRUSTUM = 0.22  # of the median distance of the cameras from the scene
-PATH_FRAMES = 60  # of a camera that moves
-POINTS = 20_000  # that are drawn
+FRUSTUM = 0.22  # length of a drawn frustum over the median distance of the cameras from the scene
+PATH_FRAMES = 60  # drawn positions of a moving camera, at most
+POINTS = 20_000  # drawn points, at most
 
 
 def contact_sheet(capture: Capture, frame: int = 0) -> np.ndarray:
@@ -57,7 +57,7 @@ def contact_sheet(capture: Capture, frame: int = 0) -> np.ndarray:
 
 
 def _columns(count: int, aspect: float) -> int:
-    """So many that thumbnails are `THUMBNAIL` wide at most, and that up to about 40 cameras fill a screen."""
+    """Columns of thumbnails: enough that each is `THUMBNAIL` wide at most, and up to about 40 cameras fill a screen."""
     least = -(-WIDTH // (THUMBNAIL + GAP))
     wanted = round(np.sqrt(count * aspect * WIDTH / 1000))
     return int(max(min(count, least), min(wanted, count), 1))
@@ -99,7 +99,7 @@ def _thumbnail(view: View, width: int, height: int) -> Thumbnail:
 
 @dataclass(frozen=True)
 class _Projection:
-    """A parallel projection: `axes` [2, 3] are right and up on the sheet; `title` says where one looks from."""
+    """A parallel projection. `axes`: [2, 3], right and up on the sheet; `title`: the viewpoint in words."""
 
     title: str
     axes: np.ndarray
@@ -107,12 +107,12 @@ class _Projection:
 
 @dataclass(frozen=True)
 class _Rig:
-    """What is drawn of a rig, in the world.
+    """The drawn parts of a rig, in the world.
 
     Attributes:
         middle: [3], where the optical axes meet.
-        frusta: of each camera its position and the corners of its image, [5, 3].
-        paths: of each camera its positions over the frames, [F, 3].
+        frusta: for each camera [5, 3], its position and the corners of its image.
+        paths: for each camera [F, 3], its positions over the frames.
     """
 
     cameras: list[Camera]
@@ -134,7 +134,7 @@ class _Rig:
         rays = np.stack([c.center for c in self.cameras]) - self.middle
         right = np.linalg.svd(rays - np.outer(rays @ up, up), full_matrices=False)[2][0]
         right = right - (right @ up) * up
-        if np.linalg.norm(right) < 1e-6:  # a single camera that looks down, say
+        if np.linalg.norm(right) < 1e-6:  # e.g. a single camera that looks down
             right = np.cross(up, np.roll(up, 1))
         right /= np.linalg.norm(right)
         above = _Projection("from above", np.stack([right, np.cross(up, right)]))
@@ -146,7 +146,7 @@ class _Rig:
         return flat.min(0), flat.max(0)
 
     def scale(self, view: _Projection, width: int) -> float:
-        """Pixels for a world unit with which the rig fits a panel."""
+        """Pixels per world unit with which the rig fits a panel."""
         low, high = self.box(view)
         return 0.86 * float((np.array([width, PANEL]) / np.maximum(high - low, 1e-9)).min())
 

@@ -2,10 +2,10 @@
 
 The format lists images, a capture has cameras with all their frames: entries are grouped by `camera` and ordered by
 `frame` or `time`. Each entry has its own pose and may have its own intrinsics, so cameras may move (D-NeRF: one camera
-that is elsewhere in each frame). Poses are OpenGL camera-to-world (x right, y up, z back) and become OpenCV
+with another pose in each frame). Poses are OpenGL camera-to-world (x right, y up, z back) and become OpenCV
 world-to-camera. `near`, in the head or in an entry, is a near plane in the units of the poses. `ply_file_path` names
-sparse points in the world of the poses; `depth_file_path` names the depth image of an entry, along the optical axis,
-whose values times `depth_unit_scale_factor` (0.001 where the file does not say it, as in nerfstudio) are world units.
+sparse points in the world of the poses. `depth_file_path` names the depth image of an entry, along the optical axis;
+its values times `depth_unit_scale_factor` (default 0.001, as in nerfstudio) are world units.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .rig import FPS, Feed, Track, assemble, usable
 from .transforms_camera import FISHEYE, entry_camera
 
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
-MILLIMETRES = 0.001  # world units of one step of a depth image, where the file does not say it
+MILLIMETRES = 0.001  # world units of one step of a depth image, if the file does not state them
 
 
 @dataclass
@@ -33,9 +33,9 @@ class Entry:
     """One item of `frames`, completed from the head of the file.
 
     Attributes:
-        camera: its name; None until `_name_cameras` where the file has none.
-        time: frame number, or seconds where there is none: only the order matters.
-        values: the item over the head of the file.
+        camera: camera name; if the file has none, None until `_name_cameras`.
+        time: frame number, or seconds if there is none: only the order matters.
+        values: keys of the head of the file, overridden by keys of the item.
     """
 
     camera: str | None
@@ -92,7 +92,7 @@ def _load(path: Path) -> dict:
 
 
 def _points(data: dict, path: Path) -> Points | None:
-    """The points that `ply_file_path` names; None where it is not there."""
+    """The points that `ply_file_path` names; None: the file has no such key."""
     name = data.get("ply_file_path")
     if name is None:
         return None
@@ -144,7 +144,7 @@ def _entries(data: dict, path: Path, split: str) -> list[Entry]:
 def _name_cameras(entries: list[Entry]) -> list[Entry]:
     """The entries of a file, each with a camera.
 
-    Entries without `camera` in one folder are one camera if all have a frame or time of their own: it may move.
+    Entries without `camera` in one folder are one camera, which may move, if all have different frames or times.
     Otherwise entries with the same pose are one camera, which stands still.
     """
     folders: dict[Path, list[Entry]] = {}
@@ -192,13 +192,13 @@ def _mask(root: Path, image: Path, f: dict) -> Path | None:
 
 
 def _mask_file(root: Path, image: Path, f: dict) -> Path:
-    """Where the mask of an image is looked for, as .png."""
+    """The path of an image's mask, as .png."""
     parts = [p for p in Path(f["file_path"]).parts if p not in (".", "..", "/")]
     return (root / "masks").joinpath(*(parts[1:] or parts)).with_name(image.stem + ".png")
 
 
 def _depths(source: Path, entries: list[Entry]) -> DepthImages | None:
-    """The depth images of the entries of a camera; None where none has one.
+    """The depth images of the entries of a camera; None: no entry has one.
 
     Raises:
         CaptureError: a name or the unit is wrong, or an image is missing.
@@ -252,7 +252,7 @@ def _at_times(entries: list[Entry], times: list[float]) -> list[Entry]:
 
 
 def _track(name: str, entries: list[Entry]) -> Track:
-    """One camera in each of its frames.
+    """The camera in each of its frames.
 
     Raises:
         CaptureError: names the frame whose pose, intrinsics or size are missing or wrong.

@@ -22,7 +22,7 @@ def entry_camera(name: str, image: Path, v: dict, size: tuple[int, int]) -> Came
     Args:
         image: for messages.
         v: the entry, completed from the head of the file.
-        size: of the image, width and height.
+        size: width and height of the image, pixels.
 
     Raises:
         CaptureError: pose, intrinsics or size are missing or wrong.

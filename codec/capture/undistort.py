@@ -1,7 +1,7 @@
 """Distorted camera -> pinhole camera, and its views warped to that camera.
 
 The later stages know pinhole cameras only. The new K has the largest view without unknown pixels, so that training
-never sees a black border; of a fisheye lens, which may see more than a plane can show, `WIDEST` at most. Pixel centres
+never sees a black border; for a fisheye lens, which may see more than a plane can show, `WIDEST` at most. Pixel centres
 are at half-integers in our K and at integers in OpenCV's; K is shifted here.
 """
 
@@ -17,7 +17,7 @@ from ..errors import CaptureError, require
 from ..model.camera import Camera
 from .images import View, resample
 
-WIDEST = 65.0  # degrees from the optical axis that the pinhole camera of a fisheye lens shows
+WIDEST = 65.0  # degrees from the optical axis, largest angle in the pinhole camera of a fisheye lens
 HALVINGS = 30  # of the interval in which its focal length is searched
 
 
@@ -34,15 +34,15 @@ class _Lens:
 class Undistortion:
     """Undistorts one camera and its views; the identity without distortion. Thread-safe.
 
-    The camera may zoom or focus: each view is warped with the lens of its own frame. The maps of one lens are kept,
-    which are as large as a few images.
+    The camera may zoom or focus: each view is warped with the lens of its own frame. The maps of the last lens are
+    kept; they are as large as a few images.
     """
 
     def __init__(self):
         self._pinhole, self._maps = lru_cache(1)(_pinhole), lru_cache(1)(_maps)
 
     def camera(self, camera: Camera) -> Camera:
-        """The pinhole camera in the place of `camera`.
+        """The pinhole camera that replaces `camera`.
 
         Raises:
             CaptureError: its distortion is not that of a lens.
@@ -52,7 +52,7 @@ class Undistortion:
         return replace(camera, K=_shifted(self._pinhole(_lens(camera)), 0.5), distortion=np.zeros(0), fisheye=False)
 
     def view(self, view: View, camera: Camera) -> View:
-        """A view of `camera`, which has distortion, as its pinhole camera would show it."""
+        """A view of the distorted `camera`, warped to its pinhole camera."""
         if not _bends(camera):
             return view
         cv2, maps = require("cv2", "undistorting images"), self._maps(_lens(camera))
@@ -87,7 +87,7 @@ def _pinhole(lens: _Lens) -> np.ndarray:
 
 
 def _fisheye_pinhole(lens: _Lens) -> np.ndarray:
-    """As `_pinhole`: the principal point stays, the focal lengths shrink until the border meets that of the image."""
+    """`_pinhole` of a fisheye lens: same principal point; focal lengths shrink until the borders of both views meet."""
     K, (width, height) = np.array(lens.K), lens.size
     x, y = np.linspace(-0.5, width - 0.5, 65), np.linspace(-0.5, height - 0.5, 65)
     sides = [(x, np.full(65, v)) for v in y[[0, -1]]] + [(np.full(65, v), y) for v in x[[0, -1]]]
@@ -120,7 +120,7 @@ def _bent(angle: np.ndarray, distortion: tuple) -> np.ndarray:
 
 
 def _maps(lens: _Lens) -> tuple[np.ndarray, np.ndarray]:
-    """What cv2.remap takes: where in the distorted image each pixel comes from."""
+    """The maps for cv2.remap: source position of each pixel in the distorted image."""
     cv2 = require("cv2", "undistorting images")
     undistort = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
     return undistort(np.array(lens.K), np.array(lens.distortion), np.eye(3), _pinhole(lens), lens.size, cv2.CV_16SC2)

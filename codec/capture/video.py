@@ -23,8 +23,8 @@ class Video:
     """Random access to a video file; thread-safe.
 
     Attributes:
-        path: of the file.
-        frame_count, fps, width, height: as the container says.
+        path: path of the file.
+        frame_count, fps, width, height: from the header of the container.
     """
 
     def __init__(self, path: Path):

@@ -1,10 +1,11 @@
 """ZJU-MoCap (Peng et al. 2021) -> Capture: annots.npy, an image for each camera and frame, masks in mask/.
 
 annots.npy is a pickled dictionary. `cams` has lists by camera: K ([3, 3] pixels, centres at integers), D (distortion
-as in OpenCV), R and T (world-to-camera, T in millimetres); `ims` has for each frame the images of all cameras, by
-their paths. Masks are labels: what is not 0 is the subject. They are in mask/ or mask_cihp/, of the same names.
+as in OpenCV), R and T (world-to-camera, T in millimetres); `ims` has for each frame the paths of the images of all
+cameras. Masks are label images: pixels other than 0 are the subject. They are in mask/ or mask_cihp/ under the same
+names.
 
-Unpickling runs code that the file names. So only the few names are allowed that numpy arrays are made of.
+Unpickling runs code that the file names. So only the few names that numpy arrays need are allowed.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from .capture import Capture
 from .rig import Feed, Track, assemble, pinhole, rigid, usable
 
 FILE = "annots.npy"
-MASKS = ("masks", "mask", "mask_cihp")  # the first is where masks that are made are written
+MASKS = ("masks", "mask", "mask_cihp")  # `gscodec masks` writes to the first
 MILLIMETRES = 1000.0
 ALLOWED = {
     *((f"numpy.{core}.multiarray", name) for core in ("core", "_core") for name in ("_reconstruct", "scalar")),
@@ -75,7 +76,7 @@ def _load(path: Path) -> tuple[dict, list[list[str]]]:
 
 
 def _name(image: str, index: int) -> str:
-    """The folder of a camera's images, or its number where they have none."""
+    """The name of a camera: the folder of its images, or its number if they have no folder."""
     return Path(image).parent.name or f"cam{index:02}"
 
 

@@ -162,11 +162,11 @@ def ablation(
 @bench.command()
 def stress(
     case: Annotated[str | None, typer.Option(help="Comma-separated cases, see bench/stress_scenes.py.")] = None,
-    frames: Annotated[int | None, typer.Option(help="At most so many of each case.", show_default="all")] = None,
+    frames: Annotated[int | None, typer.Option(help="Frames of each case, at most.", show_default="all")] = None,
     out: Results = Path("bench/results/stress.json"),
     as_json: Json = False,
 ) -> None:
-    """Training on small captures of what breaks 4D methods; fails if one does worse than bench/stress.py states."""
+    """Training on small captures that break 4D methods; fails if one is worse than its floor in bench/stress.py."""
     require_bench()
     require("torch", "measuring training")
     from bench.stress import measure

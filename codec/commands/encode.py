@@ -74,7 +74,7 @@ def encode(
         str | None,
         typer.Option(
             metavar="masks|motion",
-            help="A still room, coded once, and subjects in it as tracks: what masks show, or what moves.",
+            help="A still room, coded once, and subjects in it as tracks, by masks or by motion.",
             show_default="one track",
         ),
     ] = None,

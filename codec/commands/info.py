@@ -30,10 +30,10 @@ def info(
     sheet: Annotated[
         Path | None, typer.Option(metavar="PNG", help="Of a capture: draw its cameras and its rig.")
     ] = None,
-    frame: Annotated[int, typer.Option(min=0, help="Of a capture: whose pictures are looked at.")] = 0,
+    frame: Annotated[int, typer.Option(min=0, help="Of a capture: the frame to examine.")] = 0,
     track: Tracks = None,
 ) -> None:
-    """What is in a file: groups, bits by attribute and unit. Of splats the format, of a capture what was recognised."""
+    """Contents of a file: groups, bits by attribute and unit; the format of splats; the layout of a capture."""
     kind = _kind(path)
     if maps and kind != "stream":
         what = {"capture": "a capture", "splats": "made of splats"}[kind]

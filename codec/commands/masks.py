@@ -17,10 +17,10 @@ def masks(
         Path | None,
         typer.Option(metavar="DIR", help="Pictures without the subject, CAMERA.png each.", show_default="plate/"),
     ] = None,
-    moving: Annotated[bool, typer.Option("--moving", help="What moves is the subject, even with plate/.")] = False,
+    moving: Annotated[bool, typer.Option("--moving", help="Moving objects are the subject, even with plate/.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace masks that are there.")] = False,
 ) -> None:
-    """Masks of a capture that has none: from an empty plate, or from what moves."""
+    """Masks for a capture without masks: from an empty plate, or of moving objects."""
     from ..capture import open_capture
     from ..capture.masks import make_masks
 
@@ -30,4 +30,4 @@ def masks(
     with Bar() as bar:
         count = make_masks(opened, plates, overwrite=overwrite, on_progress=lambda d, n: bar.update("cameras", d, n))
     where = opened.footage[0].mask_files[0]
-    stdout.print(f"{count} masks from {'plates' if plates else 'what moves'}, the first one is {where}")
+    stdout.print(f"{count} masks from {'plates' if plates else 'moving objects'}, the first one is {where}")

@@ -21,9 +21,7 @@ RandomAccess = Annotated[
 ]
 PRESET = "medium"  # the usual one
 Preset = Annotated[str, typer.Option(help="Training budget: fast, medium or slow.")]
-Motion = Annotated[
-    str, typer.Option(help="What learns the motion: field (hash grid and MLP beside the nodes) or nodes alone.")
-]
+Motion = Annotated[str, typer.Option(help="Motion model: field (hash grid and MLP beside the nodes) or nodes (alone).")]
 RigPath = Annotated[
     Path | None,
     typer.Option("--rig", metavar="RIG.npz", help="A skeleton whose poses predict the motion, one for each frame."),

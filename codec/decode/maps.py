@@ -1,9 +1,9 @@
-"""Stream -> attribute maps: a picture of the planes with their tiles, or a folder of 16-bit images, the sound and
+"""Stream -> attribute maps: one picture of the planes with their tiles, or a folder of 16-bit images, the sound and
 maps.json, from which encode/from_maps.py makes the same bytes again.
 
-A plane has one integer a Gaussian (spec 7.2). The image holds how much each is above the least one, which maps.json
-tells, and a second image the bits from 16 on where they are needed. Planes of zeros are left out. Sound is a file of
-all samples, one behind the other; maps.json has their sizes and durations by group, and the sample entry.
+A plane has one integer per Gaussian (spec 7.2). Its image holds bits 0 to 15 of integer minus minimum; a second image
+holds the higher bits if any is set; maps.json has the minimum. Planes of zeros are left out. The sound file is the
+concatenation of all samples; maps.json has their sizes and durations by group, and the sample entry.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def write_maps(stream: Stream, folder: Path) -> int:
         _, time, samples = g.get("audio", (0, 0, []))
         sound = {"time": time, "samples": samples}
         groups.append({"sync": g["sync"], "tiles": tiles, "planes": own, "sound": sound} | _facts(q))
-    config = {k: v for k, v in stream.config.items() if k not in ("track", "placement")}  # maps have none
+    config = {k: v for k, v in stream.config.items() if k not in ("track", "placement")}  # not in maps
     if audio := config.get("audio"):
         config["audio"] = audio | {"entry": audio["entry"].hex()}
         _write(folder / SOUND, b"".join(stream.sound(i) for i in range(len(stream.groups))))
@@ -88,7 +88,7 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _write_plane(path: Path, plane: np.ndarray) -> int:
-    """Bits 0 to 15 to PATH.png, those above to PATH.high.png if there are any."""
+    """Writes bits 0 to 15 to PATH.png, and the higher bits to PATH.high.png if any is set; returns how many images."""
     write_png(path.with_name(path.name + ".png"), (plane & 0xFFFF).clip(0).astype(np.uint16))
     high = plane.clip(0) >> 16
     if high.any():
@@ -97,7 +97,7 @@ def _write_plane(path: Path, plane: np.ndarray) -> int:
 
 
 def _facts(q: QuantizedGroup) -> dict:
-    """All of a group but its planes, JSON-able; f32 are exact as floats."""
+    """All fields of a group except its planes, JSON-able; f32 are exact as floats."""
     plain = ("frames", "origin", "grid_step", "grid_bits", "layers", "shifts", "corrections", "scale_exponents")
     facts = {name: _plain(getattr(q, name)) for name in (*plain, "tile_side_log2", "reference", "turned_harmonics")}
     facts["channels"] = {
@@ -115,7 +115,7 @@ def _facts(q: QuantizedGroup) -> dict:
 
 
 def _plain(value):
-    """Arrays, tuples and dicts of them as JSON has them."""
+    """Arrays, and tuples and dicts of them, as JSON types."""
     if isinstance(value, dict):
         return {k: _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -125,7 +125,7 @@ def _plain(value):
 
 def draw_maps(stream: Stream, path: Path) -> list[str]:
     """Draws the planes of positions and channels of the first group with the borders of their tiles: a row for each
-    attribute, layer below layer. Returns what the rows show, from the top."""
+    attribute, layer below layer. Returns the names of the rows, from the top."""
     decoded = stream.group(0)
     q = decoded.quantized()
     ends, rows, names = [0, *accumulate(q.layers)], [], []

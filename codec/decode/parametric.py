@@ -1,4 +1,4 @@
-"""DecodedGroup -> ParametricGroup: what a stream holds, in the form that training makes and encoding takes."""
+"""DecodedGroup -> ParametricGroup: a decoded group in the form that training produces and the encoder takes."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from ..model.temporal_transform import dct_basis
 
 
 def parametric_group(decoded) -> ParametricGroup:
-    """The group of a `_native.DecodedGroup` in floats; its frames are those of the stream within f32.
+    """The group of a `_native.DecodedGroup` in floats; its frames equal those of the stream within f32.
 
-    Parents are indices in the group that the header names, which may be several groups back: they are left out.
+    Parents are left out: they are indices in the reference, which may be several groups back.
     """
     q: QuantizedGroup = decoded.quantized()
     return ParametricGroup(
@@ -42,7 +42,7 @@ def _nodes(q: QuantizedGroup, neighbors: np.ndarray, weights: np.ndarray) -> Nod
 
 
 def rig_motion(r: QuantizedRig, origin: np.ndarray, grid_step: float) -> RigMotion:
-    """A rig in floats, of a group with this grid."""
+    """Dequantizes the rig of a group with this grid."""
     steps = np.repeat([r.rotation_step, r.translation_step], 3).astype(np.float32)
     joints = np.float32(origin) + np.float32(grid_step) * r.joints.astype(np.float32)
     poses = steps * np.einsum("kt,kcj->tjc", dct_basis(len(r.poses)), r.poses)

@@ -1,4 +1,4 @@
-"""What is in a stream, for people and scripts: bytes by unit and attribute."""
+"""Report on a stream, for people and scripts: bytes by unit and attribute."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from .stream import Stream
 def describe(stream: Stream) -> dict:
     """Facts of a whole file.
 
-    `units` maps the name of a unit, or of a stream of the tiles, to bytes, share of the file and bits per Gaussian and
-    group; `layers` the bytes of each layer. A file without frames has no rates (None).
+    `units` maps the name of a unit, or of a stream of the tiles, to bytes, share of the file, and bits per Gaussian and
+    group; `layers` has the bytes of each layer. Rates are None for a file without frames.
     """
     units: dict[str, int] = {}
     layers: dict[int, int] = {}
@@ -63,8 +63,8 @@ def describe(stream: Stream) -> dict:
 
 
 def describe_scene(scene: Scene) -> dict:
-    """Facts of a file with tracks: those of `describe` of each, with name, hidden, offset (seconds), repeats and the
-    number of its keys."""
+    """Facts of a file with tracks: for each track those of `describe`, and name, hidden, offset (seconds), repeats and
+    number of keys."""
     frames = scene.frame_count
     tracks = []
     for t in scene.tracks:

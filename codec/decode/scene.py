@@ -1,8 +1,8 @@
-"""A file with several tracks as frames (spec 2.8): each track is a `Stream`, placed by its `Placement`, and a frame is
-the Gaussians of all that are shown, one track behind the other.
+"""File with several tracks -> frames (spec 2.8). Each track is a `Stream`, placed by its `Placement`; a frame is the
+concatenated Gaussians of all visible tracks.
 
-A track whose boxes or groups are damaged, or that is not in the file yet, is left out where it is, with a warning; the
-others go on.
+A track with damaged boxes or groups, or a track that is not in the file yet, is left out of the frames that it cannot
+give, with a warning; the other tracks are shown.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .stream import Stream, open_bytes
 
 @dataclass(frozen=True)
 class Track:
-    """A track of a scene: its groups, and where they are shown."""
+    """A track of a scene: its groups and its placement."""
 
     stream: Stream
     placement: Placement
@@ -41,7 +41,7 @@ class Scene:
     """Frames of all tracks of a .gsv file, with the interface of a `Stream`.
 
     Attributes:
-        tracks: in the order of the file, the hidden ones too; lost ones are left out.
+        tracks: in the order of the file, with hidden tracks; unreadable tracks are left out.
         config: of the first track, whose clock, up axis, background and cameras are those of the scene.
         complete: no track ends inside a group.
     """
@@ -101,7 +101,7 @@ class Scene:
         return _joined(parts)
 
     def _part(self, track: Track, t: int) -> Gaussians | None:
-        """What a track contributes to frame `t` of the scene; None: nothing."""
+        """Gaussians of a track in frame `t` of the scene; None: the track is hidden, not playing, or damaged there."""
         (n, d), placement = self.tracks[0].rate, track.placement
         u = Fraction(t * d * track.rate[0], n)
         own = placement.frame(u, track.stream.frame_count, track.rate)
@@ -121,19 +121,19 @@ class Scene:
             warnings.warn(f"a track is left out where it is damaged: {message}", stacklevel=3)
 
     def sequence(self) -> GaussianSequence:
-        """The whole scene, every frame a group of its own; frames are decoded when read."""
+        """The whole scene; every frame is a group of its own, decoded when read."""
         return GaussianSequence(self.fps, [DenseGroup(_Frame(self, t)) for t in range(self.frame_count)], self.cameras)
 
     def plain(self) -> Stream | None:
-        """The only track, if it is shown as it was made."""
+        """The stream of the only track if its placement changes nothing; otherwise None."""
         only = self.tracks[0]
         return only.stream if len(self.tracks) == 1 and _unplaced(only.placement) else None
 
     def alone(self, purpose: str) -> Stream:
-        """The only track that is shown, as it was made.
+        """The stream of the only visible track, without its placement.
 
         Raises:
-            UsageError: there are others, or none.
+            UsageError: several tracks are visible, or none.
         """
         shown = [t for t in self.tracks if not t.placement.hidden]
         if len(shown) != 1:
@@ -149,7 +149,7 @@ def _unplaced(p: Placement) -> bool:
 
 
 class _Frame(Sequence):
-    """One frame of a scene as the frames of a group."""
+    """One frame of a scene as the sequence of frames of a group."""
 
     def __init__(self, scene: Scene, t: int):
         self.scene, self.t = scene, t
@@ -162,7 +162,7 @@ class _Frame(Sequence):
 
 
 def _joined(parts: list[Gaussians]) -> Gaussians:
-    """One set out of several, whose SH degrees may differ."""
+    """Concatenates sets whose SH degrees may differ; missing coefficients are 0."""
     most = max((p.shN.shape[1] for p in parts), default=0)
     if not parts:
         return Gaussians.none()
@@ -174,11 +174,11 @@ def open_scene(path: str | Path, *, strict: bool = True, layers: int | None = No
     """Opens a .gsv file with all of its tracks.
 
     Args:
-        strict, layers: as for `open_stream`.
+        strict, layers: see `open_stream`.
 
     Raises:
-        FileNotFoundError: nothing is there.
-        BitstreamError: it is not a .gsv file, or its first track is damaged and it has no other.
+        FileNotFoundError: the file does not exist.
+        BitstreamError: it is not a .gsv file, or its first track cannot be read.
     """
     data, name = open_bytes(path), str(path)
     try:
@@ -196,6 +196,6 @@ def read_scene(data, name: str = "scene", *, strict: bool = True, layers: int | 
             streams.append(Stream(data, name, strict=strict, layers=layers, track=k if count > 1 else None))
         except (BitstreamError, LimitError) as e:
             if k == 0:
-                raise  # it has the clock and the world of the scene
+                raise  # the first track has the clock and the world of the scene
             lost.append(f"track {k + 1} of {name}: {e}")
     return Scene([Track(s, Placement(**s.config["placement"])) for s in streams], name, lost)

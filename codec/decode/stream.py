@@ -1,7 +1,7 @@
-"""A .gsv file as frames: demux (headers only), decode groups on demand, evaluate the frame that is asked for.
+""".gsv file -> frames: demux (headers only), decode groups on demand, evaluate the requested frame.
 
-Any frame is one evaluation away from its group's coefficients, so seeking costs at most one group, and for a predicted
-one the group that it refers to. Needs numpy only.
+A frame is evaluated directly from the coefficients of its group, so seeking decodes at most one group and, if that is
+predicted, its reference. Needs numpy only.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from ..model.parametric_group import ParametricGroup
 from ..model.placement import Pose
 from .parametric import parametric_group
 
-GROUPS_HELD = 3  # decoded groups in memory: the one that plays, the next, and the one to which they refer
+GROUPS_HELD = 3  # decoded groups in memory: the playing one, the next one, and their reference
 
 
 class Stream:
-    """Random access to the frames of one track of a .gsv file (finished, growing or cut short); `Scene` has them all.
+    """Random access to the frames of one track of a .gsv file (finished, growing or cut short); `Scene` has all tracks.
 
     Attributes:
         config: the config box: fps, level, sh_degree, up, background, cameras, ...
         groups: list of {offset, size, start_frame, frames, sync}.
         complete: false if the file ends inside a group (that group is left out).
-        strict: damage is an error; otherwise what is not damaged is decoded, and `damage` tells of the rest.
+        strict: damage is an error; otherwise undamaged parts are decoded, and `damage` lists the damaged parts.
         layers: how many layers of each group are decoded; None: all.
-        track: which track of a scene, where damaged boxes cost their groups alone, even if strict. None: the first.
+        track: index in a scene, where damaged boxes cost only their groups, even if strict. None: the first track.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Stream:
         self._held: OrderedDict[int, object] = OrderedDict()
         blank = {"unit": None, "type": "fragment", "layer": 0, "tile": None}
         self._damage: dict[int, list[dict]] = {i: [blank | {"message": m}] for i, m in index["damage"]}
-        self._ends: list[int] = list(accumulate(g["frames"] for g in self.groups))  # frames up to and with each group
+        self._ends: list[int] = list(accumulate(g["frames"] for g in self.groups))  # frames up to the end of each group
 
     @property
     def fps(self) -> float:
@@ -69,19 +69,19 @@ class Stream:
 
     @property
     def damage(self) -> list[dict]:
-        """What was damaged in the groups decoded so far: dicts of group, unit, type, layer, tile, message.
+        """Damage in the groups decoded so far: dicts of group, unit, type, layer, tile, message.
 
-        The Gaussians of a damaged tile are missing; so are those of all tiles of its layer if it is the first one, from
-        whose models they start. Without nodes, or their motion, Gaussians stay where they are. Groups that refer to a
-        damaged one show its damage, which is listed once, for that one. A group without sound header and first tile
-        stays an error, and so does one whose boxes are damaged (type: fragment), which does not cost the groups behind
-        it if the file has an index.
+        The Gaussians of a damaged tile are missing. If it is the first tile of its layer, the Gaussians of all tiles of
+        the layer are missing, since their models start from it. Without the nodes or their motion, Gaussians do not
+        move. Groups that refer to a damaged group show its damage, which is listed once, for that group. A group with a
+        damaged header or first tile stays an error. A group with damaged boxes (type: fragment) stays an error, too;
+        the groups after it are not affected if the file has an index.
         """
         return [{"group": i, **d} for i, found in sorted(self._damage.items()) for d in found]
 
     @property
     def byte_count(self) -> int:
-        """Size of the file, of a track of a scene that of its groups, in bytes."""
+        """Bytes of the file; for a track of a scene, bytes of its groups."""
         return self.file_size if self.track is None else sum(g["size"] for g in self.groups)
 
     @property
@@ -110,7 +110,7 @@ class Stream:
         return self.bytes_at(self.groups[i]["offset"], self.groups[i]["size"])
 
     def sound(self, i: int) -> bytes:
-        """Samples of the sound that go with group `i`, one behind the other."""
+        """Concatenated sound samples of group `i`."""
         offset, _, samples = self.groups[i].get("audio", (0, 0, []))
         return bytes(self._data[offset : offset + sum(size for size, _ in samples)])
 
@@ -118,8 +118,8 @@ class Stream:
         """Group `i`, decoded (`_native.DecodedGroup`).
 
         Raises:
-            BitstreamError: a unit of it is damaged (not strict: header or first tile), or it contradicts the file.
-            LimitError: it exceeds the level of the file.
+            BitstreamError: the group has a damaged unit (not strict: header or first tile) or contradicts the file.
+            LimitError: the group exceeds the level of the file.
         """
         if i not in self._held:
             where = f"{self.name}: group {i} (frames {self._span(i)})"
@@ -142,7 +142,7 @@ class Stream:
         return self._held[i]
 
     def _reference(self, i: int, back: int):
-        """The group to which group `i` refers, `back` groups before it; None if it is independent."""
+        """The reference of group `i`, `back` groups before it; None if group `i` is independent."""
         if back == 0:
             return None
         if back > i or self.groups[i]["sync"]:
@@ -152,7 +152,7 @@ class Stream:
         return self.group(i - back)
 
     def _check(self, i: int, group) -> None:
-        """What the header of a group must have in common with the file (spec 4), which a group does not know."""
+        """Checks the header of a group against the file (spec 4); the decoder of a group does not know the file."""
         frames, degree = self.groups[i]["frames"], self.config["sh_degree"]
         if group.frames != frames or group.sh_degree > degree:
             raise BitstreamError(
@@ -165,7 +165,7 @@ class Stream:
         return f"{g['start_frame']}-{g['start_frame'] + g['frames'] - 1}"
 
     def bytes_at(self, offset: int, size: int) -> bytes:
-        """Bytes of the file."""
+        """`size` bytes of the file from `offset` on."""
         return bytes(self._data[offset : offset + size])
 
     def frame(self, t: int, pose: Pose | None = None) -> Gaussians:
@@ -190,7 +190,7 @@ class Stream:
         return GaussianSequence(self.fps, _Groups(self), self.cameras)
 
     def identities(self) -> list[np.ndarray]:
-        """[N] int of each group: the same number is the same Gaussian, in groups that are predicted from each other."""
+        """Identities [N] int of each group: equal numbers are one Gaussian, in groups predicted from each other."""
         found, known = [], 0
         for i in range(len(self.groups)):
             q = self.group(i).quantized()
@@ -220,8 +220,8 @@ def open_bytes(path: str | Path) -> mmap.mmap:
     """The bytes of a .gsv file.
 
     Raises:
-        FileNotFoundError: nothing is there.
-        BitstreamError: a folder, an empty file, or one that is no ISO base media file.
+        FileNotFoundError: the file does not exist.
+        BitstreamError: a folder, an empty file, or not an ISO base media file.
     """
     path = Path(path)
     if path.is_dir():
@@ -236,14 +236,14 @@ def open_bytes(path: str | Path) -> mmap.mmap:
 
 
 def open_stream(path: str | Path, *, strict: bool = True, layers: int | None = None) -> Stream:
-    """Opens a .gsv file, of a scene its first track.
+    """Opens a .gsv file; of a scene, its first track.
 
     Args:
-        strict: damage is an error; otherwise what is not damaged is decoded, and `Stream.damage` tells of the rest.
+        strict: damage is an error; otherwise undamaged parts are decoded, and `Stream.damage` lists the damaged parts.
         layers: how many layers of each group are decoded; None: all.
 
     Raises:
-        FileNotFoundError: nothing is there.
+        FileNotFoundError: the file does not exist.
         BitstreamError: it is not a .gsv file, or a folder.
     """
     data = open_bytes(path)

@@ -1,11 +1,11 @@
 """Stage refine: adaptive rounding. After quantization, integers move by one where that lowers the rendered error by
 more than their bits cost.
 
-Rounding each value on its own leaves errors that another value could make up for. The decoded frame is drawn and
-compared with a target picture; the gradient of the squared difference moves the latent under each integer, straight
-through the rounding (Bengio et al. 2013). Positions and nodes stay, which all else is decoded from. Sizes move first,
-since the steps of the rotations follow from them; then the rotations are coded again, and the rest makes up for their
-rounding. Of a predicted group, only trajectories move.
+Each value rounded on its own leaves errors that other values could compensate. The decoded frame is rendered and
+compared with a target picture; the gradient of the squared difference moves the latent of each integer
+(straight-through estimator, Bengio et al. 2013). Positions and nodes are fixed, since all other values are decoded from
+them. Sizes are settled first, since the steps of the rotations follow from them; then the rotations are coded again,
+and the other values compensate their rounding. In a predicted group, only trajectories move.
 """
 
 from __future__ import annotations
@@ -39,11 +39,12 @@ HIDDEN = -30.0  # logit of an opacity that no renderer shows
 
 
 class AdaptiveRounding:
-    """The quantizer of one group: it is handed to whoever has pictures of the group.
+    """Adaptive rounding of one group, by target pictures from the caller.
 
     Args:
-        quantized: the group. reference: what it is predicted from.
-        only: attributes that may move; None: all that can.
+        quantized: the group.
+        reference: group from which it is predicted.
+        only: attributes that may move; None: all.
         sizes: whether canonical sizes may move.
     """
 
@@ -77,7 +78,7 @@ class AdaptiveRounding:
         return len(self._quantized.form.rest)
 
     def source(self, t: int) -> Gaussians:
-        """Frame `t` of the group before it was quantized, in the order of the integers."""
+        """Frame `t` of the group before quantization, in the order of the integers."""
         return self._shown(self._quantized.form.frame(t), t)
 
     def follow(self, targets: Iterable[Target], count: int, rate: float) -> None:
@@ -85,11 +86,11 @@ class AdaptiveRounding:
 
         Args:
             targets: `count` of them: (frame, camera, background, picture [H, W, 3] f32, 0 to 1).
-            rate: quantization steps that the first target moves a latent; it falls to 0 linearly.
+            rate: quantization steps by which the first target moves a latent; it falls to 0 linearly.
         """
         backend, names = CpuBackend(), {v.attribute for v in self._variables}
         adam = Adam(backend, self._settings.rounding.adam)
-        settled = int(self._settings.rounding.sizes_until * count)  # before the last target
+        settled = int(self._settings.rounding.sizes_until * count)  # sizes settle before the last target
         for step, (t, camera, background, picture) in enumerate(prefetched(targets)):
             if step == settled:
                 self._settle_sizes()
@@ -104,12 +105,12 @@ class AdaptiveRounding:
             list(self._pool.map(lambda v: v.latents.round(), self._variables))
 
     def frame(self, t: int) -> Gaussians:
-        """Frame `t` as decoded with the integers as they are now."""
+        """Frame `t` decoded from the current integers."""
         g = self._at_rest(t)
         return g if self._turns is None else replace(g, shN=turned_harmonics(g.shN, self._turns[t]))
 
     def _at_rest(self, t: int) -> Gaussians:
-        """`frame`, with harmonics that are not turned."""
+        """`frame`, with SH that is not rotated."""
         before, values = self._before[t]
 
         def now(attribute: str) -> np.ndarray:
@@ -123,7 +124,7 @@ class AdaptiveRounding:
         return self._shown(_with_values(before, moved), t)
 
     def quantized(self) -> Quantized:
-        """The group with the integers as they are now."""
+        """The group with the current integers."""
         q = self._quantized
         channels, trajectories = dict(q.integers.channels), dict(q.integers.trajectories)
         for v in self._variables:
@@ -131,7 +132,7 @@ class AdaptiveRounding:
         return replace(q, integers=replace(q.integers, channels=channels, trajectories=trajectories))
 
     def _settle_sizes(self) -> None:
-        """From now on sizes stay as they are, and rotations are coded for them."""
+        """Fixes the sizes from now on, and codes the rotations again, whose steps follow from them."""
         moving = [v for v in self._variables if isinstance(v, CanonicalVariable) and v.attribute == SIZES]
         if not moving:
             return
@@ -141,13 +142,12 @@ class AdaptiveRounding:
         q = replace(q, integers=replace(q.integers, channels=channels))
         self._quantized = with_rotations(q, self._settings.rdo)
         self._variables.remove(moving[0])
-        for name in ("_decoded", "_before"):  # decoded anew; nothing is carried elsewhere
+        for name in ("_decoded", "_before"):  # decoded again; `_turns` stays, since the nodes do not change
             vars(self).pop(name, None)
 
     @cached_property
     def _before(self) -> list[tuple[Gaussians, dict[str, np.ndarray]]]:
-        """Each frame as decoded with the integers that variables start from, as Gaussians and as coded values;
-        harmonics as at rest."""
+        """Each frame decoded from the start integers of the variables, as Gaussians and as coded values; SH at rest."""
         out = []
         for t in range(self.frames):
             g = Gaussians(**self._decoded.frame(t))
@@ -158,19 +158,19 @@ class AdaptiveRounding:
 
     @cached_property
     def _decoded(self):
-        """The group as decoded with the integers that variables start from."""
+        """The group decoded from the start integers of the variables."""
         reference = self._reference.decoded if self._reference else None
         return _native.DecodedGroup.reconstruct(self._quantized.integers, reference)
 
     @cached_property
     def _turns(self) -> np.ndarray | None:
-        """[T, N, 4] by which harmonics are turned in each frame; None: they are not."""
+        """Rotations [T, N, 4] of the SH in each frame; None: SH is not rotated."""
         q = self._quantized.integers
         turns = q.turned_harmonics and q.nodes is not None and "shN" in q.channels
         return self._decoded.carried()[1] if turns else None
 
     def _shown(self, g: Gaussians, t: int) -> Gaussians:
-        """The same with an opacity that shows nothing, where frame `t` is outside of a lifetime."""
+        """`g` with opacity `HIDDEN` for Gaussians whose lifetime does not include frame `t`."""
         life = self._quantized.form.lifetimes
         if life is None:
             return g

@@ -1,7 +1,7 @@
-"""A file with sound -> the audio track of a stream (spec 2.7): AAC and Opus as they are, all else as AAC by ffmpeg.
+"""File with sound -> audio track of a stream (spec 2.7): AAC and Opus are copied, other codecs become AAC by ffmpeg.
 
-ffmpeg, of the imageio-ffmpeg wheel, repacks or encodes the file to a fragmented MP4, whose sample entry and samples the
-stream takes over. The samples of a group are those that begin within its frames, so sound is cut to the video.
+ffmpeg, from the imageio-ffmpeg wheel, repacks or encodes the file to a fragmented MP4, whose sample entry and samples
+the stream takes over. The samples of a group are those that begin within its frames, so sound is cut to the video.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from pathlib import Path
 from .. import _native
 from ..errors import BitstreamError, UsageError, require
 
-TAKEN = ("aac", "opus")  # ffmpeg's names of what the track may hold
+TAKEN = ("aac", "opus")  # ffmpeg's names of the codecs that the track may hold
 AAC = ("-af", "aresample=async=1:first_pts=0", "-c:a", "aac", "-b:a", "128k")  # gaps are filled with silence
 MP4 = ("-f", "mp4", "-movflags", "delay_moov+default_base_moof", "-frag_duration", "1000000", "pipe:1")
 
 
 @dataclass(frozen=True)
 class AudioTrack:
-    """Sound as it goes into a stream.
+    """The audio track of a stream.
 
     Attributes:
         config: timescale (units a second), media_start (media time of the first frame), entry (a whole box).
         samples: (size in bytes, duration in units) of each.
-        data: their bytes, one behind the other.
+        data: their bytes, concatenated.
     """
 
     config: dict
@@ -44,7 +44,7 @@ class AudioTrack:
 
     @property
     def seconds(self) -> float:
-        """What is heard of it."""
+        """Duration of the audible part."""
         return (self._times[-1] - self.config["media_start"]) / self.config["timescale"]
 
     @property
@@ -53,8 +53,8 @@ class AudioTrack:
         return hashlib.sha256(repr((self.config, self.samples)).encode() + self.data).hexdigest()[:16]
 
     def between(self, start: int, end: int, fps: tuple[int, int]) -> tuple[int, list[tuple[int, int]], bytes] | None:
-        """Media time, samples and bytes of what begins within the frames `start` to `end` - 1; None: nothing does.
-        What is before the first frame, for the decoder alone, belongs to it."""
+        """Media time, samples and bytes of the samples that begin within the frames `start` to `end` - 1; None: there
+        are none. Samples before the first frame, which only prepare the decoder, belong to it."""
 
         def first(frame: int) -> int:
             units = -(-frame * fps[1] * self.config["timescale"] // fps[0])
@@ -66,10 +66,10 @@ class AudioTrack:
 
 @dataclass(frozen=True)
 class GroupSound:
-    """Sound of which each group has its own samples already, as `AudioTrack` without its times.
+    """Sound that is already split into samples of each group: as `AudioTrack`, without its times.
 
     Attributes:
-        config: as of `AudioTrack`.
+        config: as in `AudioTrack`.
         runs: first frame of a group -> media time, (size, duration) of each sample, bytes.
     """
 
@@ -104,7 +104,7 @@ def read_audio(path: Path) -> AudioTrack:
         try:
             return _track(_mp4(path, source, ("-c:a", "copy")))
         except BitstreamError:
-            pass  # it starts late, say: then it is encoded
+            pass  # e.g. the sound starts late: then it is encoded
     return _track(_mp4(path, source, AAC))
 
 
@@ -118,16 +118,16 @@ def _mp4(path: Path, source: list[str], how: tuple[str, ...]) -> bytes:
 
 
 def _track(mp4: bytes) -> AudioTrack:
-    """The track of a fragmented MP4 of sound alone.
+    """The track of a fragmented MP4 that has only sound.
 
     Raises:
-        BitstreamError: it is not as the streams have it (spec 2.7).
+        BitstreamError: the track does not have the form of spec 2.7.
     """
     facts = _native.read_audio(mp4)
     places = facts.pop("samples")
     if not places:
         raise BitstreamError("expected samples of sound, found none")
     samples = [(size, duration) for _, size, duration in places]
-    if len(samples) > 1:  # ffmpeg cuts the time of the last one, but decoders give all of it
+    if len(samples) > 1:  # ffmpeg shortens the last sample, but decoders return all of it
         samples[-1] = samples[-1][0], max(samples[-2][1], samples[-1][1])
     return AudioTrack(facts, samples, b"".join(mp4[at : at + size] for at, size, _ in places))

@@ -1,8 +1,8 @@
-"""The axes of each Gaussian by falling scale: of the 24 equal forms of a (quaternion, scale) pair, four are left.
+"""Axes of each Gaussian sorted by falling scale: of the 24 equal forms of a (quaternion, scale) pair, four are left.
 
-A covariance does not change when its axes are permuted or flipped. Sorted, a scale predicts the next; of the four
-orientations left, the one nearest to a neighbour's is coded (rotation_residuals.py). In: canonical scales. Out: one
-choice for all frames, so that trajectories stay smooth.
+A covariance does not change when its axes are permuted or flipped. Sorted, each scale predicts the next one; of the
+four orientations left, the one nearest to a neighbour's orientation is coded (rotation_residuals.py). In: canonical
+scales. Out: one choice for all frames, so that trajectories stay smooth.
 """
 
 from itertools import permutations
@@ -30,11 +30,10 @@ _PERMUTATION_QUATS = np.stack([_permutation_quat(o) for o in _ORDERS])  # [6, 4]
 
 
 def sorted_axes(log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The form to code, by log_scales [N, 3].
+    """Axis order to code, from log_scales [N, 3].
 
     Returns:
-        order [N, 3] int, the axes by falling scale; rotation [N, 4] f32, by which quaternions of every frame are
-        multiplied from the right.
+        order [N, 3] int, the axes by falling scale; rotation [N, 4] f32, right factor of the quaternions of all frames.
     """
     order = np.argsort(-log_scales, axis=1, kind="stable")
     code = np.array([o[0] * 9 + o[1] * 3 + o[2] for o in _ORDERS])

@@ -1,8 +1,8 @@
-"""A group in the form that is coded: axes sorted, rest pose in the middle of the motion, colours decorrelated.
+"""A group in the form that is coded: axes sorted, rest pose at the mean of the motion, colours decorrelated.
 
-In: ParametricGroup. Out: CodedForm, which looks the same in every frame. What a reference has coded already keeps the
-form of the reference, and the rounding of its canonical values where refinement by pictures has chosen it: a predicted
-group then codes what has changed since, and does not undo it.
+In: ParametricGroup. Out: CodedForm, which renders the same in every frame. Gaussians that a reference has coded keep
+the form of the reference, and the rounding of their canonical values if refinement by pictures has chosen it: a
+predicted group then codes the changes since, and does not undo the rounding.
 """
 
 from __future__ import annotations
@@ -27,16 +27,18 @@ class CodedForm:
     """N Gaussians over T frames.
 
     Attributes:
-        group: what it was made of.
-        index: [N] int, Gaussian of `group`.
-        lineage: [N] int, index of each in the integers of the reference; -1: not there, a birth.
-        rest: [N, 3] f64 positions from which the nodes carry each Gaussian nearest to all frames.
+        group: source of the form.
+        index: [N] int, index of each Gaussian in `group`.
+        lineage: [N] int, index of each Gaussian in the integers of the reference; -1: a birth.
+        rest: [N, 3] f64 rest positions, from which the nodes carry each Gaussian nearest to its means in all frames.
         rotations: [N, 4] f32 canonical quaternions, axes as in `group`.
-        axis_order: [N, 3] int and axis_rotation: [N, 4] f32, how the axes are sorted and turned for coding
-            (`sorted_axes`): right factors, which cancel wherever two rotations of one Gaussian are compared.
+        axis_order: [N, 3] int, order of the axes for coding (`sorted_axes`).
+        axis_rotation: [N, 4] f32, the same as a right factor of the quaternions; it cancels where two rotations of one
+            Gaussian are compared.
         values: attribute -> [N, C] f64 canonical values of APPEARANCE, the mean over time.
         trajectories: attribute -> [K, C, N] f32 DCT coefficients of APPEARANCE.
-        means: [T, N, 3] f32 and quats [T, N, 4] f32 of all frames, axes as in `group`.
+        means: [T, N, 3] f32 of all frames.
+        quats: [T, N, 4] f32 of all frames, axes as in `group`.
     """
 
     group: ParametricGroup
@@ -53,7 +55,7 @@ class CodedForm:
 
     @property
     def frames(self) -> int:
-        """T"""
+        """Number of frames, T."""
         return self.group.frame_count
 
     @property
@@ -88,19 +90,19 @@ class CodedForm:
         )
 
     def turned(self, forms: np.ndarray) -> CodedForm:
-        """Axes turned by the inverse of 1, i, j or k ([N] 0 to 3) as well, which changes no look."""
+        """Axes also rotated by the inverse of 1, i, j or k (`forms`: [N] 0 to 3); renders the same."""
         inverse = quat_conjugate(np.eye(4, dtype=np.float32))[forms]
         return replace(self, axis_rotation=quat_multiply(self.axis_rotation, inverse))
 
     def held(self, a: np.ndarray) -> np.ndarray:
-        """[T, N, ...] of these Gaussians; outside a lifetime it repeats the nearest frame inside."""
+        """Values [T, N, ...] of these Gaussians; outside a lifetime they repeat the nearest frame inside."""
         if self.lifetimes is None:
             return a
         t = np.clip(np.arange(len(a))[:, None], self.lifetimes[:, 0], self.lifetimes[:, 1] - 1)
         return a[t, np.arange(a.shape[1])]
 
     def frame(self, t: int) -> Gaussians:
-        """All Gaussians as they are at frame `t`; where one is not shown, its opacity is that of the nearest frame."""
+        """All Gaussians at frame `t`, also those outside their lifetimes."""
         return self.group.frame(t).take(self.index)
 
 
@@ -110,7 +112,7 @@ class ReferenceForm:
 
     Attributes:
         rest, rotations, axis_order, axis_rotation: as in `CodedForm`.
-        rounding: attribute -> [n, C] f64, what coding has added to its canonical values and stays; {}: nothing.
+        rounding: attribute -> [n, C] f64, rounding of the canonical values by coding, which stays; {}: none.
     """
 
     rest: np.ndarray
@@ -139,7 +141,7 @@ def coded_form(group: ParametricGroup, lineage: np.ndarray, known: ReferenceForm
 
 def _recentered(group: ParametricGroup, means: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rest positions [N, 3] f64 and canonical quaternions [N, 4] f32 from which the nodes carry each Gaussian nearest
-    to where it is in all frames ([T, N, 3], [T, N, 4]): jitter of one frame does not become canonical."""
+    to its means [T, N, 3] and quats [T, N, 4] in all frames: jitter of one frame does not become canonical."""
     if group.frame_count == 1 or not len(group.canonical):
         return means[0].astype(np.float64), quats[0].copy()
     carried, rotations = group.carried()

@@ -1,7 +1,7 @@
 """Groups -> payloads: measure, plan, quantize, refine, pack; independent, or predicted where that is cheaper.
 
-A group is predicted from the last independent one. `CoderState` holds what that takes, and where the Gaussians of the
-groups since came from; it is returned with each group and never changed, so that a group can be tried more than once.
+A group is predicted from the last independent one. `CoderState` holds the data for that, and the lineage of the
+Gaussians since; it is returned with each group and never changed, so that a group can be tried more than once.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from .settings import EncodeSettings
 
 
 class RefineByPictures(Protocol):
-    """Refines a group that begins at a frame of the capture by the pictures that it was trained on."""
+    """Refines a group, which begins at frame `first_frame` of the capture, by the pictures that it was trained on."""
 
     def __call__(
         self, group: ParametricGroup, first_frame: int, quantizer: AdaptiveRounding, views: int | None = None
     ) -> None:
-        """By `views` pictures; None: by as many as usually pay."""
+        """Refines by `views` pictures; None: by as many as usually pay."""
 
     def masked_pictures(
         self, group: ParametricGroup, first_frame: int, count: int, seed: int
     ) -> Iterable[tuple[Target, np.ndarray | None]]:
-        """`count` of the pictures, in the order that `seed` draws, each with its mask, [H, W] u8; None: it has none."""
+        """`count` of the pictures, in the order that `seed` draws, each with its mask [H, W] u8; None: no mask."""
 
 
 FORM = ("rest", "rotations", "axis_order", "axis_rotation")  # arrays of a `ReferenceForm`
@@ -49,11 +49,13 @@ CamerasAt = Callable[[int], Sequence[Camera]]  # frame of the stream -> cameras 
 
 @dataclass(frozen=True)
 class CodedGroup:
-    """A group in bytes.
+    """A coded group.
 
     Attributes:
-        payload: of the group. units: its units with their bytes.
-        gaussians: that are coded. independent: it refers to no other group.
+        payload: bytes of the group.
+        units: its units with their bytes.
+        gaussians: number of coded Gaussians.
+        independent: the group refers to no other group.
     """
 
     payload: bytes
@@ -64,13 +66,16 @@ class CodedGroup:
 
 @dataclass(frozen=True)
 class CoderState:
-    """What the next group may be predicted from.
+    """State from which the next group may be predicted.
 
     Attributes:
-        payload: of the last independent group. form: in which it was coded.
-        trajectory_steps: attribute -> step of a value in one frame; node_step: world units.
-        frames: of it and of the groups since. back: groups since, itself included.
-        lineage: [N] of each Gaussian of the group before, its index among the integers of the independent group; -1.
+        payload: of the last independent group.
+        form: form in which that group was coded.
+        trajectory_steps: attribute -> step of a value in one frame.
+        node_step: step of node translations, world units.
+        frames: number of frames of that group and of the groups since.
+        back: distance in groups from the next group to that group.
+        lineage: [N] index of each Gaussian of the group before in the integers of the independent group; -1: none.
     """
 
     payload: bytes
@@ -93,7 +98,7 @@ class CoderState:
 
     @cached_property
     def known(self) -> Known:
-        """What a predicted group shares with the independent group."""
+        """Parameters and layers that a predicted group shares with the independent group."""
         q = self.integers
         names = ("means", *q.channels)
         shifts = np.zeros((len(q.layers), len(names)), int) if q.shifts is None else q.shifts.astype(int)
@@ -111,11 +116,11 @@ class CoderState:
         return Known(parameters, np.repeat(np.arange(len(q.layers)), q.layers), opacities)
 
     def after(self, group: ParametricGroup, lineage: np.ndarray) -> CoderState:
-        """The state behind one more predicted group."""
+        """The state after one more predicted group."""
         return replace(self, frames=self.frames + len(group), back=self.back + 1, lineage=lineage)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Everything as arrays: what a later run goes on from."""
+        """All fields as arrays, from which a later run continues."""
         arrays = {n: np.asarray(getattr(self, n)) for n in ("node_step", "frames", "back", "lineage")}
         arrays |= {f"form.{n}": getattr(self.form, n) for n in FORM}
         arrays |= {f"rounding.{n}": v for n, v in self.form.rounding.items()}
@@ -146,8 +151,8 @@ class GroupCoder:
     Attributes:
         settings: of the encoder.
         fps: frames a second of the stream.
-        cameras: of the capture at a frame, if there was one; sensitivity is measured from them too.
-        refine_by_pictures: of a capture, if its pictures can be had.
+        cameras: frame -> cameras of the capture, if there is one; sensitivity is measured from them, too.
+        refine_by_pictures: refinement by the pictures of a capture, if they are available.
     """
 
     settings: EncodeSettings
@@ -156,7 +161,7 @@ class GroupCoder:
     refine_by_pictures: RefineByPictures | None = None
 
     def measure(self, group: ParametricGroup, first_frame: int) -> Importance:
-        """What `code` needs of a group at any quality."""
+        """Importance of the Gaussians, which `code` needs at any quality."""
         return measure_group(group, list(self.cameras(first_frame + len(group) // 2)), self.settings.plan)
 
     def has_pictures(self, group: ParametricGroup) -> bool:
@@ -164,7 +169,7 @@ class GroupCoder:
         return self.refine_by_pictures is not None and group.calibration is not None
 
     def quantized(self, group: ParametricGroup, importance: Importance, quality: float) -> Quantized:
-        """An independent group in integers, before it is refined."""
+        """An independent group in integers, before refinement."""
         form = coded_form(group, np.full(len(group.canonical), -1))
         plan = plan_group(form, importance.with_axes(form.axis_order), quality, self.settings)
         return quantize(form, plan, self.settings.rdo)
@@ -172,7 +177,7 @@ class GroupCoder:
     def code(
         self, state: CoderState | None, group: ParametricGroup, importance: Importance, quality: float, first_frame: int
     ) -> tuple[CodedGroup, CoderState | None]:
-        """The next group, which begins at `first_frame` of the stream, and the state behind it.
+        """Codes the next group, which begins at `first_frame` of the stream; returns it and the state after it.
 
         Raises:
             CaptureError: its parents do not fit the group before, or a picture cannot be read.
@@ -217,7 +222,7 @@ class GroupCoder:
         views, middle = self._drawn_views(group), len(group) // 2
         if not views:
             return quantized
-        sizes = len(group) == 1  # few views of what is right say little about them
+        sizes = len(group) == 1  # few views per frame measure sizes poorly
         rounding = AdaptiveRounding(quantized, self.settings, reference, sizes=sizes)
         form, rate = quantized.form, self.settings.rounding.drawn_rate / views**0.5
         cameras = sensitivity_cameras(form.means[middle], list(self.cameras(first_frame + middle)), views)
@@ -225,7 +230,7 @@ class GroupCoder:
         return rounding.quantized()
 
     def _drawn_views(self, group: ParametricGroup) -> int:
-        """By how many drawn views a group of splats is refined."""
+        """Number of drawn views by which a group of splats is refined."""
         s = self.settings
         if s.refine is not None:
             return s.refine
@@ -233,7 +238,7 @@ class GroupCoder:
 
 
 def _state_of(quantized: Quantized, payload: bytes, *, chosen: bool) -> CoderState:
-    """The state behind an independent group; `chosen`: pictures have chosen its rounding, which stays."""
+    """The state after an independent group; `chosen`: pictures have chosen its rounding, which stays."""
     form: CodedForm = quantized.form
     parameters, channels = quantized.plan.parameters, quantized.integers.channels
     lineage = np.full(len(form.group.canonical), -1)
@@ -245,10 +250,10 @@ def _state_of(quantized: Quantized, payload: bytes, *, chosen: bool) -> CoderSta
 
 
 def _lineage(group: ParametricGroup, state: CoderState | None) -> np.ndarray | None:
-    """[N] int, which Gaussian of the independent group each one continues, -1: none; None: nothing is known.
+    """[N] int, index in the independent group of the Gaussian that each one continues, -1: none; None: unknown.
 
     Raises:
-        CaptureError: two Gaussians have the same parent, or one that is not there.
+        CaptureError: two Gaussians have the same parent, or a parent does not exist.
     """
     if group.parents is None or state is None:
         return None

@@ -1,7 +1,7 @@
 """Companding: log_scales and logit_opacities are coded along a curve that is steep where the picture is insensitive.
 
-A thin axis is smaller than a pixel, an opacity is nearly 0 or 1: there the same error of the value shows less. Steps
-that widen as the measured sensitivity falls spend no bits on it (spec 13.1).
+If an axis is thinner than a pixel, or an opacity is nearly 0 or 1, the same error of the value is less visible. Steps
+that widen as the measured sensitivity falls save bits there (spec 13.1).
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ PIECES = 8  # of the bitstream
 
 @dataclass(frozen=True)
 class Curve:
-    """Piecewise linear: pieces of `width` from `low` on, in coded values; piece j has the slope 2^(slopes[j] / 16). The
-    value of `low` is `low`."""
+    """Piecewise linear curve, coded value -> value: pieces of `width` from `low` on, in coded values; piece j has the
+    slope 2^(slopes[j] / 16). Coded `low` has the value `low`."""
 
     low: float
     width: float
@@ -35,7 +35,7 @@ class Curve:
         return Curve(float(row[0]), float(row[1]), tuple(map(int, row[2:])))
 
     def coded(self, values: np.ndarray) -> np.ndarray:
-        """Values -> what is quantized."""
+        """Values -> coded values, which are quantized."""
         starts, ends, rises = self._pieces()
         piece = np.clip(np.searchsorted(ends, values, side="right") - 1, 0, PIECES - 1)
         return starts[piece] + (values - ends[piece]) / rises[piece]
@@ -47,14 +47,14 @@ class Curve:
         return ends[piece] + rises[piece] * (coded - starts[piece])
 
     def rise(self, coded: np.ndarray) -> np.ndarray:
-        """How much larger a step of the value is than one that is coded."""
+        """Slope of the curve, d(value) / d(coded value)."""
         return self._pieces()[2][self._piece(coded)]
 
     def _piece(self, coded: np.ndarray) -> np.ndarray:
         return np.clip((coded - self.low) // self.width, 0, PIECES - 1).astype(int)
 
     def _pieces(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """[PIECES] where they start, coded and as values, and how they rise."""
+        """[PIECES] each: starts of the pieces as coded values, their starts as values, their slopes."""
         rises = 2.0 ** (np.array(self.slopes) / 16)
         return (
             self.low + self.width * np.arange(PIECES),
@@ -64,7 +64,7 @@ class Curve:
 
 
 def fit(values: np.ndarray, weights: np.ndarray, settings: CompandingSettings) -> Curve:
-    """The curve along which [N] values of [N] sensitivities are equally sensitive."""
+    """The curve along which values [N] with sensitivities `weights` [N] are equally sensitive."""
     bins = settings.bins
     low, high = np.percentile(values, settings.tails)
     high = max(high, low + 1e-3)
@@ -82,7 +82,7 @@ def fit(values: np.ndarray, weights: np.ndarray, settings: CompandingSettings) -
 
 
 def fit_all(values: dict, weights: dict, settings: CompandingSettings) -> dict[str, list[Curve]]:
-    """attribute -> a curve for each channel of those that have curves; `values`, `weights`: attribute -> [N, C]."""
+    """attribute -> one curve per channel, for companded attributes; `values`, `weights`: attribute -> [N, C]."""
     if len(values["log_scales"]) < settings.least:
         return {}
     pairs = {n: zip(values[n].T, weights[n].T, strict=True) for n in COMPANDED}
@@ -90,7 +90,7 @@ def fit_all(values: dict, weights: dict, settings: CompandingSettings) -> dict[s
 
 
 def compand(values: np.ndarray, curves: list[Curve] | None) -> np.ndarray:
-    """[N, C] values -> as they are coded; without curves they are so already."""
+    """Values [N, C] -> coded values; unchanged without curves."""
     return np.stack([c.coded(v) for v, c in zip(values.T, curves, strict=True)], 1) if curves else values
 
 
@@ -100,5 +100,5 @@ def expand(coded: np.ndarray, curves: list[Curve] | None) -> np.ndarray:
 
 
 def slopes(coded: np.ndarray, curves: list[Curve] | None) -> np.ndarray | float:
-    """[N, C], how much larger steps of values are than those that are coded."""
+    """[N, C] slopes of the curves, d(value) / d(coded value); 1 without curves."""
     return np.stack([c.rise(v) for v, c in zip(coded.T, curves, strict=True)], 1) if curves else 1.0

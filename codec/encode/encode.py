@@ -1,7 +1,7 @@
 """ParametricGroups -> .gsv: the loop over groups, with progress, interruption and resume.
 
-Groups come one at a time (a trainer yields them as they are done), are turned to integers, to bytes, and appended. A
-run that stops goes on where it stopped, to the same bytes.
+Groups come one at a time (a trainer yields each when it is done), become integers, then bytes, and are appended. An
+interrupted run continues where it stopped, to the same bytes.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from .writer import StreamWriter
 
 @dataclass
 class EncodeReport:
-    """What came out: `bytes` of the file, `units` with their bytes, `seconds` in each stage."""
+    """Result of encoding: `bytes` of the file, `units` with their bytes, `seconds` in each stage."""
 
     frames: int = 0
     groups: int = 0
-    predicted: int = 0  # of these, in this run
+    predicted: int = 0  # number of predicted groups, in this run
     bytes: int = 0
     gaussians: int = 0  # most in one group
     quality: float | None = None  # of the last group
-    chosen_quality: bool = False  # nobody named it: coding costs about `loss` decibels
+    chosen_quality: bool = False  # found by search: coding costs about `loss` decibels
     loss: float = 0.0
     interrupted: bool = False
     seconds: dict = field(default_factory=dict)
@@ -44,7 +44,7 @@ class EncodeReport:
     group_list: list[dict] = field(default_factory=list)  # of this run: frame, frames, bytes, predicted, ended
 
     def group_rates(self) -> tuple[float | None, float | None]:
-        """kB a frame of the first group of the stream and of all behind it; None: this run has coded none."""
+        """kB per frame of the first group of the stream, and of all later groups; None: this run has coded none."""
         first = [g for g in self.group_list if g["frame"] == 0]
         later = [g for g in self.group_list if g["frame"] > 0]
         rate = lambda some: sum(g["bytes"] for g in some) / sum(g["frames"] for g in some) / 1000  # noqa: E731
@@ -70,10 +70,10 @@ def stream_config(
     up: str = "y",
     background=(0.5,) * 3,
 ) -> dict:
-    """The config box: what a player must know before the first group.
+    """The config box: data that a player needs before the first group.
 
     Args:
-        gaussians, frames: about how many a group has; the level is the smallest with room for twice as many Gaussians.
+        gaussians, frames: approximate numbers per group; the level is the smallest with room for twice the Gaussians.
     """
     return {
         "fps": fps,
@@ -100,13 +100,13 @@ def stream_config(
 
 @dataclass(frozen=True)
 class StreamOutput:
-    """Where a stream is written.
+    """Destination of a stream.
 
     Attributes:
         path: final path, OUT.gsv.
-        config: of `stream_config`.
-        fingerprint: whatever must be equal for a second run to go on with the groups of the first one (JSON-able).
-        audio: sound for it.
+        config: result of `stream_config`.
+        fingerprint: data that must be equal for a second run to continue the groups of the first one (JSON-able).
+        audio: audio track of the stream.
     """
 
     path: Path
@@ -125,16 +125,16 @@ def encode_groups(
     on_group: Callable[[EncodeReport], None] | None = None,
     keep_part: bool = False,
 ) -> EncodeReport:
-    """Writes a stream from the groups that `groups(done, frames)` yields: those after the `done` groups, `frames`
-    frames, that an earlier run left in the file.
+    """Writes a stream from the groups that `groups(done, frames)` yields: the groups after the `done` groups (`frames`
+    frames) that an earlier run left in the file.
 
     Args:
-        cameras: frame -> cameras for training, from which the subject was captured: sensitivity is measured from them.
+        cameras: frame -> cameras of the capture for training; sensitivity is measured from them.
         refine_by_pictures: (group, first frame, quantizer) of a capture: the last stage of training, for groups that
             have a calibration.
-        keep_part: a complete stream, too, leaves what a later run goes on from, which then has nothing to do.
+        keep_part: also a complete stream keeps the files from which a later run continues; that run has nothing to do.
 
-    Ctrl-C finishes the file with the groups done and returns with `interrupted` set; the next run goes on.
+    Ctrl-C finishes the file with the groups done and returns with `interrupted` set; the next run continues.
     """
     writer = StreamWriter(output.path, output.config, output.fingerprint, output.audio)
     coder = GroupCoder(settings, float(output.config["fps"]), cameras, refine_by_pictures)
@@ -146,7 +146,7 @@ def encode_groups(
 
 @contextmanager
 def completed(writer: StreamWriter, report: EncodeReport, *, keep_part: bool = False) -> Iterator[None]:
-    """Around the loop that appends groups: finishes the file, also after Ctrl-C, and counts it in `report`."""
+    """Context of the loop that appends groups: finishes the file, also after Ctrl-C, and counts it in `report`."""
     try:
         yield
     except KeyboardInterrupt:

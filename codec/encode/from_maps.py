@@ -27,10 +27,10 @@ def encode_maps(folder: Path, out: Path, audio: AudioTrack | None = None) -> tup
     """Codes the planes in `folder`, with their sound. Returns frames and bytes.
 
     Args:
-        audio: sound in place of theirs.
+        audio: sound that replaces the sound of the maps.
 
     Raises:
-        UsageError: maps.json or an image is missing, is no such file, or does not fit the others.
+        UsageError: maps.json or an image is missing, is not such a file, or does not fit the others.
     """
     folder, out = Path(folder), Path(out)
     try:
@@ -49,7 +49,7 @@ def encode_maps(folder: Path, out: Path, audio: AudioTrack | None = None) -> tup
         raise UsageError(f"{folder}: no attribute maps as `gscodec decode --maps` writes them: {reason}") from None
     made_of = hashlib.sha256(b"".join(payloads)).hexdigest()[:16]
     writer = StreamWriter(out, config, {"maps": made_of}, audio or own)
-    there = writer.groups  # of a run that was stopped
+    there = writer.groups  # groups of an interrupted run
     for q, payload, sync in zip(groups[there:], payloads[there:], syncs[there:], strict=True):
         writer.append(payload, q.frames, sync=sync)
     writer.finish()
@@ -118,7 +118,7 @@ def _group(folder: Path, i: int, g: dict) -> QuantizedGroup:
         tile_side_log2=g["tile_side_log2"],
         reference=g["reference"],
         parents=plane("parents").astype(np.int32) if g["reference"] else None,
-        turned_harmonics=g.get("turned_harmonics", False),  # maps of earlier versions say nothing of it
+        turned_harmonics=g.get("turned_harmonics", False),  # maps of earlier versions do not have it
     )
 
 

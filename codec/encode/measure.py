@@ -1,4 +1,4 @@
-"""Stage measure: how much each Gaussian of a group shows. It does not depend on quality, and is done once a group."""
+"""Stage measure: importance of each Gaussian of a group. It does not depend on quality: once a group."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from ..render.sensitivity import Importance, measure, of_width, sensitivity_came
 from .settings import PlanSettings
 
 HIDDEN = -30.0  # logit opacity that no view shows
-SHORT_LIFE = 0.5  # of the frames of a group; what lives shorter is seen by few of the views
-SMALL = 128  # pixels, width of the pictures that say what it matters
-GOLDEN = (5**0.5 - 1) / 2  # steps of this share of a range visit it evenly, in an order of no other sequence of views
+SHORT_LIFE = 0.5  # of the frames of a group; Gaussians that live shorter are in few of the views
+SMALL = 128  # pixels, width of the images that measure Gaussians with a short life
+GOLDEN = (5**0.5 - 1) / 2  # steps of this share visit a range evenly, in an order that no other sequence of views has
 
 
 def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanSettings) -> Importance:
-    """Importance of the N Gaussians, from the first, the middle and the last frame. Where Gaussians come and go, every
-    frame that shows some is seen, in a capture by one of its cameras and by another one. That is too little to say that
-    what lives in few frames does not matter: those frames are seen by all cameras, in small pictures.
+    """Importance of the N Gaussians, from the first, the middle and the last frame. With lifetimes, every frame that
+    shows Gaussians is measured: in a capture by one of its cameras and by another one. These views are too few to call
+    a Gaussian with a short life unimportant: all cameras, with small images, measure the frames of such Gaussians.
 
     Args:
-        cameras: from which the subject was captured, if it was.
+        cameras: of the capture, if there is one.
     """
     g, frames = group.canonical, group.frame_count
     if not len(g):
@@ -47,7 +47,7 @@ def measure_group(group: ParametricGroup, cameras: list[Camera], settings: PlanS
 
 
 def _with_short_lived(found: Importance, group: ParametricGroup, cameras: list[Camera]) -> Importance:
-    """The importance `found`, of what lives in few frames at least that which all `cameras` see of it there."""
+    """`found`; Gaussians with a short life have at least the importance that all `cameras` measure in their frames."""
     lived = np.diff(group.lifetimes, axis=1)[:, 0]
     short = (lived > 0) & (lived < SHORT_LIFE * group.frame_count)
     times = _living_frames(group.lifetimes[short], group.frame_count)
@@ -60,13 +60,13 @@ def _with_short_lived(found: Importance, group: ParametricGroup, cameras: list[C
 
 
 def _spread(items: int, count: int) -> list[int]:
-    """`count` of so many items; each comes once before any comes again, where `count` is a multiple of `items`."""
+    """`count` indices of `items` items: each once before any comes again; equally often if `items` divides `count`."""
     order = np.argsort([(i + 0.5) * GOLDEN % 1 for i in range(items)]).tolist()
     return [order[i % items] for i in range(count)]
 
 
 def _living_frames(lifetimes: np.ndarray, frames: int) -> list[int]:
-    """Frames in which something lives."""
+    """Frames in which a Gaussian lives."""
     return [t for t in range(frames) if living(lifetimes, t).any()]
 
 

@@ -1,11 +1,11 @@
-"""Without a quality that somebody names: the one at which coding costs as many decibels as the preset allows.
+"""Quality search, for streams without a given quality: finds the quality at which coding costs the allowed decibels.
 
-What counts is the error against the pictures of the capture, so that a clean capture gets finer steps than a noisy one:
-that of a try over that of the model before coding, or over that of very fine steps, whichever is smaller. Refinement by
-the pictures lowers the error of fine steps below the model's, and would hide what coarse ones cost. The log of the
-excess falls with the quality: by that of 4 for `QUALITY_HALVES` points as a first guess (refined steps lose less), and
-between two tries on either side along their line. A try is refined by a share of the pictures that the group will be
-refined by in the end, and the first group that shows something decides for all.
+The error is measured against the pictures of the capture, so that a clean capture gets finer steps than a noisy one.
+The excess is the error of a try relative to the error of the model before coding, or to the error of very fine steps,
+whichever is smaller: refinement by the pictures lowers the error of fine steps below the model's, which would hide the
+cost of coarse ones. The log of the excess falls with the quality: by log 4 for `QUALITY_HALVES` points as a first guess
+(refined steps lose less), and by linear interpolation between two tries on either side. A try is refined by a share of
+the pictures of the final refinement. The first group with Gaussians decides for all.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from .quantize import Quantized
 
 
 def choose_quality(coder: GroupCoder, group: ParametricGroup, importance: Importance, first_frame: int) -> float | None:
-    """Quality for a stream whose first group is `group`, which has pictures (`GroupCoder.has_pictures`); None: it has
-    no Gaussians, and tells nothing.
+    """Quality for a stream whose first group is `group`, which has pictures (`GroupCoder.has_pictures`); None: the
+    group has no Gaussians.
 
     Raises:
         CaptureError: a picture cannot be read.
@@ -60,8 +60,8 @@ def _next(tried: dict[float, float]) -> float:
 
 
 def _errors(coder: GroupCoder, group: ParametricGroup, quantized: Quantized, first_frame: int) -> tuple[float, float]:
-    """Mean squared error against the pictures, of the frames before coding and of those decoded from `quantized`, where
-    the mask is not contradicted by the former."""
+    """Mean squared error against the pictures, of the frames before coding and of those decoded from `quantized`, at
+    pixels where the former do not contradict the mask."""
     s, backend, errors = coder.settings.quality_search, CpuBackend(), np.zeros(2)
     rounding = AdaptiveRounding(quantized, coder.settings)
     coder.refine_by_pictures(group, first_frame, rounding, s.frame_pictures * len(group))

@@ -1,8 +1,8 @@
 """Stage plan: importance + quality -> which Gaussians are coded, in which layer, with which steps.
 
-Gaussians that no view shows go; companding and scale exponents bend values to where errors show alike; layers gather
-Gaussians of like sensitivity; steps share out the error that the quality allows (reverse water-filling). A predicted
-group keeps the parameters of its reference, and only its births choose a layer.
+Gaussians that no view shows are removed. Companding and scale exponents map values so that equal errors are equally
+visible. Layers collect Gaussians of similar sensitivity. Steps share out the error that the quality allows (reverse
+water-filling). A predicted group keeps the parameters of its reference; only its births choose a layer.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class Grid:
 
     @staticmethod
     def around(means: np.ndarray, step: float, room: int = 0) -> Grid:
-        """The lattice that holds `means` [N, 3], and 2^room of it along each axis."""
+        """The lattice that holds `means` [N, 3], with 2^room times their extent along each axis."""
         low = means.min(0) if len(means) else np.zeros(3)
         extent = float((means.max(0) - low).max()) if len(means) else 0.0
         finest = extent / (2 ** (GRID_BITS_MAX - room) - 2)
-        step = float(np.float32(max(step, finest)))  # far floaters: coarser, not an error
+        step = float(np.float32(max(step, finest)))  # far floaters make it coarser, not an error
         return Grid(low.astype(np.float32), step, room + max(1, int(np.ceil(extent / step + 1)).bit_length()))
 
     def to_integers(self, means: np.ndarray, shift: np.ndarray | int = 0) -> np.ndarray:
@@ -51,16 +51,16 @@ class Grid:
 
 @dataclass(frozen=True)
 class Parameters:
-    """What a predicted group shares with its reference.
+    """Parameters that a predicted group shares with its reference.
 
     Attributes:
         grid: lattice of positions.
-        steps: attribute -> [C] f32 of the first layer, of companded values; of quats times `step_factors`.
+        steps: attribute -> [C] f32 of the first layer, for companded values; for quats times `step_factors`.
         shifts: attribute -> [L] int, doublings of each layer's steps.
-        curves: attribute -> a curve for each channel, where it is companded.
+        curves: attribute -> a curve for each channel, if it is companded.
         scale_exponents: [3, 3] i32, of the steps of quats.
         trajectory_steps: attribute -> step of a value in one frame.
-        node_step: of translations of nodes, world units.
+        node_step: step of node translations, world units.
     """
 
     grid: Grid
@@ -73,19 +73,19 @@ class Parameters:
 
     @property
     def layers(self) -> int:
-        """How many layers there are."""
+        """Number of layers."""
         return len(self.shifts["means"])
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Who is coded, and how.
+    """Which Gaussians are coded, and how.
 
     Attributes:
-        index: [n] int, the Gaussians of the coded form that are coded.
+        index: [n] int, indices of the coded Gaussians in the coded form.
         layer: [n] int, the layer of each.
         importance: of each.
-        price: of a bit, in mean squared error of the picture.
+        price: of a bit, in mean squared error of the image.
         parameters: of the group.
     """
 
@@ -96,14 +96,14 @@ class Plan:
     parameters: Parameters
 
     def ordered(self, order: np.ndarray) -> Plan:
-        """The Gaussians at `order`."""
+        """The plan with the Gaussians at `order`."""
         kept = self.index[order], self.layer[order], self.importance.take(order)
         return Plan(*kept, self.price, self.parameters)
 
 
 @dataclass(frozen=True)
 class Known:
-    """Of a reference: its parameters, and of each of its n Gaussians the layer ([n] int) and the decoded logit of the
+    """A reference: its parameters, and for each of its n Gaussians the layer ([n] int) and the decoded logit of the
     opacity ([n])."""
 
     parameters: Parameters
@@ -117,7 +117,8 @@ def plan_group(
     """The plan of a group.
 
     Args:
-        importance: of all Gaussians of `form`. known: of the reference, where the group is predicted.
+        importance: of all Gaussians of `form`.
+        known: data of the reference, if the group is predicted.
     """
     error = error_for(quality)
     index = _kept(form, importance, error, settings, known)
@@ -135,8 +136,8 @@ def plan_group(
 def _kept(
     form: CodedForm, importance: Importance, error: float, settings: EncodeSettings, known: Known | None
 ) -> np.ndarray:
-    """[n] int, Gaussians that are worth coding: what matters, and survivors that show at all, since they cost nothing.
-    Those that no longer matter since they have faded would show as the reference has them: they go."""
+    """[n] int, Gaussians that are worth coding: Gaussians that matter, and survivors that show at all, since they cost
+    nothing. Survivors that have faded and no longer matter are removed: they would show as in the reference."""
     count, removal = len(form.rest), importance.removal
     if settings.keep_all:
         return np.arange(count)
@@ -154,7 +155,7 @@ def _kept(
 def _parameters(
     form: CodedForm, importance: Importance, quality: float, settings: EncodeSettings
 ) -> tuple[Parameters, np.ndarray]:
-    """Those of an independent group, and the layer of each Gaussian."""
+    """Parameters of an independent group, and the layer of each Gaussian."""
     error, radius = error_for(quality), subject_radius(form.rest)
     nominal, layers = steps_for(quality, radius), settings.layers or _usual_layers(form, settings.plan)
     over_time = importance.with_weights(quats=importance.scene_rotations)
@@ -182,8 +183,8 @@ def layer_of(importance: Importance, layers: int, settings: PlanSettings) -> np.
 
 
 def _layer_shifts(importance, layer, layers: int, room: dict, settings: PlanSettings) -> dict[str, np.ndarray]:
-    """[L] int of each attribute: how often each layer's step is doubled, by its mean sensitivity; at most `room` times,
-    since the derivative of the picture says too little farther off."""
+    """attribute -> [L] int, doublings of each layer's step, from its mean sensitivity; at most `room`, since the
+    derivative of the image does not predict the error of larger steps."""
     count = np.maximum(np.bincount(layer, minlength=layers), 1)
     shifts = {}
     for n, w in importance.weights.items():
@@ -195,7 +196,7 @@ def _layer_shifts(importance, layer, layers: int, room: dict, settings: PlanSett
 
 
 def _bent(form: CodedForm, importance: Importance, settings: EncodeSettings):
-    """Companding curves, scale exponents of rotations, and the importance of values that are coded along both."""
+    """Companding curves, scale exponents of rotations, and the importance of values that are coded with both."""
     curves = companding.fit_all(form.values, importance.weights, settings.companding)
     weights = dict(importance.weights)
     for n, own in curves.items():
@@ -207,7 +208,7 @@ def _bent(form: CodedForm, importance: Importance, settings: EncodeSettings):
 
 
 def _relative(factors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[N, C] and [C]: factors relative to the geometric mean of each channel, and that."""
+    """[N, C] factors relative to the geometric mean of each channel, and [C] that mean."""
     level = np.exp(np.log(factors).mean(0)) if len(factors) else np.ones(factors.shape[1])
     return factors / level, level
 
@@ -215,8 +216,8 @@ def _relative(factors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _steps(
     form: CodedForm, importance, error: float, nominal, radius: float, *, shifts=None, curves=None, exponents=None
 ) -> dict[str, np.ndarray]:
-    """[C] f32 step of each channel of each attribute; those of a Gaussian are 2^shifts ([N] each) times that, of quats
-    times its `step_factors`. `importance` is that of `_bent`, where there are curves and exponents."""
+    """[C] f32 step of each channel, for each attribute; a Gaussian's steps are 2^shifts ([N] each) times these, for
+    quats also times its `step_factors`. `importance` is that of `_bent` if there are curves and exponents."""
     weights = importance.weights
     if not len(importance.removal):
         return {n: np.full(w.shape[1], nominal[n], np.float32) for n, w in weights.items()}
@@ -229,5 +230,5 @@ def _steps(
 
 
 def _usual_layers(form: CodedForm, settings: PlanSettings) -> int:
-    """Layers that make a group smallest: trajectories of a Gaussian miss their neighbours in other layers."""
+    """Number of layers that makes a group smallest: in several, trajectories lose their neighbours in other layers."""
     return settings.still_layers if form.frames == 1 and len(form.rest) >= settings.still_least else 1

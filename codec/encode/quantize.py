@@ -1,8 +1,8 @@
-"""Stage quantize: coded form + plan -> QuantizedGroup. An independent and a predicted group take the same way.
+"""Stage quantize: coded form + plan -> QuantizedGroup. Independent and predicted groups take the same way.
 
-Order first: layer after layer, in each the survivors of the reference, then births in Morton order. Then canonical
-integers, rotations, nodes, trajectories. Each step works on the values that the decoder will have, so errors do not
-add up; a decoder's frames come from `_native.DecodedGroup.reconstruct`, without bytes.
+Order first: layer after layer; in each layer the survivors of the reference, then births in Morton order. Then
+canonical integers, rotations, nodes, trajectories. Each step works on the values that the decoder will have, so errors
+do not add up; decoded frames come from `_native.DecodedGroup.reconstruct`, without bytes.
 """
 
 from __future__ import annotations
@@ -26,16 +26,18 @@ from .quantize_rig import quantize_rig
 from .rotation_residuals import quantize_rotations, step_factors
 from .settings import RdoSettings
 
-NEIGHBORS = 4  # nodes that one Gaussian blends
+NEIGHBORS = 4  # nodes that are blended for one Gaussian
 ROTATION_STEP_MOST = 0.1  # radians
 
 
 @dataclass(frozen=True)
 class ReferenceGroup:
-    """What a group is predicted from.
+    """Group from which another group is predicted.
 
     Attributes:
-        integers: of it. decoded: the same as `_native.DecodedGroup`. back: how many groups before this one it is.
+        integers: of the group.
+        decoded: the same as `_native.DecodedGroup`.
+        back: distance in groups to the predicted group.
     """
 
     integers: QuantizedGroup
@@ -45,13 +47,13 @@ class ReferenceGroup:
 
 @dataclass(frozen=True)
 class Quantized:
-    """A group in integers, and what it was made of, all in the order of the integers.
+    """A group in integers, and its source, all in the order of the integers.
 
     Attributes:
         integers: the group.
-        form: what it was made of, in the orientation that is coded.
+        form: its coded form, in the orientation that is coded.
         plan: of the same Gaussians.
-        layers: span and context neighbours of what each layer codes itself.
+        layers: for each layer, span and context neighbours of the Gaussians that it codes itself.
         coefficients: attribute -> [K, C, N] f32 DCT coefficients in steps, before rounding.
     """
 
@@ -62,7 +64,7 @@ class Quantized:
     coefficients: dict[str, np.ndarray]
 
     def factors(self, attribute: str) -> np.ndarray:
-        """[N, 1] by which the steps of the first layer are multiplied for each Gaussian."""
+        """[N, 1] factor of each Gaussian on the steps of the first layer."""
         return 2.0 ** self.plan.parameters.shifts[attribute][self.plan.layer][:, None]
 
 
@@ -126,7 +128,7 @@ def _channels(form, plan, layers, reference, settings) -> dict[str, QuantizedCha
 
 
 def canonical_integers(name: str, values: np.ndarray, offsets: np.ndarray, plan: Plan, layers, settings) -> np.ndarray:
-    """[C, N] i32 for companded values [N, C], of what the layers code themselves; 0 elsewhere."""
+    """[C, N] i32 for companded values [N, C] of the Gaussians that the layers code themselves; 0 for the others."""
     parameters = plan.parameters
     shift, steps = parameters.shifts[name][plan.layer], parameters.steps[name]
     weights = plan.importance.weights[name] * companding.slopes(values, parameters.curves.get(name)) ** 2
@@ -145,13 +147,13 @@ def medians(values: np.ndarray) -> np.ndarray:
 
 
 def dequantize(channels: QuantizedChannels, curves: list | None) -> np.ndarray:
-    """[N, C] f64, what the decoder makes of an attribute's integers; not of quats."""
+    """[N, C] f64 values that the decoder makes of an attribute's integers; not for quats."""
     coded = channels.offsets + channels.steps * channels.values.T.astype(np.float32)
     return companding.expand(coded.astype(np.float64), curves)
 
 
 def with_rotations(q: Quantized, settings: RdoSettings, reference: ReferenceGroup | None = None) -> Quantized:
-    """The same with integers for the rotations of births, whose steps follow the decoded sizes."""
+    """`q` with integers for the rotations of births, whose steps follow from the decoded sizes."""
     plan, channels = q.plan, q.integers.channels["quats"]
     sizes = dequantize(q.integers.channels["log_scales"], plan.parameters.curves.get("log_scales"))
     steps = np.minimum(channels.steps * step_factors(sizes, plan.parameters.scale_exponents), 1) * q.factors("quats")
@@ -167,7 +169,7 @@ def with_rotations(q: Quantized, settings: RdoSettings, reference: ReferenceGrou
 
 
 def _with_motion(q: Quantized, settings: RdoSettings, reference: ReferenceGroup | None) -> Quantized:
-    """The same with nodes, and with trajectories for what canonical values and nodes leave over."""
+    """`q` with nodes, and with trajectories for the residual of canonical values and nodes."""
     form, plan = q.form, q.plan
     if not len(form.rest):
         return q
@@ -187,9 +189,9 @@ def _with_motion(q: Quantized, settings: RdoSettings, reference: ReferenceGroup 
 
 
 def _residual_coefficients(form: CodedForm, integers: QuantizedGroup, plan: Plan, decoded) -> dict[str, np.ndarray]:
-    """attribute -> [K, C, N] f32 DCT coefficients of the form, less what the decoder has without trajectories.
+    """attribute -> [K, C, N] f32 DCT coefficients of the form, less the decoded values without trajectories.
 
-    Rotations are compared before their rounding: trajectories are for what moves, not for what steps leave.
+    Rotations are compared before their rounding: trajectories code motion, not rounding errors.
     """
     frames = form.frames
     carried, rotations = decoded.carried()
@@ -209,8 +211,8 @@ def _residual_coefficients(form: CodedForm, integers: QuantizedGroup, plan: Plan
 
 
 def _quantize_nodes(form: CodedForm, positions: np.ndarray, plan: Plan, settings: RdoSettings) -> QuantizedNodes:
-    """The nodes of a group whose Gaussians rest at `positions` [N, 3] u32. Rotations first; translations then make up
-    for the rounding of the rotations, one solution for all frames and axes."""
+    """The nodes of a group whose Gaussians rest at `positions` [N, 3] u32. Rotations first; translations then
+    compensate the rounding of the rotations, in one least-squares solution for all frames and axes."""
     from scipy.spatial import cKDTree
 
     nodes, grid, price, frames = form.nodes, plan.parameters.grid, plan.price, form.frames
@@ -249,7 +251,7 @@ def _quantize_nodes(form: CodedForm, positions: np.ndarray, plan: Plan, settings
 
 
 def _node_weights(index, share, x, places, weights) -> tuple[np.ndarray, np.ndarray]:
-    """[M, 3] sensitivities of translations and of rotations of nodes at `places`, from those of the means [N, 3] of the
+    """Sensitivities [M, 3] of translations and of rotations of nodes at `places`, from those of the means [N, 3] of the
     Gaussians at x [N, 3] that blend nodes `index` by `share` ([N, k])."""
     own = share.astype(np.float64) ** 2 * weights.mean(1, keepdims=True)
     away = ((x[:, None] - places[index]) ** 2).sum(2)
@@ -258,7 +260,7 @@ def _node_weights(index, share, x, places, weights) -> tuple[np.ndarray, np.ndar
 
 
 def _rotation_step(step: float, distance: np.ndarray) -> float:
-    """Radians: an error of one rotation step at the usual distance from a node moves a Gaussian by one `step`."""
+    """Radians: at the RMS distance from a node, an error of one rotation step moves a Gaussian by one `step`."""
     arm = np.sqrt((distance**2).mean()) if len(distance) else 0.0
     return float(np.float32(min(step / max(arm, 1e-12), ROTATION_STEP_MOST)))
 

@@ -1,4 +1,4 @@
-"""A rig in floats -> its integers. What it then predicts, which the nodes build on, is decode/parametric.rig_motion."""
+"""A rig in floats -> its integers. The prediction from them, on which nodes build, is decode/parametric.rig_motion."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from ..model.rig import RigMotion
 from ..model.temporal_transform import dct_basis
 from .quantization_plan import Grid
 
-ARM = 0.25  # of the extent of the skeleton: how far from a joint an error of a step is one of the nodes' step
+ARM = 0.25  # of the extent of the skeleton: arm at which one rotation step moves a node by one translation step
 ROTATION_STEP_MOST = 0.05  # radians
-JOINT_STEP = 1.4  # of the step of the nodes, which take up what the joints leave
+JOINT_STEP = 1.4  # of the step of the nodes, which code the residual of the joints
 MAX_VALUE = 2**24
 
 
 def quantize_rig(rig: RigMotion, grid: Grid, step: float) -> QuantizedRig:
-    """The integers of a rig of a group on `grid`; `step`: of translations of nodes, world units."""
+    """Quantizes the rig of a group on `grid`; `step`: step of node translations, world units."""
     step = float(np.float32(JOINT_STEP * step))
     extent = float(np.ptp(rig.joints, axis=0).max(initial=0.0))
     rotation_step = float(np.float32(min(step / max(ARM * extent, 1e-12), ROTATION_STEP_MOST)))

@@ -1,8 +1,8 @@
-"""Bits per second -> a quality for each group: tries until a group fits what the groups before it have left over.
+"""Bits per second -> a quality for each group: tries until a group fits the bits that earlier groups have left.
 
-Nothing ahead is looked at, so a live encoder can do the same; what a group takes too much or too little, the next one
-gets less or more. The logarithm of the size is nearly linear in quality, so that two or three tries are enough. A group
-is measured once; a try repeats only what depends on quality.
+There is no look-ahead, so a live encoder can do the same; if a group takes too many or too few bits, the next one gets
+fewer or more. The logarithm of the size is nearly linear in quality, so that two or three tries are enough. A group is
+measured once; a try repeats only the stages that depend on quality.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def code_at_rate(
         start: frames and bytes of the file so far, and the quality of the group before.
 
     Returns:
-        The group, the coder's state behind it, and its quality.
+        The group, the coder's state after it, and its quality.
     """
     frames, size, quality = start
     s, per_frame = coder.settings.rate_control, coder.settings.bitrate / 8 / coder.fps

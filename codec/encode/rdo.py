@@ -1,7 +1,7 @@
-"""Rate-distortion optimised quantization: integers that cost fewer bits where the picture hardly notices.
+"""Rate-distortion optimised quantization: integers that cost fewer bits where the image hardly changes.
 
-All choices minimise error + price * bits, where the error is the picture's mean squared error by the measured
-sensitivities (render/sensitivity.py), and the price is the error that a bit saves where steps are right. Bits are
+All choices minimise error + price * bits. The error is the mean squared error of the image by the measured
+sensitivities (render/sensitivity.py); the price is the error that a bit saves where steps are right. Bits are
 estimates: code lengths given the neighbours' prediction for canonical integers, a fixed table for trajectories.
 """
 
@@ -15,17 +15,17 @@ from .. import _native
 from ..bitstream.quantization import QUALITY_DEFAULT, error_for
 from .settings import RdoSettings
 
-RANGE = 15  # integers and predictions beyond are counted together; that of `_native.quantize_rotations`
-NEAR_WEIGHT = np.array([4, 3, 2, 2])  # of the context's neighbours (spec 7.3)
+RANGE = 15  # larger integers and predictions are counted together; as in `_native.quantize_rotations`
+NEAR_WEIGHT = np.array([4, 3, 2, 2])  # weights of the context's neighbours (spec 7.3)
 
-Layer = tuple[slice, np.ndarray]  # span of what a layer codes itself, [n, 4] neighbours of each, from its first
+Layer = tuple[slice, np.ndarray]  # span of Gaussians that a layer codes itself, [n, 4] neighbours by index within it
 
 
 def bit_price(error: float, count: int, rate_optimized: bool, settings: RdoSettings) -> float:
     """Mean squared error that one bit is worth in a group of `count` Gaussians whose target is `error`.
 
-    Where training had a rate term, it has dropped what is not worth its bits already: the finer the steps are, the
-    less there is for a second look (lumberjack, quality 60: 4 % of the bytes).
+    A rate term in training has already dropped data that is not worth its bits: the finer the steps are, the less
+    remains to drop here (lumberjack, quality 60: 4 % of the bytes).
     """
     left = settings.optimized_price * min(1.0, error / error_for(QUALITY_DEFAULT)) if rate_optimized else 1.0
     return settings.bit_price * left * error / max(count, 1)
@@ -37,8 +37,10 @@ def quantize_trajectories(
     """Integers for DCT coefficients that are worth their bits: [K', C, N] i32, 1 <= K' <= K.
 
     Args:
-        c: [K, C, N] f32 coefficients in steps. frames: of the group.
-        weights: [N, C] sensitivities, of an error of one step in all frames. price: of a bit.
+        c: [K, C, N] f32 coefficients in steps.
+        weights: [N, C] sensitivities to an error of one step in all frames.
+        frames: of the group.
+        price: of a bit.
     """
     zero, nonzero = settings.zero_bits, settings.nonzero_bits
     worth = (weights.T / frames / price).astype(np.float32)  # [C, N] bits per squared step: an error spreads over T
@@ -61,7 +63,7 @@ def quantize_trajectories(
 def trajectory_thresholds(
     q: np.ndarray, weights: np.ndarray, frames: int, price: float, settings: RdoSettings
 ) -> np.ndarray:
-    """[2, M, C], as of `decision_thresholds`, of coefficients [M, C] of trajectories, of sensitivities [M, C] in steps;
+    """[2, M, C], as `decision_thresholds`, for trajectory coefficients [M, C] with sensitivities [M, C] in steps;
     frames, price: as in `quantize_trajectories`."""
 
     def bits(q):
@@ -73,7 +75,7 @@ def trajectory_thresholds(
 
 
 def coded_layers(positions: np.ndarray, counts: list[int], births: list[int]) -> list[Layer]:
-    """What each layer codes itself: the last `births` of its `counts` Gaussians, in Morton order."""
+    """Gaussians that each layer codes itself: the last `births` of its `counts` Gaussians, in Morton order."""
     ends = np.cumsum([0, *counts])
     spans = [slice(b - born, b) for (_, b), born in zip(pairwise(ends), births, strict=True)]
     return [(own, _native.context_neighbors(np.ascontiguousarray(positions[own]))) for own in spans]
@@ -85,7 +87,9 @@ def quantize_canonical(
     """Integers for `x` [N] floats in steps.
 
     Args:
-        weights: [N] sensitivities, of an error of one step. near: [N, 4] neighbours. price: of a bit.
+        weights: [N] sensitivities to an error of one step.
+        near: [N, 4] neighbours.
+        price: of a bit.
     """
     q = np.rint(x)
     if not len(x):
@@ -108,8 +112,8 @@ def quantize_canonical(
 def decision_thresholds(
     q: np.ndarray, weights: np.ndarray, near: np.ndarray, price: float, settings: RdoSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """[N] how much farther than half a step above, and below, `q` ([N]) still is the better integer, in steps: what the
-    next one costs more. Other arguments are those of `quantize_canonical`."""
+    """[N] each: distance beyond half a step, above and below, up to which `q` ([N]) still is the better integer, in
+    steps, since the next one costs more bits. Other arguments are those of `quantize_canonical`."""
     if not len(q):
         return q, q
     context = _contexts(q, near)
@@ -143,6 +147,6 @@ def _code_lengths(context: np.ndarray, q: np.ndarray, settings: RdoSettings) -> 
     side = 2 * RANGE + 1
     level = np.clip(q, -RANGE, RANGE).astype(int)
     counts = np.bincount((context + RANGE) * side + level + RANGE, minlength=side * side).reshape(side, side)
-    # A rare context counts like all contexts together.
+    # A rare context has the statistics of all contexts together.
     counts = counts + settings.context_prior * (counts.sum(0) + 0.02) / (counts.sum() + 1)
     return -np.log2(counts / counts.sum(1, keepdims=True))

@@ -1,9 +1,9 @@
-"""Appearance over the geometry of a coded group: its integers + new colours -> integers.
+"""New colours on the geometry of a coded group: its integers + new colours -> integers.
 
 Positions, sizes, rotations, opacities, motion and lifetimes keep their integers, and so their bytes: each stream of a
-tile is coded by itself, in contexts of the nearest positions (spec 7). Colours are quantized anew, in the steps and
-layers that the group has. Survivors of a predicted group have the canonical colours of its reference; what differs is
-in the constant part of their trajectories.
+tile is coded by itself, in contexts of the nearest positions (spec 7). Colours are quantized again, in the steps and
+layers of the group. Survivors of a predicted group have the canonical colours of its reference; the difference is in
+the constant part of their trajectories.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ def recolored(
     """The integers of `old` with the colours of `group`, not refined.
 
     Args:
-        group: what `old` decodes to, in its order, with other sh0 and shN.
-        importance: of it. reference: the recoloured group that `old` refers to; None: it is independent.
+        group: the decoded `old`, in its order, with other sh0 and shN.
+        importance: of `group`.
+        reference: the recoloured group to which `old` refers; None: it is independent.
     """
     values, trajectories = appearance(group, np.tile(np.arange(3), (len(old), 1)))
     lineage = np.full(len(old), -1) if reference is None else old.parents
@@ -69,7 +70,7 @@ def _counts(q: QuantizedGroup) -> tuple[int, ...]:
 
 
 def _births(q: QuantizedGroup, lineage: np.ndarray, plan: Plan) -> list[int]:
-    """Gaussians that each layer codes itself."""
+    """Number of Gaussians that each layer codes itself."""
     return np.bincount(plan.layer[lineage < 0], minlength=len(_counts(q))).tolist()
 
 
@@ -80,7 +81,7 @@ def _plan_of(q: QuantizedGroup, importance: Importance, settings: EncodeSettings
     shifts = dict(zip(names, shifts.T, strict=True))
     layer = np.repeat(np.arange(len(counts)), counts)
     steps = {n: q.channels[n].steps for n in COLORS if n in q.channels}
-    errors = [  # mean squared error of the picture that the steps of each channel make
+    errors = [  # mean squared error of the image that the steps of each channel cause
         (importance.weights[n] * 4.0 ** shifts[n][layer][:, None]).sum(0) * s.astype(float) ** 2 / 12
         for n, s in steps.items()
     ]
@@ -93,14 +94,14 @@ def _plan_of(q: QuantizedGroup, importance: Importance, settings: EncodeSettings
 
 
 def _step_over_time(q: QuantizedGroup, name: str, steps: np.ndarray) -> float:
-    """Step of a value in one frame: that of its trajectories; without any, a mean of the canonical ones."""
+    """Step of a value in one frame: that of its trajectories; without trajectories, a mean of the canonical steps."""
     if name in q.trajectories:
         return q.trajectories[name].step / float(np.sqrt(q.frames))
     return float(1 / np.sqrt((1 / steps.astype(np.float64) ** 2).mean()))
 
 
 def _form_of(group: ParametricGroup, lineage: np.ndarray, values: dict, trajectories: dict) -> CodedForm:
-    """The group in its coded form; only colours are asked for, so that axes stay as they are."""
+    """The group in its coded form; only colours are needed, so axes stay as they are."""
     g, n = group.canonical, len(group.canonical)
     order, turn = np.tile(np.arange(3), (n, 1)), np.tile(np.float32([1, 0, 0, 0]), (n, 1))
     means, quats = group.moved()
@@ -111,7 +112,7 @@ def _form_of(group: ParametricGroup, lineage: np.ndarray, values: dict, trajecto
 def _canonical(
     name: str, old: QuantizedGroup, values: np.ndarray, plan: Plan, layers, lineage, settings, reference
 ) -> QuantizedChannels:
-    """Canonical integers of an attribute: those of the reference for survivors."""
+    """Canonical integers of an attribute; survivors have those of the reference."""
     known = reference and reference.integers.channels[name]
     offsets = known.offsets if known else medians(values)
     q = canonical_integers(name, values, offsets, plan, layers, settings.rdo)

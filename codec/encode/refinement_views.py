@@ -1,4 +1,4 @@
-"""Drawn views: what adaptive rounding compares given splats with, from cameras that no measure of ours uses."""
+"""Drawn views: targets of adaptive rounding for given splats, rendered from cameras that no metric of gscodec uses."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ Target = tuple[int, Camera, Colour, np.ndarray]  # frame, camera, background, pi
 
 
 def drawn_views(source: Callable[[int], Gaussians], cameras: list[Camera], frames: int) -> Iterator[Target]:
-    """One view for each camera; all `frames` take turns before any one again.
+    """One view for each camera; every frame of `frames` comes once before any comes again.
 
     Args:
-        source: frame -> Gaussians as they are to look.
+        source: frame -> target Gaussians.
     """
     workspace, random = Workspace(), np.random.default_rng(0)
     rounds = [random.permutation(frames) for _ in range(0, len(cameras), frames)]

@@ -1,6 +1,6 @@
-"""A coded group with a rig -> the same in other poses: only their unit is written anew, and the bounds of tiles.
+"""A coded group with a rig -> the same in other poses: only the unit of poses and the bounds of tiles are new.
 
-What the nodes do beside the prediction stays: it is coded in the frame that the rig carries along, and follows.
+The residual motion of the nodes stays: it is coded in the local frame that the rig moves, and follows it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""A stream with other colours: groups of an old one -> groups with the same geometry and motion units.
+"""A stream with other colours: groups of an old stream -> groups with the same geometry and motion units.
 
 Each group is decoded, given new colours (of splats, or fitted to pictures), and packed again (recolor.py). All streams
-of the tiles that are no colours keep their bytes, and so do the units of the nodes.
+of the tiles except the colours keep their bytes, and so do the units of the nodes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Colors = Callable[[ParametricGroup, int], ParametricGroup]  # group, its first f
 
 @dataclass(frozen=True)
 class _Coded:
-    """A recoloured group, to which later ones may refer."""
+    """A recoloured group, to which later groups may refer."""
 
     payload: bytes
     decoded: object  # _native.DecodedGroup
@@ -48,15 +48,15 @@ def encode_recolored(
     refine_by_pictures: RefineByPictures | None = None,
     on_group: Callable[[EncodeReport], None] | None = None,
 ) -> EncodeReport:
-    """Writes the groups of `old` in the colours that `colors` gives them, behind those that `writer` has already.
+    """Writes the groups of `old` in the colours that `colors` gives them, after the groups that `writer` already has.
 
     Args:
         cameras: frame -> cameras from which sensitivity is measured.
-        refine_by_pictures: of a capture: colours move to where its pictures are met best.
+        refine_by_pictures: of a capture: moves the colours to match its pictures best.
 
     Raises:
         BitstreamError: `old` is damaged.
-        CaptureError: the colours are not those of its Gaussians.
+        CaptureError: the new colours do not fit its Gaussians.
     """
     report = EncodeReport(seconds={"input": 0.0, "code": 0.0})
     with completed(writer, report):
@@ -94,7 +94,7 @@ def _coded(payload: bytes, old: Stream, reference: ReferenceGroup | None) -> _Co
 
 
 def _known(writer: StreamWriter, old: Stream) -> dict[int, _Coded]:
-    """The groups since the last independent one that an earlier run wrote, by number."""
+    """number -> group, for the groups since the last independent one that an earlier run wrote."""
     known: dict[int, _Coded] = {}
     for i, payload in sorted((int(k), a.tobytes()) for k, a in writer.state().items()):
         back = _native.reference_of(payload)

@@ -1,4 +1,4 @@
-"""Streams that are made of the groups of another stream: its head and its sound, for new payloads."""
+"""New streams from the groups of another stream: its head and its sound, for new payloads."""
 
 from __future__ import annotations
 
@@ -22,6 +22,6 @@ def sound_of(stream: Stream) -> GroupSound | None:
 
 
 def writer_like(stream: Stream, out: Path, made_by: dict, audio: AudioTrack | GroupSound | None) -> StreamWriter:
-    """The file `out` with what the head of `stream` says, and with other sound."""
+    """A writer of the file `out` with the head of `stream` and with other sound."""
     config = {k: v for k, v in stream.config.items() if k not in ("track", "placement", "audio")}
     return StreamWriter(out, config, made_by, audio)

@@ -1,8 +1,8 @@
-"""Rotations: each is coded as the residual to the decoded one of its nearest neighbour (spec 13.1), about its own axes.
+"""Rotations: each is coded as the residual to its nearest neighbour's decoded rotation (spec 13.1), about its own axes.
 
-Where a surface is smooth its Gaussians lie alike, so residuals are small where rotations are not. A rotation about the
-longest axis hardly shows, and about the others it shows the more the longer the Gaussian is: the steps of a Gaussian
-follow from its decoded sizes, by exponents that are fitted to the measured sensitivities of the group.
+Gaussians on a smooth surface have similar rotations, so residuals are small where rotations are not. An error about the
+longest axis is hardly visible; an error about another axis is the more visible the longer the Gaussian is. So the steps
+of a Gaussian follow from its decoded sizes, by exponents that are fitted to the measured sensitivities of the group.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from .. import _native
 from . import rdo
 from .settings import RdoSettings, ScaleExponentSettings
 
-EXPONENT_UNIT = 32  # of the bitstream
+EXPONENT_UNIT = 32  # exponents of the bitstream are multiples of 1/32
 FARTHEST = 64.0  # octaves (spec 13.1)
 
 
 def fit_scale_exponents(log_scales: np.ndarray, weights: np.ndarray, settings: ScaleExponentSettings) -> np.ndarray:
-    """[3, 3] i32, how much the step of each channel falls with each size: log_scales and sensitivities are [N, 3]."""
+    """[3, 3] i32, how much each channel's step falls with each size; log_scales, weights (sensitivities): [N, 3]."""
     if len(weights) < settings.least:
         return np.zeros((3, 3), np.int32)
     sizes = np.column_stack([np.ones(len(log_scales)), log_scales])
@@ -28,7 +28,7 @@ def fit_scale_exponents(log_scales: np.ndarray, weights: np.ndarray, settings: S
 
 
 def step_factors(log_scales: np.ndarray, exponents: np.ndarray) -> np.ndarray:
-    """[N, 3] by which the steps of the channels are multiplied for each Gaussian of log_scales [N, 3]."""
+    """[N, 3] factors on the steps of the channels, for each Gaussian of log_scales [N, 3]."""
     octaves = -(log_scales @ (np.asarray(exponents, np.float32).T / EXPONENT_UNIT))
     return np.exp2(octaves.clip(-FARTHEST, FARTHEST))
 
@@ -42,12 +42,15 @@ def quantize_rotations(
     price: float,
     settings: RdoSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Integers of quats [N, 3] i32 of what the layers code themselves (0 elsewhere), and the form [N] u8 of each: 1, i,
-    j or k, by whose inverse it was multiplied from the right.
+    """Integers of quats [N, 3] i32 that the layers code themselves (0 for the others), and the form [N] u8 of each: 1,
+    i, j or k; the quaternion was multiplied by its inverse from the right.
 
     Args:
-        quats: [N, 4], axes by falling scale. steps: [N, 3] of each, sines of half an angle. positions: [N, 3] u32.
-        weights: [N, 3] sensitivities by rotations about the own axes. price: of a bit.
+        quats: [N, 4], axes by falling scale.
+        steps: [N, 3] of each Gaussian, sines of half an angle.
+        positions: [N, 3] u32.
+        weights: [N, 3] sensitivities to rotations about the own axes.
+        price: of a bit.
     """
     steps, quats = np.ascontiguousarray(steps, np.float32), np.ascontiguousarray(quats, np.float32)
     values, forms = np.zeros((len(quats), 3), np.int32), np.zeros(len(quats), np.uint8)

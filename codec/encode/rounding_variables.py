@@ -1,4 +1,4 @@
-"""Variables of adaptive rounding: the integers of one attribute, and the latents under them, in quantization steps."""
+"""Variables of adaptive rounding: the integers of one attribute and their latents, in quantization steps."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from .settings import EncodeSettings, RoundingSettings
 
 
 class Latents:
-    """Integers and the latents under them, arrays of one shape.
+    """Integers and their latents (values before rounding), arrays of one shape.
 
     Args:
-        latents: what was quantized. integers: the result.
-        thresholds: how much farther than half a step above, and below, an integer still is the better one.
+        latents: values that were quantized.
+        integers: the result.
+        thresholds: distances beyond half a step, above and below, up to which an integer still is the better one.
 
     Attributes:
         values: the latents, f32; an optimiser moves them in place.
@@ -34,11 +35,11 @@ class Latents:
 
     @property
     def now(self) -> np.ndarray:
-        """The integers as they are now."""
+        """The current integers."""
         return self.integers + self.change
 
     def round(self) -> None:
-        """Sets `change` from the latents as they are now."""
+        """Sets `change` from the current latents."""
         self.change = (self.values > self._high).astype(np.int8) - (self.values < self._low)
 
 
@@ -53,7 +54,7 @@ class CanonicalVariable:
         self._step = (self._unit * channels.steps).astype(np.float32)
         q = channels.values.T / self._unit
         coded = channels.offsets + self._step * q
-        if attribute in quantized.coefficients:  # the mean of what is left over time
+        if attribute in quantized.coefficients:  # the mean of the residual over time is part of the latent
             left = quantized.coefficients[attribute][0] - _first_coefficient(quantized, attribute)
             scale = plan.parameters.trajectory_steps[attribute]  # a coefficient's step is sqrt(T) times as large
             wanted = companding.compand(companding.expand(coded, self._curves) + scale * left.T, self._curves)
@@ -76,17 +77,17 @@ class CanonicalVariable:
         return companding.expand(self._coded(), self._curves)
 
     def add(self, values: np.ndarray, t: int) -> None:
-        """To `values` [N, C] of the decoded frame `t`, what has changed."""
+        """Adds the change since the start to `values` [N, C] of the decoded frame `t`."""
         values += self._values() - self._before if self._curves else self._step * self.latents.change
 
     def by_integers(self, derivative: np.ndarray, t: int) -> np.ndarray:
-        """The derivative by them, from that by the values of frame `t`."""
+        """The derivative by the integers, from the derivative by the values of frame `t`."""
         if not self._curves:
             return derivative * self._step
         return derivative * (self._step * companding.slopes(self._coded(), self._curves))
 
     def put(self, channels: dict, trajectories: dict) -> None:
-        """Puts the integers into those of the group."""
+        """Writes the integers into those of the group."""
         q = (self.latents.now * self._unit).astype(np.int32)
         channels[self.attribute] = replace(channels[self.attribute], values=np.ascontiguousarray(q.T))
 
@@ -98,12 +99,14 @@ def _first_coefficient(quantized: Quantized, attribute: str) -> np.ndarray | flo
 
 @dataclass(frozen=True)
 class TrajectoryVariable:
-    """DCT coefficients of an attribute, as far as those of each Gaussian go. Methods as in `CanonicalVariable`.
+    """DCT coefficients of an attribute, up to the last nonzero one of each Gaussian. Methods as in `CanonicalVariable`.
 
     Attributes:
-        latents: [M, C] integers. basis: [K, T] f32, times the step.
-        frequency, own: [M] of each the temporal frequency and the Gaussian, sorted by Gaussian.
-        starts: where those of each Gaussian begin.
+        latents: [M, C] integers.
+        basis: [K, T] f32, times the step.
+        frequency: [M] temporal frequency of each row.
+        own: [M] Gaussian of each row, sorted.
+        starts: first row of each Gaussian.
     """
 
     attribute: str
@@ -127,7 +130,7 @@ class TrajectoryVariable:
 
 
 def trajectory_variable(attribute: str, quantized: Quantized, settings: EncodeSettings) -> TrajectoryVariable:
-    """The trajectories of `attribute`, which the group has."""
+    """The variable of the trajectories of `attribute`, which the group has."""
     coded, plan = quantized.integers.trajectories[attribute], quantized.plan
     q, frames = coded.coefficients.transpose(2, 0, 1), quantized.form.frames  # [N, K, C]
     used = np.flip(np.maximum.accumulate(np.flip((q != 0).any(2), 1), 1), 1)

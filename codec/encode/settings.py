@@ -1,4 +1,4 @@
-"""What the encoder is asked for, and its hyperparameters by stage. Each is documented once, with unit and reason."""
+"""Settings of the encoder, and its hyperparameters by stage. Each is documented once, with unit and reason."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ class PlanSettings:
     """Stage plan (quantization_plan.py).
 
     Attributes:
-        level_percentiles: of log sensitivity, between which layers are even.
-        least_sensitivity: share of the mean sensitivity that every Gaussian has when layers are made.
-        still_layers: layers of a single frame of at least `still_least` Gaussians: a layer has steps of its own.
-            Trajectories would miss their neighbours in other layers, so that a moving group has one.
+        level_percentiles: of log sensitivity, between which layers are evenly spaced.
+        least_sensitivity: share of the mean sensitivity that is added to every Gaussian when layers are made.
+        still_layers: layers of a single frame of at least `still_least` Gaussians: a layer has steps of its own. A
+            moving group has one layer, since trajectories would lose their neighbours in other layers.
         shift_most: doublings of a layer's step at most.
-        prune: a Gaussian goes if the picture without it errs by less than this share of the error per Gaussian.
-        rebirth: times `prune` that a Gaussian must matter to come back after the reference left it out.
-        faded: times as opaque as now that a survivor which no longer matters was in the reference, to be left out.
-        few: Gaussians up to which there is time for `more_views`.
-        views, more_views: from which sensitivity is measured; `more_views` of small groups and single frames.
+        prune: a Gaussian is removed if the image without it has an error below this share of the error per Gaussian.
+        rebirth: factor on `prune` for Gaussians that the reference left out, to come back.
+        faded: a survivor that no longer matters is removed if it was this factor more opaque in the reference.
+        few: largest number of Gaussians for which there is time for `more_views`.
+        views: number of views from which sensitivity is measured.
+        more_views: the same for small groups and single frames.
     """
 
     level_percentiles: tuple[float, float] = (3, 97)
@@ -46,10 +47,11 @@ class CompandingSettings:
     """Curves of log_scales and logit_opacities (companding.py).
 
     Attributes:
-        least: Gaussians from which the curves save more than they take.
-        bins: of the histogram of values; tails: percentiles between which they lie.
-        steepest: how much coarser a piece may be than where the picture is most sensitive.
-        prior: Gaussians of mean sensitivity that each bin counts besides its own.
+        least: number of Gaussians from which the curves save more than they cost.
+        bins: number of bins of the histogram of values.
+        tails: percentiles of the values between which the bins lie.
+        steepest: how much coarser a piece may be than where the image is most sensitive.
+        prior: number of Gaussians of mean sensitivity that each bin counts in addition to its own.
     """
 
     least: int = 2000
@@ -65,8 +67,8 @@ class ScaleExponentSettings:
 
     Attributes:
         share: of the sensitivity's octaves that steps follow.
-        least: Gaussians from which exponents can be fitted.
-        prior: share of the mean sensitivity that all have: a few views know little of one Gaussian.
+        least: number of Gaussians from which exponents can be fitted.
+        prior: share of the mean sensitivity that is added to all: a few views measure one Gaussian poorly.
     """
 
     share: float = 0.5
@@ -79,14 +81,15 @@ class RdoSettings:
     """Rate-distortion optimised quantization (rdo.py).
 
     Attributes:
-        bit_price: of a bit, in units of the picture's error per Gaussian.
-        optimized_price: share of that where training had a rate term, which has dropped what is not worth its bits.
-        floor: share of the mean sensitivity that all Gaussians have: a few views know little of one, and errors that
-            agree add up.
-        zero_bits, nonzero_bits: of a coefficient of a trajectory that is 0, or +-1.
-        length_bits: of one more temporal frequency.
+        bit_price: of a bit, in units of the image's error per Gaussian.
+        optimized_price: share of `bit_price` if training had a rate term, which has dropped data not worth its bits.
+        floor: share of the mean sensitivity that is added to all Gaussians: a few views measure one Gaussian poorly,
+            and errors of the same sign add up.
+        zero_bits: bits of a trajectory coefficient that is 0.
+        nonzero_bits: bits of a trajectory coefficient that is +-1.
+        length_bits: bits of one more temporal frequency.
         passes: over canonical integers, whose contexts depend on each other.
-        threshold_range: how far a decision threshold may lie beyond half a step, in steps.
+        threshold_range: range of a decision threshold beyond half a step, in steps.
         context_prior: counts that a context takes from all contexts together.
     """
 
@@ -106,12 +109,13 @@ class RoundingSettings:
     """Stage refine: adaptive rounding (adaptive_rounding.py).
 
     Attributes:
-        adam: of the latents; epsilon is in the sum of squared differences by a step: what changes less stays, since its
-            square may be 0 in f32.
-        inside: steps by which a latent starts within the interval of its integer, at least.
-        sizes_until: share of the targets by which sizes move, and the rotations still differ from those that are coded.
-        drawn_rate: steps that the first drawn view moves a latent, times the root of the number of views.
-        frame_views: drawn views a frame by which a small group of splats is refined; still_views: of a single frame.
+        adam: of the latents; epsilon is in the sum of squared differences by a step: latents with a smaller gradient
+            stay, since its square may be 0 in f32.
+        inside: least distance, in steps, of a latent's start from the ends of the interval of its integer.
+        sizes_until: share of the targets for which sizes move; until then the rotations differ from the coded ones.
+        drawn_rate: steps by which the first drawn view moves a latent, times the root of the number of views.
+        frame_views: drawn views per frame by which a small group of splats is refined.
+        still_views: drawn views of a single frame.
     """
 
     adam: AdamSettings = field(default_factory=lambda: AdamSettings(eps=1e-6))
@@ -130,7 +134,7 @@ class RateControlSettings:
         slope: of log size against quality, on the statue and on trained captures.
         tolerance: of a group's size, as a share.
         tries: at most.
-        least_budget: share of the mean budget that a group has, however much the groups before it took.
+        least_budget: share of the mean budget that a group has at least, whatever the groups before it took.
     """
 
     slope: float = 0.036
@@ -141,15 +145,19 @@ class RateControlSettings:
 
 @dataclass(frozen=True)
 class QualitySearchSettings:
-    """Quality that follows a capture (quality_search.py).
+    """Search for the quality by the pictures of a capture (quality_search.py).
 
     Attributes:
-        start: first try; lowest, highest: bounds. tries: at most.
-        finest: very fine steps, with which coding is said to cost nothing.
-        tolerance: of the excess of the squared error, as a log ratio. excess_min: below it, it is noise.
-        frame_pictures: pictures a frame by which a try is refined.
-        mask_error_max: difference of alpha by which model and mask contradict each other: such a pixel says nothing.
-        judged: pictures by which it is judged, at least one a frame. seed: of their order.
+        start: first try.
+        lowest, highest: bounds.
+        tries: at most.
+        finest: quality of very fine steps, at which coding counts as free.
+        tolerance: of the excess of the squared error, as a log ratio.
+        excess_min: smaller excess is noise.
+        frame_pictures: pictures per frame by which a try is refined.
+        mask_error_max: difference of alpha at which model and mask contradict each other: such pixels do not count.
+        judged: pictures by which a try is judged, at least one per frame.
+        seed: of their order.
     """
 
     start: float = 56.0
@@ -167,21 +175,21 @@ class QualitySearchSettings:
 
 @dataclass(frozen=True)
 class EncodeSettings:
-    """What the encoder is asked for.
+    """Settings of the encoder.
 
     Attributes:
-        quality: 0 (small) to 100 (fine); 50 is about 41 dB against the input. None: of a capture, that at which coding
-            costs `loss`; of splats, 50.
-        loss: decibels that coding may cost against the pictures of a capture, where no quality is named.
-        bitrate: bits per second that the whole file is to have, instead of one quality; None: `quality` it is.
+        quality: 0 (small) to 100 (fine); 50 is about 41 dB against the input. None: for a capture, the quality at which
+            coding costs `loss`; for splats, 50.
+        loss: decibels that coding may cost against the pictures of a capture, if no quality is given.
+        bitrate: target of the whole file in bits per second, instead of one quality; None: `quality` is used.
         keep_all: also code Gaussians that are never visible.
         random_access: frames from one independent group to the next at most; the groups between are predicted from it
-            where their parents are known and it is cheaper. 0 or 1: every group is independent.
-        layers: layers of importance in each group, each with its own steps; any first few decode alone. None: what is
-            smallest.
+            if their parents are known and it is cheaper. 0 or 1: every group is independent.
+        layers: number of layers of importance in each group, each with its own steps; the first k layers decode without
+            the others. None: the number with the smallest size.
         refine: views by which each group is refined; 0: none is. None: as many as usually pay (docs/encoding.md).
-        doubt: a predicted group of more than this share of its reference's bytes is coded both ways.
-        plan, companding, scale_exponents, rdo, rounding, rate_control: hyperparameters of the stages.
+        doubt: a predicted group larger than this share of its reference's bytes is coded both ways.
+        quality_search, plan, companding, scale_exponents, rdo, rounding, rate_control: hyperparameters of the stages.
     """
 
     quality: float | None = None

@@ -1,8 +1,8 @@
-"""A coded track -> tracks of some of its Gaussians each. Integers are picked, not made again.
+"""A coded track -> tracks with some of its Gaussians each. Integers are copied, not quantized again.
 
-All but rotations stay as they are, and so does what is decoded of them: every Gaussian keeps its grid, its steps and
-the nodes that carry it. A rotation is coded as the residual to that of a neighbour (spec 13.1), which may be in another
-track: it is rounded once more, by its own steps.
+All integers except rotations stay, and so do their decoded values: every Gaussian keeps its grid, its steps and the
+nodes that carry it. A rotation is coded as the residual to that of a neighbour (spec 13.1), which may be in another
+track: so rotations are rounded once more, by their own steps.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from .rotation_residuals import step_factors
 
 
 def can_split(stream: Stream) -> bool:
-    """Whether its groups have one layer each: a layer of a part could be empty."""
+    """Whether the groups of `stream` have one layer each; with more, a layer of a part could be empty."""
     return all(len(stream.group(i).layers) == 1 for i in range(len(stream.groups)))
 
 
 def split_stream(stream: Stream, labels: list[np.ndarray], outs: list[Path]) -> None:
-    """Writes the Gaussians of `stream` with label k ([N] of each group) as the stream outs[k]. The first one has its
+    """Writes the Gaussians of `stream` with label k ([N] of each group) as the stream outs[k]. The first one has the
     sound."""
     whole = hashlib.sha256(stream.bytes_at(0, stream.file_size)).hexdigest()[:16]
     for k, out in enumerate(outs):
         writer = writer_like(stream, out, {"whole": whole, "part": k}, None if k else sound_of(stream))
-        there = writer.groups  # of a run that was stopped
+        there = writer.groups  # groups of an interrupted run
         parts: list[tuple[np.ndarray, QuantizedGroup, object] | None] = []
         for i, own in enumerate(labels):
             decoded, back = stream.group(i), stream.group(i).reference
@@ -51,7 +51,7 @@ def _picked(q: QuantizedGroup, decoded, index: np.ndarray, reference: tuple | No
     """The Gaussians at `index` of a group of one layer.
 
     Args:
-        reference: index, integers and decoded form of the part that a predicted one refers to.
+        reference: index, integers and decoded form of the reference's part, if the group is predicted.
     """
     channels = {n: replace(c, values=np.ascontiguousarray(c.values[:, index])) for n, c in q.channels.items()}
     trajectories = {}
@@ -74,15 +74,15 @@ def _picked(q: QuantizedGroup, decoded, index: np.ndarray, reference: tuple | No
 
 
 def _parents(parents: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Parents by their place in the part of the reference, which has its Gaussians `reference`."""
+    """Parents as indices in the reference's part, which has the Gaussians `reference` of the whole reference."""
     place = np.full(max(parents.max(initial=-1), reference.max(initial=-1)) + 2, -1)
     place[reference] = np.arange(len(reference))
-    return place[parents].astype(np.int32)  # a birth, -1, takes the last one, which is -1
+    return place[parents].astype(np.int32)  # a birth, -1, indexes the last entry, which is -1
 
 
 def _nodes(q: QuantizedGroup, index: np.ndarray) -> QuantizedNodes | None:
-    """The nodes that carry the Gaussians at `index`: the nearest ones of each, and the next one, whose distance their
-    weights depend on (spec 13.2)."""
+    """The nodes that carry the Gaussians at `index`: the nearest nodes of each, and the next nearest one, on whose
+    distance their weights depend (spec 13.2)."""
     if q.nodes is None or not len(index):
         return None
     positions = np.ascontiguousarray(q.positions[index])
@@ -92,8 +92,8 @@ def _nodes(q: QuantizedGroup, index: np.ndarray) -> QuantizedNodes | None:
 
 
 def _with_rotations(part: QuantizedGroup, quats: np.ndarray, reference: QuantizedGroup | None) -> QuantizedGroup:
-    """The part with integers for the rotations [N, 4] that it has in the whole; of survivors with those of the
-    reference."""
+    """The part with integers for its rotations `quats` [N, 4], as they are in the whole; survivors have the integers of
+    the reference."""
     channels, sizes = part.channels["quats"], part.channels["log_scales"]
     curves = None if sizes.companding is None else [Curve.of(row) for row in sizes.companding]
     steps = np.minimum(channels.steps * step_factors(dequantize(sizes, curves), part.scale_exponents), 1)

@@ -1,9 +1,9 @@
 """Subjects of a coded track: the parts of its Gaussians that never touch each other.
 
-Decoded groups -> a label for each Gaussian of each group. Two Gaussians belong together where they are neighbours and
-stay near in every frame in which both are there; connected components of that are subjects. So two men who stand apart
-are two, and a ball is its own if it leaves the hand. Groups that are predicted from each other share their Gaussians;
-behind them, each part takes the label of what was nearest to it, and there are no more subjects than at first.
+Decoded groups -> a label for each Gaussian of each group. Two Gaussians are connected if they are neighbours and stay
+near in every frame in which both exist; connected components are subjects. So two men who stand apart are two subjects,
+and a ball is a subject if it leaves the hand. Groups that are predicted from each other share their Gaussians; in the
+next independent group, each part takes the label of the Gaussians nearest to it; the number of subjects does not grow.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ import numpy as np
 from ..bitstream.quantization import subject_radius
 from ..decode.stream import Stream
 
-NEIGHBORS = 12  # of which each Gaussian may be connected to some
-REACH = 0.1  # of the radius of the track, how far apart two may be that belong together (basketball: 0.04 to 0.3 do)
-SPACING = 3.0  # times the usual distance of the nearest Gaussian, at least that far
-MOST = 8  # subjects; if there are more, the track falls into pieces that are none
-SHARE_LEAST = 0.02  # of the Gaussians that a subject has
+NEIGHBORS = 12  # nearest Gaussians that a Gaussian may be connected to
+REACH = 0.1  # of the radius of the track, largest distance of connected Gaussians (basketball: 0.04 to 0.3 work)
+SPACING = 3.0  # times the median distance of the nearest Gaussian, lower bound of that distance
+MOST = 8  # subjects; with more, the parts of the track are no subjects
+SHARE_LEAST = 0.02  # least share of the Gaussians in a subject
 
 
 @dataclass(frozen=True)
 class _Group:
-    """A group of a stream: its means [T, N, 3], and [N] identities, which groups that are predicted share."""
+    """A group of a stream: its means [T, N, 3], and identities [N], shared by groups predicted from each other."""
 
     means: np.ndarray
     identities: np.ndarray
 
 
 def find_subjects(stream: Stream) -> list[np.ndarray]:
-    """Labels [N] of each group, the largest subject of the first groups first; all 0 where there is one."""
+    """Labels [N] of each group; 0 is the largest subject of the first groups. All 0 if there is one subject."""
     reach = None
     found: list[np.ndarray] = []
     last: tuple[np.ndarray, np.ndarray] | None = None  # means and labels in the frame before
@@ -47,7 +47,7 @@ def find_subjects(stream: Stream) -> list[np.ndarray]:
 
 
 def _segments(stream: Stream):
-    """An independent group and those behind it that share Gaussians with it, one list after the other."""
+    """Yields lists of groups: an independent group and the groups after it that are predicted from it."""
     segment: list[_Group] = []
     for i, (group, identities) in enumerate(zip(stream.sequence().groups, stream.identities(), strict=True)):
         if segment and stream.group(i).reference == 0:
@@ -59,7 +59,7 @@ def _segments(stream: Stream):
 
 
 def _reach(means: np.ndarray) -> float:
-    """World units, from the size of a track and from how dense it is; `means`: [N, 3]."""
+    """Largest distance of connected Gaussians, world units, from size and density of a track; `means`: [N, 3]."""
     from scipy.spatial import cKDTree
 
     if len(means) < 2:
@@ -68,7 +68,7 @@ def _reach(means: np.ndarray) -> float:
 
 
 def _components(segment: list[_Group], reach: float) -> list[np.ndarray]:
-    """[N] component of each Gaussian of each group, numbers from 0 on, without those that are too small."""
+    """[N] component of each Gaussian of each group, numbers from 0 on, without components that are too small."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -103,7 +103,7 @@ def _pairs(g: _Group, own: np.ndarray) -> np.ndarray:
 
 
 def _without_small(labels: np.ndarray, segment: list[_Group], ids: list[np.ndarray]) -> np.ndarray:
-    """[identities] 0, 1 .. for the large components; others join the nearest large one, where they come first."""
+    """[identities] 0, 1 .. for the large components; others join the nearest large one in the first group with them."""
     from scipy.spatial import cKDTree
 
     counts = np.bincount(labels)
@@ -119,7 +119,7 @@ def _without_small(labels: np.ndarray, segment: list[_Group], ids: list[np.ndarr
 
 
 def _by_size(labels: list[np.ndarray]) -> np.ndarray:
-    """[components] label: 0 for the one with the most Gaussians."""
+    """[components] label: 0 for the component with the most Gaussians."""
     counts = np.bincount(np.concatenate(labels), minlength=1)
     rank = np.empty(len(counts), int)
     rank[np.argsort(-counts, kind="stable")] = np.arange(len(counts))
@@ -127,7 +127,7 @@ def _by_size(labels: list[np.ndarray]) -> np.ndarray:
 
 
 def _by_place(labels: np.ndarray, means: np.ndarray, before: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """[components] label that most of the nearest Gaussians `before` [M, 3] have, by `known` [M]."""
+    """[components] label of most of the nearest Gaussians `before` [M, 3], whose labels are `known` [M]."""
     from scipy.spatial import cKDTree
 
     count = int(labels.max(initial=0)) + 1

@@ -1,5 +1,5 @@
-"""Tracks of .gsv files -> one file: mux, and edits that code nothing anew. Every unit stays byte-identical, but for the
-poses of a track with a rig that is posed anew.
+"""Tracks of .gsv files -> one file: mux, and edits without re-encoding. Every unit stays byte-identical, except the
+poses of a track with a rig that gets new poses.
 
 A `TrackPlan` says which groups of which files a track consists of, and where it is placed. Only boxes are written: moov
 with the placements, an index of each track, and the fragments, whose times follow from their order.
@@ -24,7 +24,7 @@ from ..model.rig import Rig
 from .reposing import reposed
 from .writer import layer_ends
 
-SAME = ("fps", "color_space", "up", "metres_per_unit")  # of tracks that are joined
+SAME = ("fps", "color_space", "up", "metres_per_unit")  # config fields that joined tracks must share
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,10 @@ class TrackPlan:
     """A track to write.
 
     Attributes:
-        config: gsvC, of `_native.init_segment`.
+        config: gsvC, as `_native.init_segment` takes it.
         placement: gsvT.
         groups: (file, number of the group in it) in playing order.
-        rig: other poses for all of their frames; None: as they are.
+        rig: new poses for all of their frames; None: unchanged.
     """
 
     config: dict
@@ -50,20 +50,20 @@ class TrackPlan:
 
     @property
     def has_sound(self) -> bool:
-        """Whether sound comes with its groups."""
+        """Whether a group has sound."""
         return any("audio" in stream.groups[i] for stream, i in self.groups)
 
     @staticmethod
     def of(track: Track) -> TrackPlan:
-        """A track of a file as it is."""
+        """The plan of a track of a file, unchanged."""
         config = {k: v for k, v in track.stream.config.items() if k not in ("track", "placement")}
         return TrackPlan(config, track.placement, [(track.stream, i) for i in range(len(track.stream.groups))])
 
     def joined(self, other: TrackPlan) -> TrackPlan:
-        """This track, then the other one. Sound stays where both have the same form of it.
+        """This track, then the other one. Sound stays if both have the same form of it.
 
         Raises:
-            UsageError: frame rates, axes or the like differ.
+            UsageError: a field of `SAME` differs, such as the frame rate or the up axis.
         """
         for key in SAME:
             if self.config[key] != other.config[key]:
@@ -76,10 +76,10 @@ class TrackPlan:
         return replace(self, config=config, groups=[*self.groups, *other.groups])
 
     def cut(self, ranges: Sequence[range]) -> TrackPlan:
-        """The frames `ranges`, which begin and end with groups, one range behind the other.
+        """The frames of `ranges`, one range after the other; each must begin and end with groups.
 
         Raises:
-            UsageError: a range does not, or leaves out a group from which one of its groups is predicted.
+            UsageError: a range does not begin and end with groups. (`check` looks for lost references.)
         """
         starts = [0]
         for stream, i in self.groups:
@@ -108,8 +108,8 @@ class TrackPlan:
 
 
 def write_tracks(out: Path, plans: Sequence[TrackPlan]) -> int:
-    """Writes a file of these tracks; returns its bytes. Sound is that of the first track, and cameras that all have are
-    written with it alone.
+    """Writes a file of these tracks; returns its size in bytes. Sound is that of the first track; cameras that equal
+    those of the first track are written with it alone.
 
     Raises:
         UsageError: there is no track, a predicted group has lost its reference, or a group to be posed has no rig.
@@ -158,7 +158,7 @@ def _write_groups(f, plan: TrackPlan, config: dict, number: int) -> list[tuple[i
 
 
 def _sound(stream: Stream, g: dict, start: int, config: dict) -> tuple | None:
-    """The sound in front of a group that begins at frame `start` from now on."""
+    """Media time, samples and bytes of the sound of a group that now begins at frame `start`; None: no sound."""
     if "audio" not in config or "audio" not in g:
         return None
     offset, time, samples = g["audio"]

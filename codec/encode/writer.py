@@ -1,9 +1,9 @@
 """The growing file: group payloads -> OUT.gsv.part, playable at any moment, then OUT.gsv with its index.
 
-OUT.gsv.part holds the init segment and whole fragments; OUT.gsv.part.json says what made it, so that a second run goes
-on where the first one stopped, and only if input and settings are the same; OUT.gsv.part.N.npz is what the coder knows
-after N groups. It is there before group N is, and until group N + 1 is, so that a run killed at any moment can go on.
-`finish` writes the indexed file beside it and renames; a file under the final name is always complete.
+OUT.gsv.part holds the init segment and whole fragments. OUT.gsv.part.json holds the fingerprint: a second run continues
+where the first one stopped only if input and settings are the same. OUT.gsv.part.N.npz holds the coder's state after N
+groups; it exists from before group N is written until group N + 1 is written, so that a run killed at any moment can
+continue. `finish` writes the indexed file beside it and renames; a file under the final name is always complete.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class StreamWriter:
 
     Args:
         out: final path.
-        config: of `_native.init_segment` (fps, level, cameras, ...).
-        fingerprint: whatever must be equal for two runs to make the same groups (JSON-able).
-        audio: sound, whose samples go in front of the groups in whose frames they begin.
+        config: as `_native.init_segment` takes it (fps, level, cameras, ...).
+        fingerprint: data that must be equal for two runs to make the same groups (JSON-able).
+        audio: sound; its samples are written in front of the group in whose frames they begin.
     """
 
     def __init__(self, out: Path, config: dict, fingerprint: dict, audio: AudioTrack | None = None):
@@ -45,7 +45,7 @@ class StreamWriter:
         self.part = self.out.with_name(self.out.name + ".part")
         self._made_by = self.out.with_name(self.out.name + ".part.json")
         self.init = _native.init_segment(config)
-        self._fps = _native.demux(self.init)["config"]["fps"]  # exactly
+        self._fps = _native.demux(self.init)["config"]["fps"]  # as an exact fraction
         self.fragments: list[tuple[int, int, bool, list[int]]] = []  # size, frames, sync, bytes up to each layer's end
         fingerprint = json.loads(json.dumps(fingerprint))
         if not self._resume(fingerprint):
@@ -97,12 +97,12 @@ class StreamWriter:
         return self.out.with_name(f"{self.out.name}.part.{groups}.npz")
 
     def state(self) -> dict[str, np.ndarray]:
-        """What `append` was told after the last group; empty where there is none, or no longer."""
+        """`state` of the last `append`; {} if there is none, or no longer."""
         return read_arrays(self._state(self.groups)) or {}
 
     def append(self, payload: bytes, frames: int, *, sync: bool = True, state: dict[str, np.ndarray] | None = None):
-        """Writes one group of `frames` frames; it is written when this returns. `state`: what `state` is to give to a
-        run that goes on behind it."""
+        """Writes one group of `frames` frames; it is written when this returns. `state`: arrays that `state` returns to
+        a run that continues after this group."""
         if state is not None:
             write_arrays(self._state(self.groups + 1), state)
         audio = self._audio and self._audio.between(self.frames, self.frames + frames, self._fps)
@@ -114,12 +114,12 @@ class StreamWriter:
         self._state(self.groups - 1).unlink(missing_ok=True)
 
     def _forget(self) -> None:
-        """Removes what a later run could go on from."""
+        """Removes the files from which a later run could continue."""
         for path in self.out.parent.glob(f"{escape(self.part.name)}*"):
             path.unlink(missing_ok=True)
 
     def finish(self, *, keep_part: bool = False) -> None:
-        """Writes OUT.gsv: init segment, index, fragments. `keep_part` leaves what a later run needs to go on."""
+        """Writes OUT.gsv: init segment, index, fragments. `keep_part` keeps the files for a later run."""
         self._file.close()
         os.truncate(self.part, self.bytes)  # Ctrl-C may have come in the middle of a fragment
         indexed = self.out.with_name(self.out.name + ".indexed")
@@ -132,16 +132,16 @@ class StreamWriter:
             self._forget()
 
     def close(self) -> None:
-        """Leaves the .part as it is."""
+        """Closes the .part and leaves it as it is."""
         self._file.close()
 
     def abandon(self) -> None:
-        """After a failure: leaves the .part, from which a later run goes on, but removes it where it has no group."""
+        """After a failure: keeps the .part, from which a later run continues, but removes it if it has no group."""
         self.close()
         if not self.groups:
             self._forget()
 
 
 def layer_ends(units: list[dict]) -> list[int]:
-    """Bytes of a payload that end with each layer."""
+    """Bytes of a payload up to the end of each layer."""
     return [max(u["offset"] + u["bytes"] for u in units if u["layer"] <= k) for k in range(units[-1]["layer"] + 1)]

@@ -1,4 +1,4 @@
-"""Foreign splats -> ParametricGroup: nodes and trajectories. The counterpart of train/ for what others trained."""
+"""Splats of other tools -> ParametricGroup: nodes and trajectories. The counterpart of train/ for them."""
 
 from .fit import fit_groups
 

@@ -39,7 +39,7 @@ class DenseStack:
         return len(self.frames.means)
 
     def held(self, a: np.ndarray) -> np.ndarray:
-        """[T, N, ...] of these Gaussians; outside a lifetime it repeats the nearest frame inside."""
+        """Values [T, N, ...] of these Gaussians; outside a lifetime they repeat the nearest frame inside."""
         if self.lifetimes is None:
             return a
         return a[self.nearest_frame(np.arange(len(a))[:, None]), np.arange(a.shape[1])]
@@ -56,7 +56,7 @@ class DenseStack:
 
 
 def _continuous(quats: np.ndarray) -> np.ndarray:
-    """[T, N, 4], each with the sign that is nearer to the frame before; from the middle on both ways."""
+    """[T, N, 4], each with the sign nearer to its neighbour in time, from the middle frame outwards."""
     quats, middle = quats.copy(), len(quats) // 2
     for t in [*range(middle + 1, len(quats)), *range(middle - 1, -1, -1)]:
         before = quats[t - 1] if t > middle else quats[t + 1]

@@ -1,7 +1,7 @@
-"""Dense groups -> ParametricGroups: index i is the same Gaussian in all frames of a group, how it moves is found.
+"""Dense groups -> ParametricGroups: index i is the same Gaussian in all frames of a group; its motion is estimated.
 
-A group that continues another (`DenseGroup.parents`) rests where the first group of its segment does, so that the
-encoder can predict it from there. Nothing is lost: trajectories have all T frequencies.
+A group that continues another one (`DenseGroup.parents`) has the rest positions of the first group of its segment, so
+that the encoder can predict it from that group. Nothing is lost: trajectories have all T frequencies.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ def fit_groups(
     quality: float = 50.0,
     rig: Rig | None = None,
 ) -> Iterator[ParametricGroup]:
-    """Yields the groups from `start` on; those that are parametric already as they are.
+    """Yields the groups from `start` on; parametric groups unchanged.
 
     Args:
-        random_access: frames from one independent group to the next at most; 0 or 1: every group rests by itself.
+        random_access: frames from one independent group to the next at most; 0 or 1: all groups rest by themselves.
         quality: of the stream (0 to 100); it decides how many nodes pay.
         rig: with poses of all frames of `groups`, predicts the motion of groups that are fitted.
     """
@@ -61,12 +61,12 @@ def fit_groups(
 
 
 def _predicted(rig: Rig, at_rest: int, frames: range, places: np.ndarray) -> RigMotion:
-    """What a rig says of nodes at `places` [M, 3], which rest as they are in a frame."""
+    """Motion that a rig predicts for nodes at `places` [M, 3], which rest as they are in frame `at_rest`."""
     return rig.motion(skin_weights(rig, at_rest, places), at_rest, frames)
 
 
 def _segment_start(groups, start: int, random_access: int) -> int:
-    """The last group up to `start` that no group before it is needed for."""
+    """The last group up to `start` that needs no group before it."""
     first, since = 0, 0
     for i in range(start + 1 if start < len(groups) else 0):
         group = groups[i]
@@ -79,12 +79,12 @@ def _segment_start(groups, start: int, random_access: int) -> int:
 def fit_group(
     group: DenseGroup, *, quality: float = 50.0, rest: np.ndarray | None = None, predict: Predict | None = None
 ) -> ParametricGroup:
-    """One group.
+    """Fits one group.
 
     Args:
-        rest: [P, 3] rest positions of the Gaussians of the group before, which `group.parents` names; None: the group
-            rests as it is in its middle frame.
-        predict: positions of nodes at rest -> what a rig says of their motion.
+        rest: [P, 3] rest positions of the Gaussians of the group before, to which `group.parents` refers; None: the
+            group rests as it is in its middle frame.
+        predict: positions of nodes at rest -> motion that a rig predicts for them.
     """
     frames, own = len(group), (group.lifetimes, group.parents)
     if frames == 1:
@@ -104,7 +104,7 @@ def fit_group(
 
 
 def _motion(stack, middle: Gaussians, parents, rest, quality, predict) -> tuple[NodeMotion | None, np.ndarray]:
-    """Nodes of the group, and where its Gaussians rest, [N, 3]."""
+    """Nodes of the group, and rest positions [N, 3] of its Gaussians."""
     step = steps_for(quality, subject_radius(middle.means))["means"]
     if parents is None:
         return fit_nodes(middle.means, stack.frames.means, step, predict=predict), middle.means
@@ -122,8 +122,8 @@ def _motion(stack, middle: Gaussians, parents, rest, quality, predict) -> tuple[
 
 
 def _carried_back(nodes, places, middle: int, g: Gaussians, known, born) -> tuple[NodeMotion, np.ndarray]:
-    """Nodes of all Gaussians, and where the `born` ones rest: as the nearest `known` one (which rests at `places`)
-    came to its position of the middle frame, and with its nodes."""
+    """Nodes of all Gaussians, and rest positions of the `born` ones: each takes the nodes of the nearest `known`
+    Gaussian (which rests at `places`), whose motion carries it back from the middle frame."""
     from scipy.spatial import cKDTree
 
     survivors = ParametricGroup(len(nodes.rotations), _with(g.take(known), means=places), nodes)
@@ -136,7 +136,7 @@ def _carried_back(nodes, places, middle: int, g: Gaussians, known, born) -> tupl
 
 
 def _trajectories(stack, canonical: Gaussians, carried: np.ndarray, rotations: np.ndarray) -> dict[str, np.ndarray]:
-    """attribute -> [T, C, N] f32 DCT coefficients of what canonical values and nodes leave over; 0 is left out."""
+    """attribute -> [T, C, N] f32 DCT coefficients of the residual of canonical values and nodes; 0 is left out."""
     frames, f = len(stack), stack.frames
     dq = quat_multiply(f.quats, quat_conjugate(quat_multiply(rotations, canonical.quats[None])))
     residual = {"means": f.means - carried, "quats": np.copysign(1, dq[..., :1]) * dq[..., 1:]}

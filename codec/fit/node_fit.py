@@ -1,8 +1,8 @@
 """Node fit: rest positions and the means of all frames -> the nodes of a deformation graph that carry them.
 
 Nodes are sampled farthest-first; each takes the weighted Kabsch rotation of the Gaussians that it carries, then the
-translations of all frames are solved together, since blending is linear in them. As many nodes are taken as still
-reduce the residual enough to pay for themselves; their number is found on a sample of the Gaussians.
+translations of all frames are solved together, since blending is linear in them. Nodes are added while they reduce the
+bits of the residual by more than they cost; their number is found on a sample of the Gaussians.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ..model.rotations import matrix_to_quat, quat_to_matrix, quat_to_rotvec, ro
 from ..model.temporal_transform import dct_basis
 from ..threads import each_frame
 
-Predict = Callable[[np.ndarray], RigMotion]  # positions of nodes at rest [M, 3] -> what a rig says of their motion
+Predict = Callable[[np.ndarray], RigMotion]  # positions of nodes at rest [M, 3] -> motion that a rig predicts
 
 
 @dataclass(frozen=True)
@@ -30,14 +30,14 @@ class NodeFitSettings:
     """How many nodes a group gets.
 
     Attributes:
-        neighbors: nodes that carry one Gaussian.
-        counts: of nodes, that are tried in this order.
-        node_bits: what one more node costs, bits in a group of 20 frames; measured on a scanned statue.
-        sample: Gaussians by which the count is chosen.
+        neighbors: number of nodes that carry one Gaussian.
+        counts: numbers of nodes, which are tried in this order.
+        node_bits: cost of one more node, bits in a group of 20 frames; measured on a scanned statue.
+        sample: number of Gaussians by which the count is chosen.
         least_residual: DCT coefficients below this share of a step are not coded, and cost nothing.
         bits_per_octave: bits of a coefficient for each doubling.
         predicted_node_bits: as `node_bits`, where a rig predicts the motion.
-        prior: weight of the rotation that a rig predicts, beside that of the Gaussians that a node carries.
+        prior: weight of the rotation that a rig predicts, relative to that of the Gaussians that a node carries.
     """
 
     neighbors: int = 4
@@ -50,7 +50,7 @@ class NodeFitSettings:
     prior: float = 1.0
 
 
-LATTICE_BITS = 20  # of the integer lattice on which neighbours and weights are found
+LATTICE_BITS = 20  # bits of the integer lattice on which neighbours and weights are found
 
 
 def fit_nodes(
@@ -65,9 +65,10 @@ def fit_nodes(
     The residual that nodes leave costs about log2(1 + error / step) bits a coefficient, a node `node_bits`.
 
     Args:
-        rest: [N, 3] positions at rest; means: [T, N, 3] of all frames, world units.
+        rest: [N, 3] positions at rest, world units.
+        means: [T, N, 3] positions in all frames, world units.
         step: quantization step of means, world units.
-        predict: what a rig says of the motion.
+        predict: motion that a rig predicts; None: no rig.
     """
     node_bits = settings.predicted_node_bits if predict else settings.node_bits
     lattice = _Lattice.around(rest)
@@ -110,8 +111,8 @@ class _Lattice:
 
 
 def _fit(lattice, x, means, places, settings, predict) -> tuple[NodeMotion, np.ndarray]:
-    """Nodes at `places` [M, 3] for Gaussians that rest at x [N, 3] f64 and are at `means` [T, N, 3], and where they
-    carry x, [T, N, 3]."""
+    """Nodes at `places` [M, 3] for Gaussians that rest at x [N, 3] f64 and are at `means` [T, N, 3], and the positions
+    [T, N, 3] to which they carry x."""
     from scipy.sparse import csr_matrix
 
     on_lattice = np.unique(lattice.integers(places), axis=0)
@@ -140,7 +141,7 @@ def _fit(lattice, x, means, places, settings, predict) -> tuple[NodeMotion, np.n
 
 
 def _carried(motion: NodeMotion, x: np.ndarray) -> np.ndarray:
-    """[T, N, 3], where the nodes carry x [N, 3]."""
+    """[T, N, 3], positions to which the nodes carry x [N, 3]."""
     rotations, positions = rotvec_to_quat(motion.rotations), motion.positions + motion.translations
     rest, weights = x.astype(np.float32), (motion.neighbors.astype(np.uint32), motion.weights)
     at = [(motion.positions, *nodes) for nodes in zip(rotations, positions, strict=True)]
@@ -150,7 +151,7 @@ def _carried(motion: NodeMotion, x: np.ndarray) -> np.ndarray:
 def _fit_frame(transposed, mass, x, nodes, y, prior=None) -> tuple[np.ndarray, np.ndarray]:
     """Rotations [M, 4] wxyz about the nodes and translations [M, 3] that carry x [N, 3] to y [N, 3] (Kabsch 1976).
 
-    `prior`: weights [M] and matrices [M, 3, 3] of rotations that are expected.
+    `prior`: weights [M] and matrices [M, 3, 3] of expected rotations.
     """
     m = len(nodes)
     cx = transposed @ x / mass[:, None]
@@ -169,7 +170,7 @@ def _fit_frame(transposed, mass, x, nodes, y, prior=None) -> tuple[np.ndarray, n
 
 
 def _prior(rig: RigMotion, nodes: np.ndarray, weight: float) -> tuple[np.ndarray, list]:
-    """What a rig predicts of `nodes`: translations [T, M, 3], and for each frame the prior of `_fit_frame`."""
+    """Prediction of a rig for `nodes`: translations [T, M, 3], and for each frame the prior of `_fit_frame`."""
     places, turned = rig.at(nodes)
     own = weight * rig.weights.any(1)
     return places - nodes, [(own, quat_to_matrix(q.astype(np.float64))) for q in turned]

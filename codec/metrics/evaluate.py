@@ -23,7 +23,7 @@ from .stability import TemporalMeter
 from .vmaf import VmafMeter
 
 BACKGROUND = (0.5, 0.5, 0.5)
-FG_ALPHA = 0.02  # of a rendered reference; above it is the foreground of codec_psnr_fg
+FG_ALPHA = 0.02  # alpha of a rendered reference; above it is the foreground of codec_psnr_fg
 FrameSource = Callable[[int], Gaussians]
 Progress = Callable[[int, int], None]  # (images done, images)
 
@@ -42,7 +42,7 @@ def _report(
         frame_count: frames of the stream, whose bytes are `size`.
         counts: Gaussians of each measured frame.
         rows: measures of each measured frame.
-        encoded: Gaussians a frame that went in, by which the bits are divided; None: those that came out.
+        encoded: Gaussians per frame of the source, by which the bits are divided; None: those of the decoded frames.
     """
     gaussians = float(np.mean(counts))
     divisor = gaussians if encoded is None else encoded
@@ -146,11 +146,11 @@ def evaluate_splats(
         frame_source: frame -> Gaussians as shown.
         frames: the frames to compare; all by default.
         size: bytes of the stream, for the rates.
-        stream_frames: frames that the stream has; None: those of the sequence.
+        stream_frames: number of frames in the stream; None: as in the sequence.
 
     Returns:
         The keys of evaluate_capture with codec_psnr and codec_psnr_fg instead of psnr, psnr_fg, ssim, vmaf and flicker,
-        and gaussians_encoded, the mean of a frame of `sequence`, by which bits_per_gaussian_frame divides.
+        and gaussians_encoded, the mean number in a frame of `sequence`, by which bits_per_gaussian_frame divides.
 
     Raises:
         UsageError: a frame is outside the sequence.

@@ -37,7 +37,7 @@ def psnr(reference: np.ndarray, image: np.ndarray, mask: np.ndarray | None = Non
 
 def psnr_corrected(reference: np.ndarray, image: np.ndarray, mask: np.ndarray | None = None) -> float:
     """As `psnr`, after the gain and the offset of each channel that bring the image nearest to the reference: without
-    what the colour of one camera differs from that of all others."""
+    the colour difference of one camera from all others."""
     _check(reference, image)
     y, x = (a.reshape(-1, 3) if mask is None else a[mask] for a in (reference, image))
     if not len(x):

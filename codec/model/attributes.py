@@ -1,7 +1,7 @@
 """The attribute table: everything that differs between the attributes of a Gaussian, declared once.
 
 Training, quantization and the stream read it; gsv::attributes mirrors the columns that the stream knows (spec 3.2), and
-a test compares the two. A new attribute is one row here, one there, and the code that is really about it.
+a test compares the two. A new attribute needs one row here, one row there, and the code that is specific to it.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ class Attribute:
 
     Attributes:
         name: as in `Gaussians`.
-        number: in the stream.
-        channels: integers per Gaussian; of shN for one coefficient.
-        meaning: of the integers, once dequantized.
+        number: of the attribute in the stream.
+        channels: integers per Gaussian; shN: per coefficient.
+        meaning: of the dequantized integers.
         decorrelated: RGB triples are coded as Y, Co, Cg (spec 13.5).
         companded: values may be coded along a curve (spec 13.1).
         nominal_step: quantization step at quality 50 (means: radii of the subject); equal slopes of rendered error
             against bits, measured on a scanned statue.
-        coarsest_step: beyond it the derivative of the picture says too little (means: radii of the subject).
+        coarsest_step: beyond it the derivative of the image does not predict the error (means: radii of the subject).
         temporal_frequencies: of its trajectory in a group of `FREQUENCIES_OF` frames; 0: constant in a group.
         learning_rate: of Adam in a keyframe, at the first step (means: radii of the subject).
     """

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-NEAR = 0.01  # world units, near plane of a camera of which nothing is known (spec 14)
-LOW_PASS = 0.3  # px^2, of splats of other tools: 3D Gaussian Splatting (spec 14)
-PIXEL_LOW_PASS = 0.1  # px^2, of pictures: a pixel is a box, whose variance is 1/12 (Mip-Splatting has the same)
+NEAR = 0.01  # world units, near plane of a camera if it is not known (spec 14)
+LOW_PASS = 0.3  # px^2, for splats of other tools: as in 3D Gaussian Splatting (spec 14)
+PIXEL_LOW_PASS = 0.1  # px^2, for captures: a pixel is a box of variance 1/12 (Mip-Splatting has the same)
 
 
 @dataclass(frozen=True)
@@ -21,14 +21,14 @@ class Camera:
         K: [3, 3] f64, intrinsics in pixels; pixel centres are at half-integers.
         viewmat: [4, 4] f64, world-to-camera, OpenCV axes.
         width, height: image size in pixels.
-        distortion: [k1, k2, p1, p2, k3] as in OpenCV (any length it takes), empty for none; a Capture hands out
-            undistorted images with an empty one.
+        distortion: [k1, k2, p1, p2, k3] as in OpenCV (any length that OpenCV takes); empty: none. A Capture returns
+            undistorted images, with an empty array.
         fisheye: `distortion` is [k1, k2, k3, k4] of OpenCV's fisheye model (Kannala and Brandt 2006) instead; a Capture
-            hands out pinhole cameras.
+            returns pinhole cameras.
         split: "train", "val" or "test".
         near: near plane, world units: Gaussians whose centre is nearer are not drawn. A reader of captures leaves
-            `NEAR` where its layout says nothing; `Capture` then puts it at a share of the distance to the scene.
-        low_pass: variance of the low-pass with which Gaussians are drawn, px^2 (spec 14).
+            `NEAR` if its layout has no near plane; `Capture` then sets it to a share of the distance to the scene.
+        low_pass: variance of the screen-space low-pass of drawn Gaussians, px^2 (spec 14).
     """
 
     name: str
@@ -48,7 +48,7 @@ class Camera:
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def seen_from(self, origin: np.ndarray) -> Camera:
-        """The same view in a world whose origin is at `origin` ([3], world units) of this one."""
+        """The same view in coordinates with the origin at `origin` ([3], world units) of this world."""
         viewmat = self.viewmat.copy()
         viewmat[:3, 3] += viewmat[:3, :3] @ origin
         return replace(self, viewmat=viewmat)
@@ -70,13 +70,13 @@ class Camera:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What training has found out about the C cameras of a capture in the T frames of a group.
+    """Calibration learned in training, for the C cameras of a capture in the T frames of a group.
 
     Attributes:
         corrections: [C, 4, 4] f64, rigid motions of the world: the true viewmat is viewmat @ correction, in all frames,
             also of moving cameras.
-        gains: [T, C, 3] f32, by which the images of a camera are brighter than the scene.
-        offsets: [T, C, 3] f32, in 0..1, by which they are brighter besides.
+        gains: [T, C, 3] f32, colour gain of each camera: image = gain * scene + offset.
+        offsets: [T, C, 3] f32, colour offset of each camera, in 0..1.
     """
 
     corrections: np.ndarray
@@ -85,21 +85,21 @@ class Calibration:
 
     @staticmethod
     def plain(cameras: int, frames: int) -> Calibration:
-        """Cameras that are as the capture says."""
+        """The identity: cameras as in the capture."""
         gains = np.ones((frames, cameras, 3), np.float32)
         return Calibration(np.tile(np.eye(4), (cameras, 1, 1)), gains, 0 * gains)
 
     def evened(self, rgb: np.ndarray, index: int, t: int) -> np.ndarray:
-        """Colours of camera `index` (0 to 255) at frame `t` of the group as the scene has them, f32."""
+        """Colours of camera `index` (0 to 255) at frame `t` of the group, corrected to those of the scene, f32."""
         return ((rgb - 255 * self.offsets[t, index]) / self.gains[t, index]).astype(np.float32)
 
     def camera(self, camera: Camera, index: int) -> Camera:
-        """`camera`, which is camera `index` of the capture in any frame or a crop of it, with the true viewmat."""
+        """`camera` with the true viewmat; it is camera `index` of the capture in any frame, or a crop of it."""
         return replace(camera, viewmat=camera.viewmat @ self.corrections[index])
 
 
 def low_pass_of(cameras: Sequence[Camera]) -> float:
-    """Low-pass of what is drawn from other places than these cameras of a stream, a sequence or a capture, px^2."""
+    """Low-pass for views from other positions than these cameras of a stream, a sequence or a capture, px^2."""
     return cameras[0].low_pass if cameras else LOW_PASS
 
 
@@ -130,7 +130,7 @@ def meeting_point(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def working_distance(cameras: Sequence[Camera]) -> float:
-    """Median distance of the cameras from where their optical axes meet, world units."""
+    """Median distance of the cameras from the point where their optical axes meet, world units."""
     centre = meeting_point(cameras)
     return float(np.median([np.linalg.norm(c.center - centre) for c in cameras]))
 
@@ -139,7 +139,7 @@ GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
 
 def fibonacci_directions(count: int, turn: float = 0.0) -> np.ndarray:
-    """[count, 3] f64 unit vectors, evenly over the sphere; `turn` of all about z, radians."""
+    """[count, 3] f64 unit vectors, evenly over the sphere; `turn`: rotation of all about z, radians."""
     i = np.arange(count)
     z, angle = 1 - (2 * i + 1) / count, i * GOLDEN_ANGLE + turn
     return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], 1)
@@ -157,11 +157,13 @@ def cameras_around(
 ) -> list[Camera]:
     """Cameras in Fibonacci directions around the box of the 1st to 99th percentile of `points` ([N, 3]); even ones have
     its bounding sphere just in frame, odd ones stand at half that distance. Their near planes are at `NEAR`, or at a
-    hundredth of their distance where that is less, so that scenes of any unit are seen.
+    hundredth of their distance if that is less, so that scenes of any unit are visible.
 
     Args:
-        size: width and height; focal: focal length in widths; turn: of all directions about z, radians;
-            low_pass: of the cameras, px^2.
+        size: width and height, pixels.
+        focal: focal length in widths.
+        turn: rotation of all directions about z, radians.
+        low_pass: of the cameras, px^2.
     """
     low, high = np.percentile(points, (1, 99), axis=0)
     center, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)

@@ -1,4 +1,4 @@
-"""Groups of frames in playing order. Dense frames are an edge: splats that come from, or go to, other tools."""
+"""Groups of frames in playing order. Dense groups, one set of splats per frame, are for exchange with other tools."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class GaussianSequence:
         return sum(len(g) for g in self.groups)
 
     def with_groups(self, groups: Sequence[DenseGroup | ParametricGroup]) -> GaussianSequence:
-        """The same with other groups."""
+        """This sequence with other groups."""
         return replace(self, groups=groups)
 
     def frame(self, t: int) -> Gaussians:

@@ -1,8 +1,8 @@
 """Gaussians of one frame, the data model that every stage shares.
 
-Names are gsplat's; the state of activation is in the name (`log_scales`, `logit_opacities`). Arrays are numpy f32 here;
-the differentiable side (train, render) holds torch tensors under the same names. What crosses a module boundary goes
-through `validate`, so that the stages themselves need no checks.
+Names are gsplat's; a name tells the state of activation (`log_scales`, `logit_opacities`). Arrays are numpy f32 here;
+the differentiable side (train, render) holds torch tensors under the same names. Data that crosses a module boundary
+goes through `validate`, so that the stages themselves need no checks.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from ..errors import CaptureError
 
 SH_C0 = 0.28209479177387814  # Y_00; colour = 0.5 + SH_C0 * sh0 (3D Gaussian Splatting, Kerbl et al. 2023)
 SH_COUNTS = {0: 0, 3: 1, 8: 2, 15: 3}  # K of shN -> SH degree
-OPACITY_LIMIT = 1e-6  # distance of opacities from 0 and 1
-GOP = 30  # frames of a group at most, unless told otherwise: a second
-RANDOM_ACCESS = 150  # frames from one independent group to the next at most: five seconds
+OPACITY_LIMIT = 1e-6  # least distance of opacities from 0 and 1
+GOP = 30  # most frames in a group, by default: one second
+RANDOM_ACCESS = 150  # most frames from one independent group to the next, by default: five seconds
 
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:
-    """f64, without overflow: opacities of their logits."""
+    """Opacities of logits, f64, without overflow."""
     return 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80)))
 
 
 def logit(opacities: np.ndarray | float) -> np.ndarray:
-    """Inverse of `sigmoid`; 0 and 1, whose logits are not finite, count as `OPACITY_LIMIT` away from them."""
+    """Inverse of `sigmoid`; 0 and 1, whose logits are not finite, are moved by `OPACITY_LIMIT`."""
     p = np.clip(opacities, OPACITY_LIMIT, 1 - OPACITY_LIMIT)
     return np.log(p / (1 - p))
 
@@ -72,7 +72,7 @@ class Gaussians:
         """Checks shapes and values and returns f32, contiguous, unit-quaternion arrays.
 
         Args:
-            where: what the message names, e.g. "statue/000003.ply".
+            where: source of the data, for the message, e.g. "statue/000003.ply".
 
         Raises:
             CaptureError: a shape is wrong, a value is not finite or a quaternion is zero.
@@ -108,17 +108,17 @@ PARAMETERS = tuple(f.name for f in fields(Gaussians))
 
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
-    """One set out of several with the same SH degree."""
+    """Concatenates sets with the same SH degree."""
     return Gaussians(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)})
 
 
 def living(lifetimes: np.ndarray, t: int) -> np.ndarray:
-    """[N] bool: whether frame `t` is in the lifetimes [t0, t1) of the rows ([N, 2])."""
+    """[N] bool: whether frame `t` is in each lifetime [t0, t1) ([N, 2])."""
     return (lifetimes[:, 0] <= t) & (t < lifetimes[:, 1])
 
 
 def shown_at(g: Gaussians, lifetimes: np.ndarray | None, t: int) -> Gaussians:
-    """The Gaussians of `g` that live at frame `t`; all of them without `lifetimes` ([N, 2])."""
+    """The Gaussians of `g` that live at frame `t`; all of them if `lifetimes` ([N, 2]) is None."""
     if lifetimes is None:
         return g
     return g.take(living(lifetimes, t))

@@ -1,4 +1,4 @@
-"""Translations of nodes by least squares: blending is linear in them, so all frames and axes have one solution."""
+"""Node translations by least squares: blending is linear in them, so one factorization solves all frames and axes."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from .. import _native
 from ..threads import each_frame
 from .rotations import rotvec_to_quat
 
-RIDGE = 1e-3  # pull of a translation towards where it starts, in shares of the node's mass
+RIDGE = 1e-3  # pull of a translation towards its start value, as a share of the node's mass
 
 
 def solve_translations(
     nodes: tuple[np.ndarray, np.ndarray, np.ndarray], rest: np.ndarray, means: np.ndarray, blend: tuple
 ) -> np.ndarray:
-    """[T, M, 3] f64, translations by which the nodes carry Gaussians nearest to their means.
+    """[T, M, 3] f64 translations of the nodes that carry the Gaussians nearest to `means`.
 
     Args:
-        nodes: positions [M, 3], rotation vectors [T, M, 3], and translations [T, M, 3] to start from.
-        rest: [N, 3] positions of the Gaussians at rest; means: [T, N, 3] where they are.
+        nodes: positions [M, 3], rotation vectors [T, M, 3], and start values of the translations [T, M, 3].
+        rest: [N, 3] positions of the Gaussians at rest.
+        means: [T, N, 3] positions of the Gaussians in each frame.
         blend: neighbors [N, k] and weights [N, k].
     """
     from scipy.sparse import csr_matrix, identity

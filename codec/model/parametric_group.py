@@ -1,4 +1,4 @@
-"""ParametricGroup: what training makes and fit/ makes of foreign splats, what encoding takes and decoding gives back.
+"""ParametricGroup: training and fit/ (from splats of other tools) produce it, encoding takes it, decoding returns it.
 
 One set of N Gaussians for T frames. Frame t = the canonical Gaussians, carried rigidly by the nodes of a deformation
 graph (HiFi4G), plus residual trajectories in a temporal DCT. Evaluation is native and the same for all four uses.
@@ -22,15 +22,15 @@ from .temporal_transform import dct_basis
 
 @dataclass(frozen=True)
 class NodeMotion:
-    """Coarse motion of a group: M control points, each a rigid motion per frame (HiFi4G's ED graph, DualGS's joints).
+    """Coarse motion of a group: M control points with a rigid motion per frame (HiFi4G's ED graph, DualGS's joints).
 
     Attributes:
         positions: [M, 3] f32, each node at rest, world units.
         rotations: [T, M, 3] f32, rotation vector in radians from rest to frame t, about the node.
         translations: [T, M, 3] f32, displacement of the node from rest, world units.
         neighbors: [N, k] int32, nodes that carry each Gaussian, k >= 1.
-        weights: [N, k] f32, by which their motions are blended; each row sums to 1.
-        rig: what predicts the motion, so that the stream holds what is left; None: nothing does. Rotations and
+        weights: [N, k] f32, blending weights of their motions; each row sums to 1.
+        rig: predicts the motion, so that the stream codes only the residual; None: no prediction. Rotations and
             translations are the whole motion in either case.
     """
 
@@ -47,10 +47,10 @@ class NodeMotion:
 
 
 def checked_parents(parents: np.ndarray, count: int, before: int) -> np.ndarray:
-    """The parents of a group of `count` Gaussians, if they fit the `before` Gaussians of the group before.
+    """Returns the parents of a group of `count` Gaussians if they fit the `before` Gaussians of the group before.
 
     Raises:
-        CaptureError: two Gaussians have the same parent, or one that is not there.
+        CaptureError: two Gaussians have the same parent, or a parent does not exist.
     """
     parents = np.asarray(parents)
     known = parents[parents >= 0]
@@ -69,21 +69,21 @@ class ParametricGroup:
     Attributes:
         frame_count: T.
         canonical: N Gaussians at rest. A Gaussian with a parent rests where its parent does.
-        nodes: coarse motion; None: nothing but the trajectories moves.
+        nodes: coarse motion; None: only trajectories move Gaussians.
         trajectories: attribute -> [K, C, N] f32, 1 <= K <= T orthonormal DCT-II coefficients over the T frames, in the
-            attribute's units, lowest frequency first; what is missing is 0. means, log_scales, logit_opacities (C = 1),
+            attribute's units, lowest frequency first; missing ones are 0. means, log_scales, logit_opacities (C = 1),
             sh0 (RGB) and shN (C = 3 coefficients, RGB fastest) are added to the canonical value; means after the nodes.
-            quats (C = 3): x, y, z of the unit quaternion that the carried rotation is multiplied by from the left.
+            quats (C = 3): x, y, z of a unit quaternion; the carried rotation is multiplied by it from the left.
         lifetimes: [N, 2] int32, the frames [t0, t1) of the group in which Gaussian i is shown; None: all frames.
         parents: [N] int32, index in the group before of the Gaussian that each one continues, -1 for a new one; no two
-            have the same parent. None: nothing is known, as in the first group.
-        calibration: what training learned of the capture's cameras; None: there is no capture.
-        rate_optimized: training had a rate term, which has dropped what is not worth its bits.
-        ended: why it is shorter than it may be: "cut" (the next frame cannot be tracked), "drift" (nor well enough,
-            since the keyframe is too far), "more" (it shows much that the keyframe did not), "change" (much that rests
-            begins to change), "jump" (what moves is suddenly elsewhere), "empty" (nothing is seen before the next
-            frame); an empty string: it is not.
-        turned_harmonics: shN turns with the nodes; otherwise it stays in the world.
+            have the same parent. None: unknown, as in the first group.
+        calibration: of the capture's cameras, learned in training; None: there is no capture.
+        rate_optimized: training had a rate term, which has dropped data that is not worth its bits.
+        ended: why the group is shorter than allowed: "cut" (the next frame cannot be tracked), "drift" (the next frame
+            cannot be tracked well enough, since the keyframe is too far away), "more" (the next frame shows much that
+            the keyframe did not show), "change" (many resting Gaussians begin to change), "jump" (moving objects are
+            suddenly elsewhere), "empty" (nothing is visible before the next frame); an empty string: it is not shorter.
+        turned_harmonics: shN rotates with the nodes; otherwise it is fixed to the world axes.
     """
 
     frame_count: int
@@ -105,7 +105,7 @@ class ParametricGroup:
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
     def frame(self, t: int) -> Gaussians:
-        """All N Gaussians at frame `t` of the group, as `lifetimes` may hide them.
+        """All N Gaussians at frame `t` of the group, also those outside their lifetimes.
 
         Raises:
             IndexError: `t` is not in the group.
@@ -119,11 +119,11 @@ class ParametricGroup:
         return shown_at(self.frame(t), self.lifetimes, t)
 
     def carried(self) -> tuple[np.ndarray, np.ndarray]:
-        """What the nodes alone do: means [T, N, 3] f32 and rotations [T, N, 4] f32 wxyz that carry the Gaussians."""
+        """Motion by the nodes alone: means [T, N, 3] f32 and rotations [T, N, 4] f32 wxyz that carry the Gaussians."""
         return self._evaluator.carried()
 
     def harmonics_turns(self) -> np.ndarray | None:
-        """Rotations [T, N, 4] f32 wxyz by which shN is turned in each frame; None: it stays as it is."""
+        """Rotations [T, N, 4] f32 wxyz of shN in each frame; None: shN is not rotated."""
         turns = self.turned_harmonics and self.nodes is not None and self.canonical.sh_degree > 0
         return self.carried()[1] if turns else None
 

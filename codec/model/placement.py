@@ -21,14 +21,14 @@ Rate = tuple[int, int]  # timescale, and frame duration in its units
 
 @dataclass(frozen=True)
 class Placement:
-    """A track in its scene.
+    """Placement of a track in its scene.
 
     Attributes:
         name: for people.
-        hidden: it is not shown.
+        hidden: the track is not shown.
         offset: time of the scene at which frame 0 is shown.
         repeats: how often the track is played; 0: without end.
-        keys: by time; before the first and behind the last one the transform stays, without any it is the identity.
+        keys: by time; before the first key and after the last one the transform is constant. No keys: the identity.
     """
 
     name: str = ""
@@ -38,7 +38,7 @@ class Placement:
     keys: tuple[Key, ...] = ()
 
     def to_config(self) -> dict:
-        """As `_native.init_segment` takes it."""
+        """The dict that `_native.init_segment` takes."""
         return asdict(self)
 
     def pose(self, u: Fraction | float) -> Pose | None:
@@ -46,7 +46,7 @@ class Placement:
         return _native.pose_at(self.to_config(), float(u)) if self.keys else None
 
     def changed(self, *, turn=STILL[1], move=(0.0, 0.0, 0.0), scale: float = 1.0) -> Placement:
-        """The track turned (wxyz) and scaled about its own origin, then moved, on top of what its keys do."""
+        """The track rotated by `turn` (wxyz) and scaled about its own origin, then moved, in addition to its keys."""
         turn = np.asarray(turn, float)
         keys = []
         for time, rotation, translation, own in self.keys or (STILL,):
@@ -57,12 +57,12 @@ class Placement:
         return replace(self, keys=tuple(keys))
 
     def frame(self, u: Fraction, frames: int, rate: Rate) -> int | None:
-        """The frame of the track at time `u` of the scene, of `frames`; None: it shows nothing."""
+        """Index, below `frames`, of the track's frame at time `u` of the scene; None: it shows nothing."""
         n = int((u - self.offset) // rate[1])
         if n < 0 or not frames or (self.repeats and n >= self.repeats * frames):
             return None
         return n % frames
 
     def end(self, frames: int, rate: Rate) -> int:
-        """Time of the scene at which the track ends; one without end counts as played once."""
+        """Time of the scene at which the track ends; an endless track counts as played once."""
         return self.offset + max(self.repeats, 1) * frames * rate[1]

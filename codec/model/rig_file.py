@@ -15,13 +15,13 @@ JOINTS_MAX = 255
 
 
 def read_rig(path: Path, frames: int | None = None) -> Rig:
-    """The rig of a file.
+    """Reads the rig of a file.
 
     Args:
-        frames: how many the rig must have; None: any number.
+        frames: number of frames that the rig must have; None: any number.
 
     Raises:
-        CaptureError: the file is none, an array is missing, or has another shape or value than it may have.
+        CaptureError: the file is not a rig, or an array is missing or has an invalid shape or value.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -46,7 +46,7 @@ class _Arrays:
         if not 1 <= count <= JOINTS_MAX:
             raise CaptureError(f"{self.path}: joints_rest has {count} joints, expected 1 to {JOINTS_MAX}")
         rotations = self.take("rotations", ("T", count, 3))
-        for t in range(1, len(rotations)):  # of the equal rotation vectors the nearest one, so that poses are smooth
+        for t in range(1, len(rotations)):  # nearest of the equal rotation vectors, so that poses are smooth
             rotations[t] = quat_to_rotvec(rotvec_to_quat(rotations[t]), rotations[t - 1])
         poses = np.concatenate([rotations, self.translations(len(rotations), count)], 2)
         vertices = weights = None
@@ -58,7 +58,7 @@ class _Arrays:
         return Rig(joints, self.parents(count), poses, vertices, weights)
 
     def translations(self, frames: int, joints: int) -> np.ndarray:
-        """[T, J, 3]; those of the root alone may be [T, 3], and none may be there."""
+        """[T, J, 3]; the file may have [T, 3], for the root alone, or no translations (0)."""
         found = np.zeros((frames, joints, 3), np.float32)
         if "translations" not in self.arrays:
             return found
@@ -78,7 +78,7 @@ class _Arrays:
         return np.where(told < 0, own, told).astype(np.uint8)
 
     def take(self, name: str, shape: tuple) -> np.ndarray:
-        """An array as f32; a letter in `shape` is any number."""
+        """An array as f32; a letter in `shape` stands for any number."""
         if name not in self.arrays:
             raise CaptureError(f"{self.path}: has no {name}, expected an array of shape {_words(shape)}")
         a = self.arrays[name]

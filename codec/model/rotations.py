@@ -8,7 +8,7 @@ from .. import _native
 
 
 def _namespace(a):
-    """numpy, or torch for a tensor, which is then loaded already."""
+    """numpy, or torch for a tensor; torch is already loaded then."""
     if isinstance(a, np.ndarray):
         return np
     import torch
@@ -59,8 +59,8 @@ def rotvec_to_quat(v):
 
 
 def quat_to_rotvec(q, near=None):
-    """Unit quaternions [..., 4] -> [..., 3] radians; of the equal rotation vectors the one nearest to `near` [..., 3],
-    so that a rotation over time has no jumps."""
+    """Unit quaternions [..., 4] -> rotation vectors [..., 3], radians; of the equal rotation vectors the nearest to
+    `near` [..., 3], so that a rotation over time has no jumps."""
     xp = _namespace(q)
     q = xp.where(q[..., :1] < 0, -q, q)
     sine = xp.sqrt((q[..., 1:] * q[..., 1:]).sum(-1))[..., None]
@@ -93,6 +93,6 @@ def matrix_to_quat(R: np.ndarray) -> np.ndarray:
 
 
 def turned_harmonics(shN: np.ndarray, rotations: np.ndarray, *, back: bool = False) -> np.ndarray:
-    """Bands 1 to 3 of spherical harmonics [N, K, 3] f32, turned by unit quaternions [N, 4] f32, or by their inverse
-    (spec 13.4)."""
+    """Bands 1 to 3 of spherical harmonics [N, K, 3] f32, rotated by unit quaternions [N, 4] f32 or, with `back`, by
+    their inverse (spec 13.4)."""
     return _native.turned_harmonics(np.ascontiguousarray(shN, np.float32), rotations, back)

@@ -1,7 +1,7 @@
-"""Skin weights: places in a posed frame -> which joints move them, as the integers of the stream.
+"""Skin weights: positions in a posed frame -> weights of the joints, as the integers of the stream.
 
-By the nearest vertices of the rig's skin where it has one, else by the distance to the bones. What is far from both, a
-wall behind a figure, is not moved by the rig.
+Weights come from the nearest vertices of the rig's skin if it has one, else from the distance to the bones. The rig
+does not move positions far from both, such as a wall behind a figure.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ import numpy as np
 
 from .rig import Rig
 
-WHOLE = 64  # sum of the weights of a place
-MOST_JOINTS = 4  # that move one place
-LEAST = 0.04  # smaller shares are left out
-REACH = 0.25  # of the largest extent of the skeleton; what is farther away is not moved
+WHOLE = 64  # sum of the weights of a position
+MOST_JOINTS = 4  # joints that move one position, at most
+LEAST = 0.04  # of the largest share of a position; smaller shares are left out
+REACH = 0.25  # of the largest extent of the skeleton; positions farther away are not moved
 SHARPNESS = 8.0  # weights fall with this power of the distance to a bone
-NEAREST = 4  # vertices whose weights a place has
+NEAREST = 4  # vertices whose weights are averaged for a position
 
 
 def skin_weights(rig: Rig, frame: int, places: np.ndarray) -> np.ndarray:
-    """[M, J] u8, weights of places [M, 3] of a frame; each row sums to 64, or is 0."""
+    """[M, J] u8, weights of positions [M, 3] of a frame; each row sums to 64, or is 0."""
     reach = REACH * float(np.ptp(rig.joints, axis=0).max(initial=0.0))
     shares, distance = (_by_bones if rig.vertices is None else _by_vertices)(rig, frame, places)
     if len(rig.joints) > 1:  # a single joint has no extent
@@ -28,7 +28,7 @@ def skin_weights(rig: Rig, frame: int, places: np.ndarray) -> np.ndarray:
 
 
 def integer_weights(shares: np.ndarray) -> np.ndarray:
-    """Shares [M, J] >= 0 -> [M, J] u8: the largest few, which sum to 64 by largest remainders; rows of 0 stay."""
+    """Shares [M, J] >= 0 -> [M, J] u8: the `MOST_JOINTS` largest, summing to 64 by largest remainders; 0 rows stay."""
     shares = np.asarray(shares, np.float64)
     least = np.sort(shares, 1)[:, -min(MOST_JOINTS, shares.shape[1])][:, None]
     shares = np.where((shares >= least) & (shares >= LEAST * shares.max(1, keepdims=True)), shares, 0)

@@ -1,5 +1,5 @@
 """Gaussians + Camera -> image, on the CPU, differentiable.
 
-`image` is the player's side. `backend` is the seam that training goes through, `cpu` its implementation, `optimizer`
-what steps along the gradients, `sensitivity` what encoding measures. `reference` is the slow plain version (torch).
+`image` is for the player. `backend` is the interface for training, `cpu` its implementation, `optimizer` Adam along the
+gradients, `sensitivity` the measurement for encoding. `reference` is the slow plain version (torch).
 """

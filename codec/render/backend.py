@@ -1,4 +1,4 @@
-"""The device seam: all that training, camera calibration and sensitivity measurement ask of a device.
+"""Device interface: all operations that training, camera calibration and sensitivity measurement need from a device.
 
 `cpu.CpuBackend` is the only implementation. A caller makes one backend, passes it along and uses it from one thread.
 """
@@ -15,8 +15,8 @@ from ..model.camera import Camera
 
 STATISTICS = ("grad2d", "max_weight")
 
-TURNS = "turns"  # rotations [N, 4] wxyz by which shN is turned
-Params = Mapping[str, np.ndarray]  # PARAMETERS -> numpy arrays or torch CPU tensors, f32, contiguous; or TURNS, too
+TURNS = "turns"  # rotations [N, 4] wxyz of shN
+Params = Mapping[str, np.ndarray]  # PARAMETERS -> numpy arrays or torch CPU tensors, f32, contiguous; optionally TURNS
 PixelGradient = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 PendingLoss = Callable[[], "RenderLoss"]
 
@@ -29,9 +29,8 @@ class TargetView:
         camera: pinhole camera.
         target_rgb: [H, W, 3] u8, unassociated colour.
         target_alpha: [H, W] u8; the target is composited on `background` with it. None: opaque, and no mask term.
-        background: 3 floats in [0, 1]; a random one in each step where there are masks.
-        exposure: gain and offset of this camera, 3 floats each, of the light of the Gaussians and not of the
-            background.
+        background: 3 floats in [0, 1]; a random one in each step if there are masks.
+        exposure: gain and offset of this camera, 3 floats each, for the Gaussians and not for the background.
         target_depth: [H, W] f32, world units along the optical axis, 0 where it is unknown. None: no depth term.
     """
 
@@ -48,7 +47,8 @@ class LossWeights:
     """Weights of the terms of the loss.
 
     Attributes:
-        ssim: share of D-SSIM in the image loss. mask, depth: of what is added to it.
+        ssim: share of D-SSIM in the image loss.
+        mask, depth: weights of the terms that are added to it.
     """
 
     ssim: float = 0.2
@@ -61,17 +61,17 @@ class RenderLoss:
     """Loss of a batch of views and its gradients. Arrays belong to the backend; its next call overwrites them.
 
     Attributes:
-        loss: image_loss, and the terms of mask and depth with their `LossWeights`, summed over the views.
+        loss: image_loss plus the terms of mask and depth with their `LossWeights`, summed over the views.
         image_loss: (1 - w) * l1 + w * (1 - ssim) with w = `LossWeights.ssim`, summed over the views.
         l1, mse, ssim, mask, depth: the terms; means over pixels (and channels) and views. psnr = -10 log10(mse). The
             depth term is |sum of weights * (depth - target)| / target, 0 where the target is unknown.
-        pixels: of all views together.
+        pixels: number in all views together.
         grads: by parameter name, in the shapes of the parameters; tensors where the parameter was a tensor.
         grad2d: [N] f32, norm of the gradient by the projected mean in units of half the image (the densification
             measure of 3D Gaussian Splatting), summed over the views.
         max_weight: [N] f32, largest blending weight alpha * transmittance.
         radii: [N] f32, pixels, largest over the views; 0 for a Gaussian that is not visible.
-        grad_exposure: [views, 2, 3] f64, gradient by the gain and the offset of each.
+        grad_exposure: [views, 2, 3] f64, gradient by the gain and the offset of each view.
     """
 
     loss: float
@@ -97,17 +97,17 @@ class Backend(Protocol):
         """Image [H, W, 3] f32 over `background` and alpha [H, W] f32."""
 
     def render_depth(self, params: Params, camera: Camera) -> np.ndarray:
-        """[H, W] f32 expected depth along the optical axis, world units, as blending weighs it; 0 where nothing is
-        drawn."""
+        """[H, W] f32 expected depth along the optical axis, world units, with the weights of blending; 0 where nothing
+        is drawn."""
 
     def photometric_loss(self, params: Params, views: Sequence[TargetView], weights: LossWeights) -> RenderLoss:
         """Loss of Gaussians against the targets of `views`, and its gradients."""
 
     def start_photometric_loss(self, params: Params, views: Sequence[TargetView], weights: LossWeights) -> PendingLoss:
-        """Starts `photometric_loss` of the Gaussians as they are now, beside the caller.
+        """Starts `photometric_loss` of the current Gaussians, in parallel to the caller.
 
         Returns:
-            What waits for the result, which stays valid until the second start after this one.
+            A function that waits for the result, which stays valid until the second start after this one.
         """
 
     def backpropagate(
@@ -135,16 +135,16 @@ class Backend(Protocol):
 
         Args:
             arrays: parameter, gradient, first and second moment; f32, contiguous, one shape.
-            step: of this parameter, from 1.
+            step: number of this step of the parameter, from 1.
         """
 
     def trajectory_sum(self, coefficients: np.ndarray, at: np.ndarray, dead_zone: float) -> np.ndarray:
-        """Sum over k of at[k] * rounded(coefficients[k]), [N, C] f32, as a decoder has it.
+        """Sum over k of at[k] * rounded(coefficients[k]), [N, C] f32, as in a decoder.
 
         Args:
-            coefficients: [K, N, C] f32, quantization steps.
-            at: [K], by which each is multiplied.
-            dead_zone: steps more than half of one, below which a coefficient is 0.
+            coefficients: [K, N, C] f32, in quantization steps.
+            at: [K] factors of the coefficients.
+            dead_zone: steps beyond half a step, below which a coefficient is 0.
         """
 
     def trajectory_step(
@@ -158,15 +158,15 @@ class Backend(Protocol):
         eps: float,
         step: int,
     ) -> np.ndarray:
-        """One step of Adam on coefficients in place, along the gradient by their sum at a frame, straight through the
-        rounding, and along that by their bits: Laplace code lengths with uniform noise in place of rounding.
+        """One step of Adam on coefficients, in place. The gradient has two parts: by their sum at a frame, straight
+        through the rounding; and by their bits: Laplace code lengths with uniform noise in place of rounding.
 
         Args:
-            arrays: coefficients [K, N, C], gradient [N, C] by the sum, first moment [K, N, C], and second [N, C], which
-                the K share; f32.
-            at: [K], as of `trajectory_sum`.
+            arrays: f32 coefficients [K, N, C], gradient [N, C] by the sum, first moment [K, N, C], and second moment
+                [N, C], shared by the K coefficients.
+            at: [K], as in `trajectory_sum`.
             price: loss of one bit, Laplace scales [K], and at least N * C + K - 1 uniform values in -0.5 .. 0.5.
-            step: of these coefficients, from 1.
+            step: number of this step of the coefficients, from 1.
 
         Returns:
             [K, 2] f64: bits of each coefficient and their derivative by the log of its scale; 0 without a price.

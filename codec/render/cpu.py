@@ -21,7 +21,7 @@ IMAGE_ALONE = LossWeights()
 
 
 class CpuBackend:
-    """Realises `Backend`.
+    """Implements `Backend`.
 
     Args:
         threads: 0 for all cores. Results do not depend on it.
@@ -36,17 +36,17 @@ class CpuBackend:
         self._worker = ThreadPoolExecutor(1, "render")
 
     def render(self, params: Params, camera: Camera, background: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        """As of `Backend`."""
+        """See `Backend`."""
         return self.workspace.forward(_arrays(params), camera, background)
 
     def render_depth(self, params: Params, camera: Camera) -> np.ndarray:
-        """As of `Backend`."""
+        """See `Backend`."""
         return self.workspace.depth(_arrays(params), camera)
 
     def photometric_loss(
         self, params: Params, views: Sequence[TargetView], weights: LossWeights = IMAGE_ALONE
     ) -> RenderLoss:
-        """As of `Backend`.
+        """See `Backend`.
 
         Raises:
             UsageError: shapes disagree, a camera has distortion, or there are no views.
@@ -56,14 +56,14 @@ class CpuBackend:
     def start_photometric_loss(
         self, params: Params, views: Sequence[TargetView], weights: LossWeights = IMAGE_ALONE
     ) -> PendingLoss:
-        """As of `Backend`."""
+        """See `Backend`."""
         arrays = tuple(a.copy() for a in _arrays(params))
         return self._worker.submit(self._photometric_loss, params, arrays, views, weights).result
 
     def _photometric_loss(
         self, params: Params, arrays: tuple[np.ndarray, ...], views: Sequence[TargetView], weights: LossWeights
     ) -> RenderLoss:
-        """`photometric_loss` of the `arrays`; `params`: what the gradients look like."""
+        """`photometric_loss` of the `arrays`; the gradients have the types (array or tensor) of `params`."""
         if not views:
             raise UsageError("a batch has at least one view, got none")
         grads, statistics = self.workspace.gradients(arrays)
@@ -87,7 +87,7 @@ class CpuBackend:
     def backpropagate(
         self, params: Params, camera: Camera, background: Sequence[float], pixel_gradient: PixelGradient
     ) -> dict[str, np.ndarray]:
-        """As of `Backend`."""
+        """See `Backend`."""
         arrays = _arrays(params)
         image, alpha = self.workspace.forward(arrays, camera, background, training=True)
         pixels = tuple(np.ascontiguousarray(g, np.float32) for g in pixel_gradient(image, alpha))
@@ -106,11 +106,11 @@ class CpuBackend:
         eps: float,
         step: int,
     ) -> None:
-        """As of `Backend`."""
+        """See `Backend`."""
         call(_native.adam, arrays, rate, betas, eps, step)
 
     def trajectory_sum(self, coefficients: np.ndarray, at: np.ndarray, dead_zone: float) -> np.ndarray:
-        """As of `Backend`."""
+        """See `Backend`."""
         out = np.empty(coefficients.shape[1:], np.float32)
         call(_native.trajectory_sum, coefficients, at.tolist(), dead_zone, out)
         return out
@@ -126,19 +126,19 @@ class CpuBackend:
         eps: float,
         step: int,
     ) -> np.ndarray:
-        """As of `Backend`."""
+        """See `Backend`."""
         native = None if price is None else (price[0], price[1].tolist(), price[2])
         return np.array(call(_native.trajectory_step, arrays, at.tolist(), native, rate, betas, eps, step))
 
 
 def _arrays(params: Params) -> tuple[np.ndarray, ...]:
-    """The arrays in the order of PARAMETERS, and behind them TURNS if they are there."""
+    """The arrays in the order of PARAMETERS, then TURNS if present."""
     names = (*PARAMETERS, TURNS) if TURNS in params else PARAMETERS
     return tuple(np.ascontiguousarray(host_array(params[name]), np.float32) for name in names)
 
 
 def _native_view(v: TargetView) -> tuple:
-    """A view and its target as the native side takes it."""
+    """A view and its target in the form of the native side."""
     target = (v.target_rgb, v.target_alpha, v.target_depth)
     return (
         view(v.camera),

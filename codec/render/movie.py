@@ -125,13 +125,13 @@ def render_stream(stream, dest: Path, *, camera: str, size: str | None, frames: 
 
 def _write_images(images, folder: Path, frames: range) -> Iterator[int]:
     for done, (t, image) in enumerate(zip(frames, images, strict=True), 1):
-        folder.mkdir(parents=True, exist_ok=True)  # not before there is something to put in it
+        folder.mkdir(parents=True, exist_ok=True)  # not before there is an image for it
         write_png(folder / f"{t:06d}.png", image)
         yield done
 
 
 def _write_movie(images, path: Path, fps: float, frames: range, sound: Path | None) -> Iterator[int]:
-    """`sound`: the .gsv file whose audio track goes in."""
+    """Writes an .mp4; `sound`: the .gsv file with its audio track."""
     ffmpeg = require("imageio_ffmpeg", "writing .mp4 (a folder of .png needs nothing)")
     part = path.with_name(path.stem + ".part.mp4")
     first = next(images)

@@ -30,8 +30,8 @@ class _State:
 
 
 class Adam:
-    """The optimiser of the arrays of one stage. Each name has its own moments and its own count of steps, both from
-    its first step on. The arrays belong to the caller, who adds and removes the same rows here as there."""
+    """The optimiser of the arrays of one stage. Each name has its own moments and its own count of steps, from its
+    first step on. The arrays belong to the caller, who adds and removes the same rows in the arrays and here."""
 
     def __init__(self, backend: Backend, settings: AdamSettings):
         self._backend, self._settings = backend, settings
@@ -72,7 +72,7 @@ class Adam:
             state.first, state.second = np.concatenate([state.first, more]), np.concatenate([state.second, more])
 
     def resize(self, name: str, columns: int) -> None:
-        """Gives array `name` so many columns (axis 1); new ones have zero moments."""
+        """Sets the number of columns (axis 1) of array `name`; new columns have zero moments."""
         if name not in self._states:
             return
         state = self._states[name]
@@ -80,7 +80,7 @@ class Adam:
 
 
 class TrajectoryAdam:
-    """The optimiser of the coefficients of trajectories, [K, N, C] of each attribute, which a frame shows as a sum."""
+    """The optimiser of trajectory coefficients, [K, N, C] of each attribute; a frame shows their weighted sum."""
 
     def __init__(self, backend: Backend, settings: AdamSettings):
         self._backend, self._settings = backend, settings
@@ -95,7 +95,7 @@ class TrajectoryAdam:
         price: tuple[float, np.ndarray, np.ndarray] | None,
         rate: float,
     ) -> np.ndarray:
-        """One step of the coefficients of attribute `name`, in place; arguments and result as of
+        """One step of the coefficients of attribute `name`, in place; arguments and result as in
         `Backend.trajectory_step`."""
         s, state = self._settings, self._states.get(name)
         if state is None:
@@ -119,7 +119,7 @@ class TrajectoryAdam:
 
 
 def _resized(a: np.ndarray, columns: int) -> np.ndarray:
-    """[N, C, ...] -> [N, columns, ...], zeros where there was nothing."""
+    """[N, C, ...] -> [N, columns, ...]; new columns are 0."""
     out = np.zeros((len(a), columns, *a.shape[2:]), np.float32)
     kept = min(columns, a.shape[1])
     out[:, :kept] = a[:, :kept]

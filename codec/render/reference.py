@@ -1,8 +1,8 @@
 """The rasterizer and the image loss as plain torch, for tests: the native kernels are compared with them, forward and
 backward.
 
-Written from the definition: every pixel visits every Gaussian in depth order, with full matrices, and culls only what
-the definition culls. The precision is that of the inputs.
+Written from the definition: every pixel visits every Gaussian in depth order, with full matrices, and culls only the
+Gaussians that the definition culls. The precision is that of the inputs.
 """
 
 from __future__ import annotations

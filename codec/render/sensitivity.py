@@ -4,7 +4,7 @@ quantization steps that follow from it.
 If the parameters carry independent errors e, the mean squared error of the image is the sum of W * e^2, where W is the
 mean over pixels and views of the squared derivative. A backward pass whose pixel gradients are random signs estimates
 all W at once, without bias (Hutchinson's estimator of a diagonal). The views stand on a sphere around the subject; they
-are not those by which `gscodec eval` judges.
+are not those of `gscodec eval`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .cpu import CpuBackend
 
 VIEWS, SIZE = 24, 512
 GREY = (0.5, 0.5, 0.5)
-DARKEST = 1e-3  # colour, in 0..1, of which the derivative is taken for black
+DARKEST = 1e-3  # colour, in 0..1, at which the derivative of black is taken
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,8 @@ class Importance:
     """Sensitivities in the units of the coded channels; pixels are 0 to 1.
 
     Attributes:
-        weights: attribute -> [N, C] f64, W of each channel. quats: of rotations about the Gaussian's own axes, as the
-            vector part of a quaternion that its quaternion is multiplied by from the right.
+        weights: attribute -> [N, C] f64, W of each channel. quats: W of rotations about the Gaussian's own axes (vector
+            part of a quaternion that is multiplied from the right).
         scene_rotations: [N, 3] f64, W of rotations about the axes of the scene (multiplied from the left).
         removal: [N] f64, mean squared error of the image without this Gaussian.
     """
@@ -50,11 +50,11 @@ class Importance:
         return Importance(weights, self.scene_rotations[index], self.removal[index])
 
     def with_weights(self, **weights: np.ndarray) -> Importance:
-        """The same with other sensitivities of some attributes."""
+        """This importance with other sensitivities of some attributes."""
         return replace(self, weights=self.weights | weights)
 
     def at_least(self, other: Importance, share: float, among: np.ndarray) -> Importance:
-        """The same, but of the Gaussians `among` ([N] bool) at least `share` of `other`."""
+        """This importance, for the Gaussians `among` ([N] bool) at least `share` times `other`."""
         some = among[:, None]
         weights = {n: np.where(some, np.maximum(w, share * other.weights[n]), w) for n, w in self.weights.items()}
         turns = np.where(some, np.maximum(self.scene_rotations, share * other.scene_rotations), self.scene_rotations)
@@ -62,7 +62,7 @@ class Importance:
         return Importance(weights, turns, removal)
 
     def with_axes(self, order: np.ndarray) -> Importance:
-        """The same for Gaussians whose own axes are in `order` ([N, 3] int)."""
+        """This importance for Gaussians whose own axes are in `order` ([N, 3] int)."""
         own = {n: np.take_along_axis(self.weights[n], order, 1) for n in ("log_scales", "quats")}
         return self.with_weights(**own)
 
@@ -71,8 +71,7 @@ def sensitivity_cameras(means: np.ndarray, given: list[Camera] = (), count: int 
     """`count` cameras on a Fibonacci sphere around the 1-99 % box of `means`, every other one at half the distance.
 
     Args:
-        given: cameras of the capture; they take the place of up to half of the others, since they may stand within the
-            scene.
+        given: cameras of the capture; they replace up to half of the others, since they may stand within the scene.
     """
     taken = [given[i] for i in np.linspace(0, len(given) - 1, min(len(given), count // 2)).round().astype(int)]
     fitted = [of_width(c, SIZE) for c in taken]
@@ -81,7 +80,7 @@ def sensitivity_cameras(means: np.ndarray, given: list[Camera] = (), count: int 
 
 
 def of_width(camera: Camera, width: int) -> Camera:
-    """The camera with pictures of `width` pixels."""
+    """The camera with images of `width` pixels."""
     return camera.resized(width, max(1, round(width * camera.height / camera.width)))
 
 
@@ -89,7 +88,7 @@ def measure(shown: Callable[[int], Gaussians], cameras: list[Camera], *, backend
     """Sensitivity over several frames of the same N >= 1 Gaussians.
 
     Args:
-        shown: view -> the Gaussians that it shows.
+        shown: index of a view -> the Gaussians that it shows.
         cameras: one for each view, all frames together.
         backend: a new CpuBackend if None.
     """
@@ -110,13 +109,13 @@ def measure(shown: Callable[[int], Gaussians], cameras: list[Camera], *, backend
 
 
 def _above_black(g: Gaussians) -> Gaussians:
-    """`g` with its darkest colours a little brighter: at black the rasterizer cuts off, and the derivative says nothing
-    of a step up."""
+    """`g` with its darkest colours a little brighter: at black the rasterizer clamps, and the derivative says nothing
+    about a step up."""
     return replace(g, sh0=np.maximum(g.sh0, np.float32((DARKEST - 0.5) / SH_C0)))
 
 
 def params_of(g: Gaussians, turns: np.ndarray | None = None) -> dict[str, np.ndarray]:
-    """The arrays of `g` by name, as a backend takes them; `turns`: rotations [N, 4] that turn its harmonics."""
+    """The arrays of `g` by name, as a backend takes them; `turns`: rotations [N, 4] of its SH."""
     params = {name: np.ascontiguousarray(getattr(g, name), np.float32) for name in PARAMETERS}
     return params if turns is None else {**params, TURNS: turns}
 
@@ -141,7 +140,7 @@ def derivatives(
         by_picture: image of `camera` over `background` -> derivative by its pixels, [H, W, 3] f32 both.
         names: attributes; quats by rotations about the Gaussian's own axes, "scene_rotations" about those of the scene.
             shN is left out where there is none.
-        turns: rotations [N, 4] by which the harmonics of `g` are turned; None: they are not.
+        turns: rotations [N, 4] of the SH of `g`; None: SH is not rotated.
     """
     by_pixels = lambda image, alpha: (by_picture(image), np.zeros_like(alpha))  # noqa: E731
     grads = backend.backpropagate(params_of(g, turns), camera, background, by_pixels)

@@ -52,7 +52,7 @@ class Workspace:
         return dict(self.native.timings())
 
     def forward(self, params, camera: Camera, background, training: bool = False):
-        """Renders `params`, the six arrays in the order of PARAMETERS, and TURNS behind them or not.
+        """Renders `params`, the six arrays in the order of PARAMETERS, then TURNS or nothing.
 
         Returns:
             image [H, W, 3] f32 and alpha [H, W] f32, new arrays.
@@ -71,8 +71,8 @@ class Workspace:
         return flat.reshape(camera.height, camera.width, 3)
 
     def gradients(self, params) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-        """Arrays in the shapes of `params`, without TURNS, and two statistics [N]; every second call gives the same
-        ones while the shapes stay, so that those of the step before can still be read."""
+        """Arrays in the shapes of `params`, without TURNS, and two statistics [N]. Two sets alternate from call to call
+        while the shapes stay, so that the arrays of the step before can still be read."""
         self._grads = self._grads[::-1]
         grads = self._grads[0]
         n = len(params[0])
@@ -85,7 +85,7 @@ class Workspace:
 
 
 def view(camera: Camera) -> dict:
-    """A camera as the native side takes them.
+    """A camera in the form of the native side.
 
     Raises:
         UsageError: the camera has distortion or skew.

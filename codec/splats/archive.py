@@ -12,7 +12,7 @@ from pathlib import Path
 from ..errors import CaptureError
 
 FILES_MAX = 100_000
-RATIO_MAX = 100  # splats hardly shrink; a zip that promises more is a bomb
+RATIO_MAX = 100  # of unpacked to packed bytes; splats hardly shrink, so a zip with a higher ratio is a zip bomb
 SPARE = 256 << 20  # bytes that stay free on the disk
 _folders: list[tempfile.TemporaryDirectory] = []  # removed at exit
 
@@ -36,7 +36,7 @@ def _unpacked(path: Path, _: int, size: int) -> Path:
             folder = tempfile.TemporaryDirectory(prefix="gscodec-")
             _folders.append(folder)
             for member in members:
-                z.extract(member, folder.name)  # leaves out what would lead outside
+                z.extract(member, folder.name)  # drops parts of the path that lead outside
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as e:
         raise CaptureError(f"{path}: not a readable zip ({e}), expected a zip of splats") from None
     inner = Path(folder.name)
@@ -48,7 +48,7 @@ def _unpacked(path: Path, _: int, size: int) -> Path:
 
 
 def _is_litter(name: str) -> bool:
-    """What archivers of macOS add."""
+    """Whether the file is one that archivers of macOS add."""
     return name.startswith("__MACOSX/") or name.rpartition("/")[2].startswith(".")
 
 

@@ -1,7 +1,7 @@
 """SuperSplat .compressed.ply <-> Gaussians: 16 bytes per Gaussian, quantized in chunks of 256.
 
 Each chunk has its range of positions, log scales and colours; a Gaussian has four words: position and scale in
-11+10+11 bits, the three smallest quaternion components in 10 bits each behind the index of the largest (wxyz),
+11+10+11 bits, the three smallest quaternion components in 10 bits each after the index of the largest (wxyz),
 colour and opacity in 8 bits. SH coefficients are bytes over -4..4 in an element of their own. Other writers sort the
 Gaussians; this one keeps their order, so that index i is the same Gaussian in all frames of a sequence.
 """

@@ -1,4 +1,4 @@
-"""What a splat input is, for `gscodec info`: its format in words, frames, Gaussians, harmonics and bytes."""
+"""Description of a splat input for `gscodec info`: its format in words, frames, Gaussians, harmonics and bytes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def describe_splats(path: Path) -> dict:
     """Keys: format, frames, fps, mode, gaussians (of the first frame), sh_degree, bytes.
 
     Raises:
-        CaptureError: the input is no splats, or damaged.
+        CaptureError: the input is not splats, or damaged.
     """
     inner = unpacked(path) if path.suffix.lower() == ".zip" else path
     name = format_of(inner) + (" in a zip" if inner != path else "")

@@ -1,6 +1,6 @@
 """Draco point clouds (.drc) <-> Gaussians: positions only.
 
-A point that is read becomes a light, opaque ball as wide as the mean distance to its nearest neighbours, like the
+A point becomes a light, opaque, isotropic Gaussian whose scale is the mean distance to its nearest neighbours, like the
 initial Gaussians of 3DGS.
 """
 

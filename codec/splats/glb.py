@@ -1,7 +1,7 @@
 """Gaussians -> binary glTF 2.0 with KHR_gaussian_splatting (Khronos, release candidate of 2026).
 
 One point primitive with the attributes of the ellipse kernel, all f32, and COLOR_0 for viewers without the extension.
-Values stay as they are: the node turns the scene upright, for glTF has y up and z to the front.
+Values stay as they are: the node turns the scene upright, since glTF has y up and z to the front.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ KERNEL = {
 HALF = float(np.sqrt(0.5))
 UPRIGHT = {  # up axis of the scene -> quaternion xyzw that turns it to +y
     "y": (0.0, 0.0, 0.0, 1.0),
-    "-y": (0.0, 0.0, 1.0, 0.0),  # about z: what a .ply has in front stays in front
+    "-y": (0.0, 0.0, 1.0, 0.0),  # about z: the front of a .ply stays in front
     "z": (-HALF, 0.0, 0.0, HALF),
     "-z": (HALF, 0.0, 0.0, HALF),
     "x": (0.0, 0.0, HALF, HALF),

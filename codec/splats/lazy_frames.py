@@ -1,4 +1,4 @@
-"""Frames of files that are read when they are asked for: sequences may be larger than memory."""
+"""Frames that are read from files on demand: sequences may be larger than memory."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Frames(Sequence):
 
 
 class FrameRange(Sequence):
-    """A range of the frames of a `Frames`, as lazy as it."""
+    """A range of the frames of a `Frames`, also lazy."""
 
     def __init__(self, frames: Frames, index: range):
         self._frames, self._index = frames, index

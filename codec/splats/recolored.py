@@ -1,4 +1,4 @@
-"""Frames of splats that others have recoloured -> a group with these colours over its own geometry."""
+"""Splat frames recoloured by another tool -> a group with these colours and its own geometry."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from ..model.parametric_group import ParametricGroup
 from ..model.rotations import turned_harmonics
 from ..model.temporal_transform import dct_basis
 
-APART = 0.01  # of the size of a group; a Gaussian that lies farther from its place is another one
+APART = 0.01  # of the extent of the positions; a Gaussian farther from its position in the stream is another one
 
 
 def with_colors(
     group: ParametricGroup, frames: Sequence[Callable[[], Gaussians]], names: Sequence[str]
 ) -> ParametricGroup:
-    """The group with the colours of frames that `gscodec decode` wrote of it, and others have changed.
+    """The group with the colours of its frames, which `gscodec decode` wrote and another tool has recoloured.
 
     Args:
-        frames: of each frame of the group what reads it: all its Gaussians in their order, or those that it shows.
-        names: of each, for messages.
+        frames: for each frame of the group a function that reads its Gaussians in order: all, or the visible ones.
+        names: name of each frame, for messages.
 
     Raises:
         CaptureError: the Gaussians are not those of the group, or have harmonics that it has no room for.
@@ -43,7 +43,7 @@ def with_colors(
 
 
 def _shown(group: ParametricGroup, t: int) -> np.ndarray:
-    """[N] bool: Gaussians that frame `t` shows."""
+    """[N] bool: visible Gaussians of frame `t`."""
     life = group.lifetimes
     return np.ones(len(group.canonical), bool) if life is None else living(life, t)
 
@@ -75,7 +75,7 @@ def _filled(before: np.ndarray, new: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def _with(group: ParametricGroup, colors: dict[str, np.ndarray]) -> ParametricGroup:
-    """The group with colours [T, N, ...] of its frames; outside of a lifetime those of the nearest frame inside."""
+    """The group with colours [T, N, ...] of its frames; outside a lifetime, the colours of the nearest frame inside."""
     n, frames = len(group.canonical), len(group)
     canonical, trajectories = {}, {k: v for k, v in group.trajectories.items() if k not in colors}
     for name, values in colors.items():

@@ -1,9 +1,9 @@
 """A folder, a file or a zip of splats -> GaussianSequence with lazy frames; sequence_writer.py is its mirror.
 
-A folder with sequence.json has its groups, lifetimes and nodes in it. VideoGS and .splatv have their own groups, in
-which index i is one Gaussian. Anything else: either index i is verified to be the same Gaussian from frame to frame
-(tracked), or the Gaussians are matched, or each frame is a group of its own. Frames are read when they are asked for; a
-few stay in memory.
+A folder with sequence.json contains its groups, lifetimes and nodes. VideoGS and .splatv have their own groups, in
+which index i is one Gaussian. Other inputs: either index i is verified to be the same Gaussian from frame to frame
+(tracked), or the Gaussians are matched, or each frame is a group of its own. Frames are read on demand; a few stay in
+memory.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from .splatv import read_splatv, splatv_header
 from .tracking import relate
 from .videogs import find_checkpoints, find_packed, open_packed
 
-FPS = 30.0  # of folders without sequence.json
+FPS = 30.0  # frames per second of folders without sequence.json
 SCENES = "a .splatv, VideoGS's checkpoint, feature_image or feature_video, or a zip of any of these"
 
 
@@ -49,7 +49,7 @@ class SplatSequence(GaussianSequence):
             verified to be the same Gaussian), "matched" (Gaussians of some frames were reordered) or "independent"
             (groups of one frame).
         names: file name of each frame.
-        training: what `gscodec train` has left besides (`SequenceWriter`); None: others made the splats.
+        training: facts that `gscodec train` wrote (`SequenceWriter`); None: another tool made the splats.
     """
 
     mode: str = "stored"
@@ -73,13 +73,13 @@ def is_scene(path: Path) -> bool:
 
 
 def detect_input(path: str | Path) -> str:
-    """What kind of input `path` is.
+    """The kind of input at `path`.
 
     Returns:
         "capture" or "splats".
 
     Raises:
-        CaptureError: neither; lists what was looked for.
+        CaptureError: neither; lists the known formats.
     """
     path = Path(path)
     if not path.exists():
@@ -95,7 +95,7 @@ def detect_input(path: str | Path) -> str:
 
 
 def _instead(path: Path) -> str:
-    """What `path` is instead of an input, where that is known, the start of a sentence."""
+    """The start of an error message: the kind of file or folder at `path`; empty: unknown."""
     if path.is_file():
         return "a stream already, " if path.suffix.lower() == ".gsv" else ""
     suffixes = [p.suffix.lower() for p in path.iterdir()]
@@ -118,8 +118,8 @@ def open_sequence(
     """Opens a folder of splats (or a single one, a moving scene or a zip) as a sequence.
 
     Args:
-        gop: frames of a group at most, where there is no sequence.json.
-        fps: frames a second; None: that of sequence.json, or 30.
+        gop: largest number of frames in a group, if there is no sequence.json.
+        fps: frames per second; None: that of sequence.json, or 30.
         progress: called with (pairs of frames checked, pairs) while tracking is verified.
 
     Raises:
@@ -151,7 +151,7 @@ def open_sequence(
 
 
 def _scene(path: Path, gop: int) -> tuple[list[DenseGroup], list[str], float]:
-    """Groups of a file or a folder for which `is_scene` holds, the names of their frames, and frames a second."""
+    """Groups of a file or a folder for which `is_scene` holds, the names of their frames, and frames per second."""
     if path.suffix.lower() != ".splatv":
         return *open_packed(find_packed(path), gop), FPS
     head = splatv_header(path)
@@ -214,7 +214,7 @@ def _stored(path: Path, paths: list[Path], fps: float | None) -> SplatSequence:
 def _stored_group(
     path: Path, paths: list[Path], start: int, count: int, extra: str | None, sha256: str | None
 ) -> DenseGroup | ParametricGroup:
-    """A group as it was written; one whose frames were edited since is dense."""
+    """A group as it was written; a group whose frames were edited since is dense."""
     own = paths[start : start + count]
     if not extra:
         return DenseGroup(Frames(own, {})[:])

@@ -1,9 +1,8 @@
 """GaussianSequence -> a folder with one .ply per frame and sequence.json; the mirror of sequence.py.
 
 Other tools see plain 3DGS files. All frames of a group have the same indices: a Gaussian outside its lifetime is
-written with an opacity that shows nothing, and its true opacity is in the .npz of the group, beside the nodes. Groups
-are added one by one. sequence.json is replaced after each group: finished groups can be used, and a stopped run can
-resume.
+written with an invisible opacity, and its true opacity is in the .npz of the group, beside the nodes. Groups are added
+one by one. sequence.json is replaced after each group: finished groups can be used, and a stopped run can resume.
 """
 
 from __future__ import annotations
@@ -46,8 +45,8 @@ class SequenceWriter:
     ):
         """
         Args:
-            training: what `encode` must know of a trained sequence (JSON-able): capture, range, sh_degree, gaussians,
-                frames.
+            training: facts that `encode` needs about a trained sequence (JSON-able): capture, range, sh_degree,
+                gaussians, frames.
             resume: continue after the groups of an existing sequence.json; otherwise it is removed.
         """
         self._folder = Path(folder)
@@ -64,7 +63,7 @@ class SequenceWriter:
         return sum(g["frames"] for g in self.groups)
 
     def add(self, group: DenseGroup | ParametricGroup, progress: Callable[[int], None] | None = None) -> None:
-        """Writes a group; `progress` is called with the number of frames written in all."""
+        """Writes a group; `progress` is called with the number of all frames written so far."""
         start, extra, digest = self.frame_count, {}, hashlib.sha256()
         for t in range(len(group)):
             g = group.frame(t)
@@ -81,7 +80,7 @@ class SequenceWriter:
         entry = {"start": start, "frames": len(group)}
         if isinstance(group, ParametricGroup):
             extra |= parametric_file.to_arrays(group)
-            entry["sha256"] = digest.hexdigest()  # of the frames: whoever edits them, codes them as they are
+            entry["sha256"] = digest.hexdigest()  # of the frames: edited frames are coded as they are
         else:
             extra |= {n: v for n in ("lifetimes", "parents") if (v := getattr(group, n)) is not None}
         if extra:

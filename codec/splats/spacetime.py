@@ -16,7 +16,7 @@ from ..model.gaussians import Gaussians, logit, sigmoid
 
 ALPHA_MIN = 1 / 255  # an opacity below it shows nothing (spec 14)
 FADE_MIN = 0.02  # a share of the peak opacity below it is not drawn by antimatter15/splaTV
-WIDTH_MIN = 1e-6  # of an opacity in time
+WIDTH_MIN = 1e-6  # least width of an opacity in time
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class SpacetimeGaussians:
     """N Gaussians over a time of 0 to 1.
 
     Attributes:
-        rest: as they are at time `centers`, with their highest opacities; quats may have any length.
+        rest: the Gaussians at time `centers`, with their highest opacities; quats may have any length.
         motion: [3, N, 3] f64, linear, quadratic and cubic coefficients of the position in time from `centers`.
-        turn: [N, 4] f64, what is added to the quaternion by time, before it is normalized.
+        turn: [N, 4] f64, change of the quaternion per unit of time, before it is normalized.
         centers: [N] f64, time of the highest opacity.
         widths: [N] f64, opacity falls by exp(-((time - center) / width)^2); inf: it stays.
     """
@@ -50,7 +50,7 @@ class SpacetimeGaussians:
         return np.exp(-(((time - self.centers) / np.maximum(self.widths, WIDTH_MIN)) ** 2))
 
     def shown(self, time: float) -> np.ndarray:
-        """[N] bool, whether anything of a Gaussian can be seen at `time`."""
+        """[N] bool: Gaussians that are visible at `time`."""
         fade = self.fade(time)
         return (fade >= FADE_MIN) & (fade * sigmoid(self.rest.logit_opacities) >= ALPHA_MIN)
 
@@ -60,7 +60,7 @@ class SpacetimeGaussians:
         a, b, c = self.motion
         quats = self.rest.quats + self.turn * dt
         length = np.linalg.norm(quats, axis=1, keepdims=True)
-        still = length[:, 0] < 1e-9  # turned through nothing: as at rest
+        still = length[:, 0] < 1e-9  # the quaternion passes through 0: as at rest
         quats = np.where(still[:, None], self.rest.quats, quats / np.maximum(length, 1e-9))
         logits = logit(self.fade(time) * sigmoid(self.rest.logit_opacities))
         means = self.rest.means + dt * (a + dt * (b + dt * c))
@@ -68,7 +68,7 @@ class SpacetimeGaussians:
 
 
 class SpacetimeFrames(Sequence):
-    """Frames at the given times, made when they are asked for."""
+    """Frames at the given times, made on demand."""
 
     def __init__(self, scene: SpacetimeGaussians, times: Sequence[float]):
         self._scene, self._times = scene, times

@@ -1,6 +1,6 @@
 """A sequence -> Spacetime Gaussians, by least squares for each Gaussian: cubic positions, linear rotations, an opacity
-that is a Gaussian in time, one size and one colour. What moves or fades otherwise is met only roughly; the caller
-compares the frames and decides.
+that is a Gaussian in time, one size and one colour. Other motions and fades are only approximated; the caller compares
+the frames and decides.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from ..model.gaussians import Gaussians, logit, sigmoid
 from .spacetime import FADE_MIN, SpacetimeGaussians
 
 VALUES_MAX = 60_000_000  # Gaussians times frames that are fitted at once, 56 bytes each
-HIDDEN = 0.002  # opacity that a Gaussian is to have next to its lifetime
-HIDDEN_WEIGHT = 0.1  # of that, in shares of the weight of its highest opacity
-EDGE = 3  # frames next to a lifetime that are looked at
-WIDEST, NARROWEST = 1e4, 1e-3  # widths in time; the wider ones do not change
-POWERS = 4  # of a cubic
+HIDDEN = 0.002  # target opacity of a Gaussian next to its lifetime
+HIDDEN_WEIGHT = 0.1  # weight of that target, as a share of the weight of the highest opacity
+EDGE = 3  # frames next to a lifetime that have this target
+WIDEST, NARROWEST = 1e4, 1e-3  # widths in time; a wider opacity is constant
+POWERS = 4  # coefficients of a cubic
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,10 @@ class _Tracks:
 
 
 def fit_spacetime(sequence: GaussianSequence, identities: Sequence[np.ndarray]) -> SpacetimeGaussians:
-    """The scene of which frame t, at time t / T, is nearest to frame t of the sequence. Harmonics are left out.
+    """The scene whose state at time t / T is nearest to frame t of the sequence. Harmonics are left out.
 
     Args:
-        identities: [N] int of each group; the same number is the same Gaussian.
+        identities: for each group [N] int; equal numbers are the same Gaussian.
 
     Raises:
         UsageError: the sequence is empty, or too long for one fit.
@@ -85,9 +85,9 @@ def _tracks(sequence: GaussianSequence, identities: Sequence[np.ndarray], count:
 
 
 def _polynomial(dt: np.ndarray, values: np.ndarray, weights: np.ndarray, powers: int) -> np.ndarray:
-    """[powers, N, C] f64, the polynomial in dt [T, N] nearest to values [T, N, C]; high powers only where they are
-    needed."""
-    wanted = dt.shape[0] * 1e-9 * np.arange(powers) ** 2 + 1e-12  # ridge: few frames leave high powers open
+    """[powers, N, C] f64, the polynomial in dt [T, N] nearest to values [T, N, C]; a ridge keeps unneeded high powers
+    near 0."""
+    wanted = dt.shape[0] * 1e-9 * np.arange(powers) ** 2 + 1e-12  # ridge: few frames do not determine high powers
     basis = np.stack([dt**p for p in range(powers)])  # [P, T, N]
     normal = np.einsum("ptn,qtn,tn->npq", basis, basis, weights) + np.diag(wanted)
     right = np.einsum("ptn,tnc,tn->npc", basis, values.astype(np.float64), weights)
@@ -95,8 +95,8 @@ def _polynomial(dt: np.ndarray, values: np.ndarray, weights: np.ndarray, powers:
 
 
 def _fade(opacity, weights, shown, times) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Highest opacities, their times and the widths, [N] each: a parabola through the logarithm of the opacities. Where
-    it would show a Gaussian next to its lifetime, it is fitted to a low opacity there as well."""
+    """Highest opacities, their times and the widths, [N] each: a parabola fitted to the logarithm of the opacities. If
+    a Gaussian would be visible next to its lifetime, the fit includes a low opacity there."""
     near = np.zeros_like(shown)
     for k in range(1, EDGE + 1):
         near[k:] |= shown[:-k]
@@ -114,7 +114,7 @@ def _fade(opacity, weights, shown, times) -> tuple[np.ndarray, np.ndarray, np.nd
     falls = c < -1 / WIDEST**2
     c = np.minimum(c, -(WIDEST**-2))
     shift = np.where(falls, -b / (2 * c), 0)
-    far = np.abs(shift) > 1  # still rising or falling when the clip ends: the peak stays near
+    far = np.abs(shift) > 1  # opacity still rises or falls at the end of the clip: the peak stays near
     shift = np.clip(shift, -1, 1)
     mean = (weights * opacity).sum(0) / weights.sum(0)
     peaks = np.where(falls, np.exp(np.minimum(a + b * shift + c * shift**2, 0)), mean)
@@ -124,7 +124,7 @@ def _fade(opacity, weights, shown, times) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def _continuous(quats: np.ndarray, shown: np.ndarray) -> np.ndarray:
-    """[T, N, 4], each with the sign that is nearer to the last one that was shown."""
+    """[T, N, 4], each quaternion with the sign that is nearer to the last shown one."""
     out, last = quats.astype(np.float64), quats[shown.argmax(0), np.arange(quats.shape[1])].astype(np.float64)
     for t in range(len(out)):
         out[t] *= np.where(np.einsum("nc,nc->n", out[t], last) < 0, -1, 1)[:, None]

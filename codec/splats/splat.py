@@ -18,10 +18,10 @@ SCALE_MIN = 1e-9  # a scale of 0 has no logarithm
 
 
 def splat_count(path: Path) -> int:
-    """Gaussians of the file.
+    """Number of Gaussians in the file.
 
     Raises:
-        CaptureError: its size is no multiple of that of a Gaussian, or 0.
+        CaptureError: the size of the file is 0 or not a multiple of that of a Gaussian.
     """
     size = path.stat().st_size
     if not size or size % ROW.itemsize:

@@ -1,8 +1,8 @@
 """antimatter15's .splatv <-> Spacetime Gaussians.
 
-Eight bytes (magic, length of the header), a JSON list of chunks, and their data; the one of type "splat" is a texture
-with 64 bytes a Gaussian. A Gaussian without a finite position or orientation is left out, as viewers draw none. The
-file does not say how many frames were trained, unless this module wrote it: then it has 50, the usual clip of Spacetime
+Eight bytes (magic, length of the header), a JSON list of chunks, and their data; the chunk of type "splat" is a texture
+with 64 bytes per Gaussian. A Gaussian without a finite position or orientation is left out, since viewers do not draw
+it. Only files that this module wrote state the number of frames; other files count as 50, the usual clip of Spacetime
 Gaussians.
 """
 
@@ -24,9 +24,9 @@ from .spacetime import SpacetimeGaussians
 
 MAGIC = 0x674B
 HEADER_MAX = 1 << 20  # bytes of JSON
-FRAMES, FPS = 50, 30.0  # over the time from 0 to 1, where the file does not say; frame t is at t / FRAMES
+FRAMES, FPS = 50, 30.0  # over the time from 0 to 1, if the file does not state them; frame t is at t / FRAMES
 FRAMES_MAX = 100_000
-FAR = 1e9  # a position beyond it is no position
+FAR = 1e9  # a position beyond it is invalid
 SCALE_MIN = 6e-8  # the least f16; a scale of 0 has no logarithm
 ROW = np.dtype(
     [
@@ -34,16 +34,17 @@ ROW = np.dtype(
         ("motion", "<f2", (3, 3)), ("unused2", "<f2"), ("turn", "<f2", 4), ("center", "<f2"), ("width", "<f2"),
     ]
 )  # fmt: skip
-LINE = 1024  # Gaussians in a line of the texture; writers may leave the rest of the last line away
+LINE = 1024  # Gaussians in a line of the texture; writers may omit the rest of the last line
 
 
 @dataclass(frozen=True)
 class SplatvHeader:
-    """What a file says before its texture.
+    """The header of a file.
 
     Attributes:
-        start: byte of the first Gaussian. count: Gaussians, of which some may not be drawable.
-        frames, fps: of the clip.
+        start: byte of the first Gaussian.
+        count: number of Gaussians; some may not be drawable.
+        frames, fps: number of frames of the clip, and frames per second.
     """
 
     start: int
@@ -116,13 +117,13 @@ def write_splatv(
     """Writes a .splatv; colours are clipped to 8 bits.
 
     Args:
-        frames, fps: of the clip, which viewers do not need.
-        cameras: from which a viewer may start; none: one in front of the scene.
+        frames, fps: number of frames of the clip, and frames per second; viewers do not need them.
+        cameras: start cameras for a viewer; none: one in front of the scene.
     """
     lines = -(-len(scene) // LINE)
     rows = np.zeros(lines * LINE, ROW)
     own, g = rows[: len(scene)], scene.rest
-    with np.errstate(over="ignore"):  # an infinite width is one of f16
+    with np.errstate(over="ignore"):  # an infinite width becomes the largest f16
         own["means"], own["quats"], own["scales"] = g.means, g.quats, np.exp(g.log_scales)
         own["rgba"][:, :3] = np.clip(np.rint((g.sh0 * SH_C0 + 0.5) * 255), 0, 255)
         own["rgba"][:, 3] = np.rint(255 / (1 + np.exp(-g.logit_opacities.astype(np.float64))))
@@ -137,7 +138,7 @@ def write_splatv(
 
 
 def _camera(i: int, c: Camera) -> dict:
-    """A camera as viewers know it: rotation from the camera to the world."""
+    """A camera in the viewers' form: rotation from the camera to the world."""
     pose = {"position": c.center.tolist(), "rotation": c.viewmat[:3, :3].T.tolist()}
     size = {"width": c.width, "height": c.height, "fx": float(c.K[0, 0]), "fy": float(c.K[1, 1])}
     return {"id": i, "img_name": c.name} | size | pose

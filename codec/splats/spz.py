@@ -1,13 +1,13 @@
-"""Niantic's .spz, versions 2 to 4 <-> Gaussians: 8-bit attributes, 24-bit positions, planes behind each other.
+"""Niantic's .spz, versions 2 to 4 <-> Gaussians: 8-bit attributes, 24-bit positions, one plane after the other.
 
 | version | container | rotations |
 |---|---|---|
 | 2 | one gzip stream, header within | x, y, z in 8 bits each |
-| 3 | the same | the three smallest in a sign and 9 bits each, behind the index of the largest |
-| 4 | plain header, a table of sizes, one zstd stream for each plane | as 3 |
+| 3 | the same | the three smallest in a sign and 9 bits each, after the index of the largest |
+| 4 | plain header, a table of sizes, one zstd stream for each plane | as in 3 |
 
-Axes are right, up, back, those of a .ply right, down, forward: y and z change signs. Version 3 is written, since all
-readers know it; 4 differs by its container.
+Axes are right, up, back; those of a .ply are right, down, forward: y and z change signs. Version 3 is written, since
+all readers know it; 4 differs only by its container.
 """
 
 from __future__ import annotations
@@ -29,24 +29,27 @@ MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
 WRITTEN = 3
 SH_DEGREES = {0: 0, 1: 3, 2: 8, 3: 15, 4: 24}  # degree -> coefficients a channel; those of degree 4 are not used
-POSITION_BITS = 12  # of the fraction, where positions need no more of the 24 bits
+POSITION_BITS = 12  # fraction bits, unless large positions need more of the 24 bits
 COLOR_SCALE = 0.15  # of sh0, which is wider than 0 to 1
 GAUSSIANS_MAX = 50_000_000
 LEAST_BYTES = (
     1 / 40
-)  # of the file for each Gaussian, which has 19 to 92 plain ones: a file that promises more is a bomb
+)  # least bytes of the file per Gaussian, which has 19 to 92 unpacked bytes; a file with fewer is a zip bomb
 COORDINATES = 0xADBE0003  # record of another coordinate system (SPZ_ADOBE_coordinate_system)
 RUB = 4
-RDF = np.array([1, -1, -1])  # axes of a .spz in those of a .ply
+RDF = np.array([1, -1, -1])  # signs from the axes of a .spz to those of a .ply
 RDF_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])  # the same for harmonics, degree 1 to 3
 
 
 @dataclass(frozen=True)
 class Header:
-    """What a file says before its planes.
+    """The header of a file.
 
     Attributes:
-        version: 2 to 4. count: Gaussians. degree: of the harmonics. fraction: bits behind the point of positions.
+        version: 2 to 4.
+        count: number of Gaussians.
+        degree: SH degree.
+        fraction: fraction bits of positions.
     """
 
     version: int
@@ -55,7 +58,7 @@ class Header:
     fraction: int
 
     def planes(self) -> dict[str, int]:
-        """Plane -> bytes a Gaussian, in the order of the file; no plane is empty."""
+        """Plane -> bytes per Gaussian, in the order of the file; no plane is empty."""
         rotation = 3 if self.version == 2 else 4
         sizes = {"means": 9, "alphas": 1, "colors": 3, "scales": 3, "quats": rotation}
         return sizes | ({"sh": 3 * SH_DEGREES[self.degree]} if self.degree else {})
@@ -191,7 +194,7 @@ def write_spz(path: Path, gaussians: Gaussians) -> None:
     """Writes a .spz of version 3, harmonics in 8 bits.
 
     Raises:
-        CaptureError: there are no Gaussians, or one is too far off for 24 bits.
+        CaptureError: there are no Gaussians, or a position is too large for 24 bits.
     """
     g = gaussians
     if not len(g):

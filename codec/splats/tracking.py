@@ -12,13 +12,13 @@ import numpy as np
 
 from ..errors import require
 
-FAR_BELOW = 0.1  # median displacement of tracked Gaussians over that of random pairs, at most
+FAR_BELOW = 0.1  # largest ratio of the median displacement of tracked Gaussians to that of random pairs
 ROUGH = 1.5  # displacement fields at least this rough are no motion
 SMOOTH = 0.1  # identity is taken without trying a matching up to this roughness
 BETTER = 0.5  # a matching replaces identity if its roughness is below this share of identity's
 MUTUAL = 0.9  # least share of mutual nearest neighbours in a matching
 SAMPLES = 4000  # Gaussians that roughness is measured on
-LEFT_MAX = 3000  # Gaussians at most that are matched by assignment, whose time is cubic
+LEFT_MAX = 3000  # Gaussians, at most, that are matched by assignment, which takes cubic time
 
 
 def relate(a: np.ndarray, b: np.ndarray) -> np.ndarray | bool:

@@ -1,13 +1,13 @@
 """VideoGS (V3, Wang et al. 2024): its checkpoints and its packed maps -> frames.
 
-    checkpoint/FRAME/point_cloud/iteration_N/point_cloud.ply     as trained: standard .ply, the last iteration counts
+    checkpoint/FRAME/point_cloud/iteration_N/point_cloud.ply     as trained: standard .ply; the last iteration is read
     feature_image/groupG/FRAME_PLANE.png, group_info.json, viewer_min_max.json (or min_max.json)
     feature_video/png_all_QP/groupG/PLANE.mp4, group_info.json, viewer_min_max.json
 
 A column c of a checkpoint's .ply (position, normal, sh0, shN, opacity, scales, rotation) is plane c + 3 in 8 bits
-between its least and largest value in the frame; a position is two planes, the low and the high byte of 16 bits. One
-of the published scripts packs exp(scale), sigmoid(opacity) and harmonics by coefficient, the other all as trained:
-only the former has no scale below 0.
+between its least and largest value in the frame; a position is two planes, the low and the high byte of 16 bits. One of
+the published scripts packs exp(scale), sigmoid(opacity) and harmonics by coefficient; the other packs all values as
+trained. Only the first has no scale below 0.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def find_checkpoints(path: Path) -> list[Path]:
 
 
 def find_packed(path: Path) -> Path | None:
-    """The folder of packed maps in, or at, `path`: images rather than videos, which are coded with loss."""
+    """The folder of packed maps in, or at, `path`; images are preferred to videos, which are lossy."""
     inside = [path, path / "feature_image", *sorted(path.glob("feature_video/*")), *sorted(path.glob("png_all_*"))]
     ranges = lambda p: (p / RANGES).is_file() or (p / RANGES_FLAT).is_file()  # noqa: E731
     return next((p for p in inside if (p / INFO).is_file() and ranges(p)), None)
@@ -56,11 +56,14 @@ def find_packed(path: Path) -> Path | None:
 
 @dataclass(frozen=True)
 class PackedFrame:
-    """Where a frame is packed, and what its integers mean.
+    """Location of a packed frame, and the ranges of its integers.
 
     Attributes:
-        folder: of its group. name: its number. place: in the videos of the group.
-        count: Gaussians. ranges: [columns, 2] f64, least and largest value.
+        folder: folder of its group.
+        name: its number.
+        place: its index in the videos of the group.
+        count: number of Gaussians.
+        ranges: [columns, 2] f64, least and largest value.
     """
 
     folder: Path
@@ -92,7 +95,7 @@ class OpenVideos:
 
 
 class PackedFrames(Sequence):
-    """Frames of a group, read when they are asked for; thread-safe."""
+    """Frames of a group, read on demand; thread-safe."""
 
     def __init__(self, frames: list[PackedFrame], videos: OpenVideos):
         self._frames, self._videos = frames, videos
@@ -188,7 +191,7 @@ def open_packed(folder: Path, gop: int) -> tuple[list[DenseGroup], list[str]]:
 
 
 def _ranges(folder: Path) -> dict[int, tuple[int, np.ndarray]]:
-    """Frame -> Gaussians, and [columns, 2] least and largest values."""
+    """Frame -> number of Gaussians, and [columns, 2] least and largest values."""
     path = folder / RANGES if (folder / RANGES).is_file() else folder / RANGES_FLAT
     try:
         data = json.loads(path.read_text())
@@ -208,7 +211,7 @@ def _ranges(folder: Path) -> dict[int, tuple[int, np.ndarray]]:
 
 
 def _nested(flat: dict) -> dict:
-    """min_max.json as viewer_min_max.json is: "0_num", "0_3_min" ... -> {"0": {"num": ..., "info": [...]}}."""
+    """min_max.json in the form of viewer_min_max.json: "0_num", "0_3_min" ... -> {"0": {"num": ..., "info": [...]}}."""
     frames = {k[:-4]: int(v) for k, v in flat.items() if k.endswith("_num")}
     out = {}
     for name, count in frames.items():

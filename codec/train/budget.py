@@ -1,9 +1,9 @@
-"""What a scene needs: points to start from and steps of a keyframe, from the pixels that its pictures show of it.
+"""Budget of a keyframe: its initial points and optimisation steps, from the pixels that show the scene.
 
-A preset is a price, the same for all scenes: of a dB in bits (below which screen gradient a Gaussian is not split, and
-above which contribution it stays) and in seconds (steps for a small picture). How many Gaussians there are follows from
-what is still wrong in the pictures; a larger picture has more of them to place, and its keyframe gets more steps. Very
-small pictures get more steps, too, in every frame, so that as many pixels are seen: a step costs hardly less there.
+A preset is a price, the same for all scenes: of a dB in bits (the screen gradient below which a Gaussian is not split,
+the contribution above which it stays) and in seconds (steps for a small picture). The number of Gaussians follows from
+the remaining error of the pictures. A larger picture needs more Gaussians, so its keyframe gets more steps. Very small
+pictures get more steps, too, in every frame, so that as many pixels are seen: there a step costs hardly less.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from .views import Views
 
 @dataclass(frozen=True)
 class Budget:
-    """Of one keyframe.
+    """Budget of one keyframe.
 
     Attributes:
-        points: to start from, about.
+        points: initial points, about.
         steps: optimisation steps.
     """
 
@@ -37,8 +37,8 @@ def keyframe_budget(views: Views, frame: int, settings: TrainSettings) -> Budget
 
 
 def with_frame_budget(settings: TrainSettings, views: Views, frame: int) -> TrainSettings:
-    """Settings with the steps of a tracked frame: a large picture has fewer, since each costs more, and all frames of a
-    group together refine its Gaussians. And with the bound of drift behind a keyframe of so many steps."""
+    """Settings with the steps of a tracked frame and with the drift bound for the steps of its keyframe. A large
+    picture has fewer steps a frame: each costs more, and all frames of a group refine the same Gaussians."""
     covered, g = float(np.mean(views.covered(frame))), settings.group
     larger = _larger(covered, settings.budget)
     fit = max(1.0, larger * settings.keyframe_steps / g.drift_steps) ** g.drift_exponent
@@ -50,10 +50,10 @@ def with_frame_budget(settings: TrainSettings, views: Views, frame: int) -> Trai
 
 
 def _larger(covered: float, settings: BudgetSettings) -> float:
-    """Factor of the steps for pictures that are larger than those that a preset's steps are meant for, 1 for others."""
+    """Factor of the steps for pictures with more than `pixels` pixels of the scene, 1 for others."""
     return float(np.clip((covered / settings.pixels) ** settings.steps_exponent, 1.0, settings.steps_most))
 
 
 def _smaller(covered: float, settings: BudgetSettings) -> float:
-    """The same for pictures so small that a step costs hardly less; 1 where they show nothing."""
+    """Factor of the steps for pictures so small that a step costs hardly less, 1 for others and for empty pictures."""
     return float(np.clip(settings.small_pixels / covered, 1.0, settings.steps_most)) if covered else 1.0

@@ -1,10 +1,10 @@
 """Calibration of the training cameras: colour and pose of each, learned with a keyframe and kept while it is tracked.
-Fine-tuning learns the colour anew for each frame, where a keyframe's no longer holds.
+Fine-tuning learns the colour again for each frame, since the colour of the keyframe may not hold there.
 
-The mean over the cameras stays 0, since the brightness and the place of the scene cannot be told from that of all
-cameras together. Colour is learned from the first step on (as in Dynamic 3D Gaussians), so that Gaussians never take up
-what differs between cameras. Poses are learned late, since with missing shapes errors look like a wrong pose, and only
-where matched features say that they are off.
+The mean over the cameras stays 0: a change that all cameras share cannot be told from a change of the scene's
+brightness or place. Colour is learned from the first step on (as in Dynamic 3D Gaussians), so that Gaussians never
+learn the differences between cameras. Poses are learned late, because missing shapes look like pose errors, and only
+where matched features show that the poses are wrong.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .settings import TrainSettings
 
 
 class _Learned:
-    """A few values of each camera, learned with Adam; 0 is what the capture says.
+    """A few values of each camera, learned with Adam; 0 is the calibration of the capture.
 
     Args:
         count: cameras of the capture.
@@ -47,7 +47,7 @@ class _Learned:
         """One step of `values` ([C, K]) for one camera.
 
         Args:
-            name: of `values`.
+            name: of `values` in the optimiser.
             grad: [K], gradient of the loss.
             decay: multiplies the learning rate.
         """
@@ -57,10 +57,11 @@ class _Learned:
 
 
 class Exposure(_Learned):
-    """Colour of each training camera: gains and offsets of the channels of its rendered images, and of no others.
+    """Exposure of each training camera: gain and offset of each channel, applied only to images rendered for this
+    camera.
 
-    Values: log gains, then offsets in units of `offset_unit`: few cameras differ in their black. They are those of the
-    keyframe, then those of the last frame of a group, and hold for frames that have none of their own.
+    Values: log gains, then offsets in units of `offset_unit`, since few cameras differ in their black level. `values`
+    are those of the keyframe, later those of the last frame of a group; frames without own values use them.
     """
 
     def __init__(self, count: int, trained: list[int], settings: TrainSettings, backend: Backend):
@@ -70,7 +71,7 @@ class Exposure(_Learned):
         self._frame_weight, self._frame_free = c.frame_weight, np.float32(c.frame_free)
 
     def reset(self) -> None:
-        """As of `_Learned`, in all frames."""
+        """Sets all values to 0, in all frames."""
         super().reset()
         self._of_frame: dict[int, np.ndarray] = {}
 
@@ -80,12 +81,12 @@ class Exposure(_Learned):
         return np.exp(values[:3]), self._unit * values[3:]
 
     def applied_to(self, g: Gaussians, camera: int, frame: int) -> Gaussians:
-        """The Gaussians in the colours that `camera` has at `frame`."""
+        """The Gaussians with the exposure of `camera` at `frame` in their colours."""
         (gain, offset), grey = self.of(camera, frame), 0.5 / SH_C0
         return replace(g, sh0=gain * (g.sh0 + grey) - grey + offset / SH_C0, shN=gain * g.shN)
 
     def learn(self, camera: int, grad: np.ndarray, decay: float) -> None:
-        """One step for one camera and the keyframe.
+        """One step of the keyframe's values for one camera.
 
         Args:
             grad: [2, 3], gradients of the loss by the gain and the offset.
@@ -96,29 +97,29 @@ class Exposure(_Learned):
         self._step(values, "keyframe", camera, own + self._weight * values[camera], decay)
 
     def learn_in(self, frame: int, camera: int, grad: np.ndarray, decay: float) -> None:
-        """The same for one frame of a group, which is held near what was before the group."""
+        """One step of one frame's values for one camera; a Huber term holds them near the values before the group."""
         values = self._of_frame.setdefault(frame, self.values.copy())
         own = self._by_values(values[camera], grad)
         away = self._frame_weight * ((values[camera] - self.values[camera]) / self._frame_free).clip(-1, 1)
         self._step(values, str(frame), camera, own + away, decay)
 
     def go_on(self, frame: int) -> None:
-        """Later frames begin as `frame`, the last one of a group."""
+        """Later frames start from the values of `frame`, the last one of a group."""
         self.values = self._of_frame.get(frame, self.values).copy()
 
     def _by_values(self, values: np.ndarray, grad: np.ndarray) -> np.ndarray:
-        """[6], the gradient by the values of a camera."""
+        """[6], gradient of the loss by the values of a camera."""
         gain, offset = grad
         return np.concatenate([gain * np.exp(values[:3]), offset * self._unit])
 
 
 class Extrinsics(_Learned):
-    """Correction of each camera's pose, as a small rigid motion of the scene before it.
+    """Correction of each camera's pose: a small rigid motion of the scene, applied before the view matrix.
 
     Values: rotation vector about the center of the subject in radians, then translation in radii of the subject.
 
     Attributes:
-        learns: whether the calibration is off and `learn` does anything.
+        learns: whether poses are refined; if not, `learn` does nothing.
     """
 
     def __init__(self, count: int, trained: list[int], settings: TrainSettings, backend: Backend):
@@ -138,7 +139,7 @@ class Extrinsics(_Learned):
         return replace(camera, viewmat=camera.viewmat @ self.correction(index))
 
     def correction(self, index: int) -> np.ndarray:
-        """[4, 4] f64, the motion that camera `index` sees."""
+        """[4, 4] f64, the rigid motion of the scene for camera `index`."""
         from scipy.spatial.transform import Rotation
 
         R, t = Rotation.from_rotvec(self.values[index, :3]).as_matrix(), self.radius * self.values[index, 3:]
@@ -147,7 +148,7 @@ class Extrinsics(_Learned):
         return moved
 
     def learn(self, camera: int, params: dict, grads: dict, decay: float) -> None:
-        """One step for one camera, from the gradients by the Gaussians `params`: the motion moves all, to first order.
+        """One step for one camera, from the gradients by the Gaussians `params`, all of which move, to first order.
 
         Args:
             decay: multiplies the learning rate.

@@ -16,7 +16,7 @@ from .visual_hull import project
 
 
 class Changes:
-    """What the Gaussians have been fitted to, for each training camera of `views`.
+    """Reference image of each training camera of `views`: each pixel as it was last fitted.
 
     Args:
         fitted: [h, w, 3] u8 of each training camera, small images over mid-grey.
@@ -27,13 +27,13 @@ class Changes:
 
     @staticmethod
     def since(views: Views, frame: int, settings: ChangeDetectionSettings) -> Changes:
-        """All pixels fitted to `frame`."""
+        """Reference images that are those of `frame`."""
         changes = Changes(views, [], settings)
         changes.fitted = [changes._image(i, frame) for i in views.train_cameras]
         return changes
 
     def copy(self) -> Changes:
-        """A copy, to look at later frames without fitting to them."""
+        """A copy, to detect changes in later frames that do not yet count as fitted."""
         return Changes(self.views, [image.copy() for image in self.fitted], self.settings)
 
     def _image(self, camera: int, frame: int) -> np.ndarray:
@@ -78,13 +78,13 @@ class Changes:
         return ~self.behind(frame, masks, means, [np.ones(len(means), bool)] * len(masks))
 
     def behind(self, frame: int, masks: list[np.ndarray], means: np.ndarray, visible: list[np.ndarray]) -> np.ndarray:
-        """Gaussians behind the pixels of `masks`, [N] bool: enough of the cameras that see them have them there, and
-        they are not too far away to be what has changed (`far`).
+        """Gaussians behind the pixels of `masks`, [N] bool: a large enough share of the cameras that see a Gaussian
+        (`seen_share`) see it there, and it is not too far away to have changed (`far`).
 
         Args:
-            masks: [h, w] bool of each training camera, as of `advance`.
+            masks: [h, w] bool of each training camera, from `advance`.
             means: [N, 3] world units.
-            visible: [N] bool of each training camera, Gaussians that it sees.
+            visible: [N] bool of each training camera, Gaussians that the camera sees.
         """
         seen, hit = np.zeros(len(means), np.int32), np.zeros(len(means), np.int32)
         for camera, mask, sees in zip(self.views.train_cameras, masks, visible, strict=True):
@@ -97,11 +97,11 @@ class Changes:
         return ~self.far(means) & (hit > 0) & (hit >= self.settings.seen_share * seen)
 
     def far(self, means: np.ndarray) -> np.ndarray:
-        """[N] bool, which of `means` [N, 3] are too far away to tell how they move (`ChangeDetectionSettings.far`)."""
+        """[N] bool: `means` [N, 3] that are too far away to measure their motion (`ChangeDetectionSettings.far`)."""
         return self.views.distance(means) > self.settings.far * self.views.working_distance
 
     def _dilated(self, mask: np.ndarray) -> np.ndarray:
-        """[h, w] bool with a margin around it."""
+        """`mask` [h, w] bool with a margin around it."""
         import cv2
 
         size = 2 * round(self.settings.margin * mask.shape[1]) + 1

@@ -19,9 +19,9 @@ class Checkpoint:
         return self.folder / f"before_{next_frame:06d}.npz"
 
     def save(self, next_frame: int, state: dict[str, np.ndarray] | None) -> None:
-        """Writes the state before `next_frame`, atomically; None: there is none to write.
+        """Writes the state before `next_frame`, atomically; None: nothing is written.
 
-        Of the older states the last is kept: the stream may not hold the group between them yet.
+        The last older state is kept: the stream may not hold the group between the two yet.
         """
         if self.folder is None or state is None:
             return

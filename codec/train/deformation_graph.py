@@ -3,8 +3,9 @@
 The stream holds the same nodes (spec 13.2 and 13.3: same neighbours, same weights). Tracking optimises them, so that a
 smooth motion is smooth by construction and cheap to code.
 
-Gaussians that come in later have nodes of their own. The decoder blends the nearest nodes and knows no owner. So new
-Gaussians and their nodes rest at a free place beside all others, and the nodes' translations move them to the scene.
+Gaussians added later have nodes of their own. The decoder blends the nearest nodes, whichever Gaussians they were added
+for. So new Gaussians and their nodes rest at a free place beside all others, and the translations of the nodes move
+them into the scene.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from .settings import DeformationGraphSettings
 
 @dataclass
 class Pose:
-    """Motion of the nodes since the keyframe, and their last step.
+    """Motion of the nodes since the keyframe, and their velocity.
 
     Attributes:
         nodes: [M, 3] positions, world units.
@@ -47,13 +48,13 @@ class Pose:
         return self.moved(self.angular_velocity, self.velocity)
 
     def moved(self, turn: torch.Tensor, shift: torch.Tensor) -> Pose:
-        """The nodes turned by `turn` ([M, 3] rotation vectors) and shifted by `shift` ([M, 3] world units); their last
-        step stays as it was."""
+        """The nodes turned by `turn` ([M, 3] rotation vectors) and shifted by `shift` ([M, 3] world units); their
+        velocity stays the same."""
         rotations = quat_normalize(quat_multiply(rotvec_to_quat(turn), self.rotations))
         return replace(self, nodes=self.nodes + shift, rotations=rotations)
 
     def extended(self, nodes: torch.Tensor) -> Pose:
-        """With more nodes at `nodes` [K, 3], which have not moved yet."""
+        """The pose with K more nodes at `nodes` [K, 3], which have not moved yet."""
         zero = torch.zeros_like(nodes)
         more = Pose(nodes, rotvec_to_quat(zero), zero, zero)
         return Pose(*(torch.cat([getattr(self, f.name), getattr(more, f.name)]) for f in fields(Pose)))
@@ -63,17 +64,18 @@ class NodeGraph:
     """Nodes of a keyframe and of Gaussians added since, and the weights by which they carry Gaussians.
 
     Args:
-        means: [N, 3] positions at rest; Gaussians of the keyframe rest where the keyframe has them.
+        means: [N, 3] positions at rest, for Gaussians of the keyframe their positions there.
         low: [3], origin of the lattice, world units.
         step: spacing of the lattice, world units.
-        chosen: [M, 3] u32, nodes on the lattice.
-        batch: [M] int; 0 for nodes of the keyframe, else the number of the batch of Gaussians that a node came in with.
-        extent: [3], of the keyframe, world units.
+        chosen: [M, 3] u32, lattice coordinates of the nodes.
+        batch: [M] int; 0 for nodes of the keyframe, else the number of the batch of Gaussians added with the node.
+        extent: [3], size of the keyframe, world units.
         held: [M] bool, nodes that do not move.
 
     Attributes:
         nodes: [M, 3] positions of the nodes at rest.
-        neighbors: [N, k] u32, nodes that carry each Gaussian, the nearest first; weights: [N, k] f32.
+        neighbors: [N, k] u32, nodes that carry each Gaussian, the nearest first.
+        weights: [N, k] f32, blending weights of these nodes.
     """
 
     def __init__(
@@ -120,10 +122,10 @@ class NodeGraph:
 
         Args:
             means: [N, 3] world units.
-            sizes: [N], proportional to the distance of nodes.
+            sizes: [N], spacing of the nodes near each Gaussian, in any unit.
             radius: of the moving Gaussians, world units.
             moving: [N] bool.
-            far: [N] bool, what stands still whatever happens: nodes that carry some of it are held. None: nothing.
+            far: [N] bool, Gaussians that never move: nodes that carry some of them are held. None: no Gaussians.
         """
         low, step, nodes = means.min(0).values, settings.lattice * radius, settings.nodes
         grid = torch.round((means - low) / step).numpy().astype(np.uint32)
@@ -143,7 +145,7 @@ class NodeGraph:
         return graph
 
     def extend(self, means: torch.Tensor) -> None:
-        """More Gaussians to carry, at [K, 3] at rest."""
+        """Adds Gaussians to carry, which rest at `means` [K, 3]."""
         index, weight = (_padded(a, self.settings.blended) for a in self._weights(means, self.chosen))
         if len(self.means):
             index, weight = np.concatenate([self.neighbors, index]), np.concatenate([self.weights, weight])
@@ -158,10 +160,10 @@ class NodeGraph:
         return torch.round((means - self.low) / self.step).clamp(min=0).numpy().astype(np.uint32)
 
     def add_nodes(self, means: torch.Tensor) -> torch.Tensor | None:
-        """Adds nodes for Gaussians that come in at `means` [K, 3], and finds a place where both rest.
+        """Adds nodes for new Gaussians at `means` [K, 3], and finds a place where both rest.
 
         Returns:
-            Shift [3] from `means` to that place, where no other Gaussian's nodes or weights change. None: no room.
+            Shift [3] from `means` to that place, where they change no other Gaussian's nodes or weights. None: no room.
         """
         own = means[torch.from_numpy(farthest_points(means.numpy(), self.settings.added_nodes))]
         before = self._weights(self.means, self.chosen)
@@ -179,7 +181,7 @@ class NodeGraph:
         return None
 
     def _places(self, means: torch.Tensor):
-        """Shifts [3] of `means` to beside all Gaussians at rest, along the axis with most room on the lattice."""
+        """Shifts [3] of `means` to places beside all Gaussians at rest, along the lattice axis with most room."""
         low, high = means.min(0).values, means.max(0).values
         start, size = self.means.max(0).values, high - low
         room = self.low + self.settings.extent_max * self.extent.max() - size - start
@@ -224,10 +226,10 @@ class NodeGraph:
         return len(self.nodes)
 
     def carry(self, x: torch.Tensor, pose: Pose) -> tuple[torch.Tensor, torch.Tensor]:
-        """Points of the keyframe moved by the nodes' rigid motions, blended (spec 13.3).
+        """Points at rest moved by the blended rigid motions of the nodes (spec 13.3).
 
         Args:
-            x: [N, 3], in the keyframe.
+            x: [N, 3], at rest.
 
         Returns:
             means [N, 3] and the blended rotation [N, 4] unit wxyz.
@@ -243,15 +245,16 @@ class NodeGraph:
         by_carried: tuple[torch.Tensor, torch.Tensor],
         rigidity: float,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Gradients [M, 3] and [M, 3] by the turn and the shift of the nodes (`Pose.moved`): those of a loss and of the
-        as-rigid-as-possible term, the mean weighted difference between edges as they are and as their node rotates them
-        (Sorkine and Alexa 2007), in lattice spacings times `lattice`.
+        """Gradients [M, 3] and [M, 3] by the turn and the shift of the nodes (`Pose.moved`), of a loss and of the
+        as-rigid-as-possible term (Sorkine and Alexa 2007): the mean weighted distance between each edge as it is and as
+        its node rotates it, in lattice spacings times `lattice`.
 
         Args:
-            x: [N, 3] as of `carry`.
-            base: rotations [M, 4] before the turn, and the turn [M, 3]; `pose`: the nodes behind it.
+            x: [N, 3], at rest.
+            base: rotations [M, 4] before the turn, and the turn [M, 3].
+            pose: of the nodes after the turn.
             by_carried: gradients of the loss by the results of `carry`, [N, 3] and [N, 4].
-            rigidity: weight of the term.
+            rigidity: weight of the as-rigid-as-possible term.
         """
         rotations, turn = (a.contiguous().numpy() for a in base)
         blend = x.numpy(), self.neighbors, self.weights
@@ -263,13 +266,13 @@ class NodeGraph:
         return self.nodes.numpy(), pose.rotations.numpy(), pose.nodes.numpy()
 
     def carriers(self, chosen: torch.Tensor) -> torch.Tensor:
-        """Nodes that carry a Gaussian of `chosen` ([N] bool) with a weight of more than
-        `carrier_weight_min`, but for those that are held, [M] bool."""
+        """Nodes that carry a Gaussian of `chosen` ([N] bool) with a weight of more than `carrier_weight_min`, without
+        held nodes, [M] bool."""
         some = chosen.numpy()
         carried = self.neighbors[some][self.weights[some] > self.settings.carrier_weight_min]
         return torch.from_numpy(np.isin(np.arange(len(self)), carried) & ~self.held)
 
 
 def _padded(a: np.ndarray, width: int) -> np.ndarray:
-    """[N, k] -> [N, width], zeros behind: a group with few nodes may get more."""
+    """[N, k] -> [N, width], padded with zeros: a group with few nodes may get more."""
     return np.ascontiguousarray(np.pad(a, ((0, 0), (0, width - a.shape[1]))))

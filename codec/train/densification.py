@@ -2,9 +2,9 @@
 
 In: the Gaussians of a tracked frame and their screen gradients. Out: new Gaussians in the pose of the frame, optimised
 for some steps among the others, which stay as they are. Their lifetime begins at this frame. Gaussians are added only
-where changed pixels are altogether wrong, because no Gaussian near them could move there (a ball drops in). Half of
-them come from a plane sweep; the others are children of Gaussians whose screen gradient is far above that of the
-keyframe. Children alone, at any large gradient, raised lumberjack from 9,500 to 16,900 Gaussians for no better image.
+at changed pixels with a large error, where no Gaussian nearby could move to (a ball drops in). Half of them come from a
+plane sweep; the others are children of Gaussians whose screen gradient is far above that of the keyframe. Children
+alone, at any large gradient, raised lumberjack from 9,500 to 16,900 Gaussians for no better image.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ def spawn(
 
     Args:
         model: the Gaussians of the frame.
-        gradient: [N], screen gradient of each, in units of the keyframe's.
-        wrong: as of `error_masks`.
+        gradient: [N], screen gradient of each Gaussian, in units of the keyframe's.
+        wrong: from `error_masks`.
         room: bound on the number of new Gaussians.
         on_step: called with (step, loss).
     """
@@ -68,7 +68,7 @@ def spawn(
 def _optimize(
     spawned: Model, others: Model, frame: int, views: Views, settings: TrainSettings, rng: np.random.Generator, on_step
 ) -> Statistics:
-    """Optimises `spawned` among the `others`, which stay; returns the statistics of all in the second half."""
+    """Optimises `spawned` among fixed `others`; returns the statistics of all over the second half of the steps."""
     steps, k, known = settings.densification.steps, settings.keyframe, len(others)
     radius, stats = float(others.params["means"].std(0).norm()), Statistics(known + len(spawned), k.mse_min)
     spawned.start_optimizer(views.backend, settings.adam, views.size_bound)
@@ -90,7 +90,7 @@ def error_masks(
     """Changed pixels that the Gaussians do not show at all: [h, w] bool of each training camera.
 
     Args:
-        masks: [h, w] bool of each training camera, its changed pixels.
+        masks: [h, w] bool of each training camera, changed pixels.
     """
     import cv2
 
@@ -107,7 +107,7 @@ def error_masks(
 def sweep_masked(
     wrong: list[np.ndarray], frame: int, views: Views, count: int, settings: PlaneSweepSettings, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """At most `count` points on surfaces in the pixels `wrong` (of `error_masks`), and their colours; see `sweep`."""
+    """At most `count` points on surfaces in the pixels `wrong` (from `error_masks`), and their colours; see `sweep`."""
     taken = [views.view(i, frame) for i in views.train_cameras]
     images = [(views.camera(i, frame), v.rgb, v.alpha) for i, v in zip(views.train_cameras, taken, strict=True)]
     return sweep(images, count, seed, settings, wrong)

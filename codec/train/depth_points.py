@@ -1,7 +1,7 @@
 """Depth images as initial points of a keyframe: pixels of all cameras, back-projected.
 
-In: views of one frame and their depth images. Out: points and colours. A point is left out that more cameras look
-through than see (their own depth there is larger): sensors mix the depths of both sides along an edge.
+In: views of one frame and their depth images. Out: points and colours. A point is left out if more cameras look through
+it (their depth there is larger) than see it: along an edge, sensors mix the depths of both sides.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ import numpy as np
 from .plane_sweep import unproject
 from .visual_hull import OPAQUE, project
 
-TRIED = 2.0  # times the wanted number of points: so many pixels are looked at
+TRIED = 2.0  # pixels that are tried, times the wanted number of points
 
 
 def depth_points(
     views, depths: Sequence[np.ndarray | None], count: int, seed: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points of random pixels whose depth is known, as many from each equal area of the pictures.
+    """Points of random pixels with known depth, the same share of them in each picture.
 
     Args:
         views: (camera, rgb u8 [H, W, 3], alpha u8 or None) of each training camera.
-        depths: [H, W] f32 of each, 0 where it is unknown; None: the camera has none.
+        depths: [H, W] f32 of each view, 0 where unknown; None: the camera has no depth image.
         count: bound on the number of points.
         tolerance: relative difference of depth at which two cameras see the same surface.
 
@@ -54,7 +54,7 @@ def depth_points(
 
 
 def _seen(points: np.ndarray, camera, depth: np.ndarray, tolerance: float) -> np.ndarray:
-    """[N] int: 1 where the camera sees a surface at the point, -1 where it sees one behind it, else 0."""
+    """[N] int: 1 where the camera sees a surface at the point, -1 where it sees a surface behind it, else 0."""
     p, z = project(camera, points)
     x, y = np.floor(p).astype(np.int64).T
     on = (z > camera.near) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)

@@ -4,7 +4,7 @@ Bits are code lengths of integers under Laplace distributions, with uniform nois
 2017). The mean of a residual coefficient is 0. The mean of a canonical value follows from the context of the coder: the
 nearest Gaussians before it in Morton order (spec 7.3), in the form that the encoder codes (axes by falling scale,
 rotations relative to that of the nearest Gaussian, colours as Y, Co, Cg). Positions have no term, because they cost the
-same wherever they are.
+same everywhere.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class _LaplaceBits(torch.autograd.Function):
         a = x.abs()
         inside, near = a < 0.5, a.clamp(max=0.5)
         rising, falling = torch.exp((near - 0.5) * rate), torch.exp(-(near + 0.5) * rate)
-        p = (1 - 0.5 * (rising + falling)).clamp(min=1e-9)  # so wide that it would be rounded to 0
+        p = (1 - 0.5 * (rising + falling)).clamp(min=1e-9)  # a very large scale would round it to 0
         off, beyond = (a - 0.5) * rate, -torch.expm1(-rate)
         bits = torch.where(inside, -torch.log2(p), off / LN2 + 1 - torch.log2(beyond))
         share = rate / (2 * LN2) / p
@@ -81,8 +81,8 @@ class CanonicalRate:
     """Bits of the canonical attributes of N Gaussians, whose neighbours stay the same.
 
     Args:
-        means: [N, 3], from which order and neighbours follow.
-        steps: of the stream.
+        means: [N, 3], which define the order and the neighbours.
+        steps: quantization steps of the stream.
     """
 
     def __init__(self, means: torch.Tensor, steps: Steps, settings: EntropyModelSettings):
@@ -93,7 +93,7 @@ class CanonicalRate:
         self.steps = {a.name: steps[a.name] * weights[a.decorrelated] for a in ATTRIBUTES if a.name != "means"}
 
     def channels(self, params: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Integers-to-be of each attribute, [N, C], as the encoder codes them, in steps; differentiable."""
+        """Values of each attribute, [N, C], as the encoder codes them, in steps, before rounding; differentiable."""
         order = params["log_scales"].detach().argsort(dim=1, descending=True, stable=True)
         values = {
             "log_scales": params["log_scales"].gather(1, order),
@@ -111,7 +111,7 @@ class CanonicalRate:
     def _bits(self, attribute: str, x: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         x = x + torch.rand(x.shape, generator=generator) - 0.5
         around = x[self.near]
-        mean = torch.zeros_like(x) if attribute == "quats" else around.mean(1)  # a rotation may be to either side
+        mean = torch.zeros_like(x) if attribute == "quats" else around.mean(1)  # relative rotations go to either side
         with torch.no_grad():  # the scale follows the differences of the neighbours
             spread = (around - mean[:, None]).abs().mean(1) + self.settings.spread_min
             scale = spread * (x - mean).abs().mean(0) / spread.mean(0)
@@ -129,8 +129,8 @@ class CanonicalRate:
 
 
 def rotation_residuals(quats: torch.Tensor, order: torch.Tensor, nearest: torch.Tensor) -> torch.Tensor:
-    """Rotation of each Gaussian relative to that of its nearest one (spec 13.1): sines of half the angles about the
-    first, second and third axis, [N, 3]. Of the equal forms of an ellipsoid, the one with the smallest rotation.
+    """Rotation of each Gaussian relative to that of its nearest neighbour (spec 13.1): sines of half the angles about
+    the first, second and third axis, [N, 3]. Of the equivalent rotations of an ellipsoid, the smallest.
 
     Args:
         quats: [N, 4] wxyz.

@@ -1,7 +1,7 @@
-"""Far shell: Gaussians around a scene without masks, for what has no depth (sky, a dark hall).
+"""Far shell: Gaussians around a scene without masks, for background without depth (sky, a dark hall).
 
-In: views of one frame. Out: a model. Its Gaussians are flat and opaque, and overlap: if the background shone through,
-what fills the gap in training would settle anywhere between the cameras and the scene.
+In: views of one frame. Out: a model. Its Gaussians are flat and opaque, and overlap: if the background showed through,
+training would fill the gap with Gaussians anywhere between the cameras and the scene.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from .visual_hull import colors_of, project
 
 
 def far_shell(views, settings: FarShellSettings) -> Model:
-    """Gaussians evenly in the directions that a view sees, each with the median colour of the views.
+    """Gaussians evenly over the directions that a view sees, each with the median colour of the views.
 
     Args:
         views: (camera, rgb u8 [H, W, 3], alpha or None) of each training camera.
@@ -37,7 +37,7 @@ def far_shell(views, settings: FarShellSettings) -> Model:
 
 
 def _from_x(directions: np.ndarray) -> np.ndarray:
-    """Unit quaternions [N, 4] that turn the x axis to unit vectors [N, 3]; of those opposite to it, half a turn."""
+    """Unit quaternions [N, 4] that turn the x axis to unit vectors [N, 3]; half a turn for vectors opposite to it."""
     x, y, z = directions.T
     quats = np.stack([1 + x, 0 * x, -z, y], 1)
     quats[x < -1 + 1e-9] = (0, 0, 0, 1)

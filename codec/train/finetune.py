@@ -1,9 +1,9 @@
-"""Fine-tuning, the model: one canonical set and sparse residual trajectories that fit all frames of a group.
+"""Fine-tuning, the model: one set of canonical Gaussians and sparse residual trajectories for all frames of a group.
 
 The model is that of the codec: frame t = canonical Gaussians, carried by the nodes, + sum_k basis[k, t] * c_k for every
 attribute. It starts from the tracked frames, projected on the lowest temporal frequencies. All frames share the
-canonical attributes, so that frames x views images determine each Gaussian. Coefficients are rounded as the decoder has
-them; their gradient passes straight through the rounding. joint_optimization.py optimises the model.
+canonical attributes, so that frames x views images determine each Gaussian. Coefficients are rounded as in the
+decoder; their gradient passes straight through the rounding. joint_optimization.py optimises the model.
 """
 
 from __future__ import annotations
@@ -28,14 +28,20 @@ from .settings import TrainSettings
 
 @dataclass
 class Frame:
-    """One frame of a group, and what its backward pass needs.
+    """One frame of a group, and the values that its backward pass needs.
 
     Attributes:
         params: attributes as they are rendered; harmonics as at rest, with TURNS.
-        pose: of the nodes; turn: [M, 3] rotation vectors behind the tracked one; by_field: what the field says of them.
-        means, rotations: [N, 3] and [N, 4], where the nodes carry the Gaussians. rest: [N, 3], canonical means.
-        residual: [N, 4], the residual rotation, unit. inner: [N, 4], rotation before it. quats: [N, 4], canonical.
-        shown: [N] bool.
+        pose: of the nodes.
+        turn: [M, 3] rotation vectors of the nodes, after their tracked rotations.
+        by_field: motion from the field.
+        means: [N, 3], canonical means as the nodes carry them.
+        rest: [N, 3], canonical means.
+        rotations: [N, 4], rotations of the Gaussians by the nodes.
+        residual: [N, 4], residual rotation, unit.
+        inner: [N, 4], rotation before the residual one.
+        quats: [N, 4], canonical rotations.
+        shown: [N] bool, Gaussians that live in this frame.
     """
 
     params: dict[str, torch.Tensor]
@@ -57,7 +63,7 @@ def rounded(c: np.ndarray, dead_zone: float) -> np.ndarray:
 
 
 def shrunk(c: np.ndarray, by: float) -> np.ndarray:
-    """Coefficients nearer to 0 by so much, those that are less by all they are."""
+    """Soft threshold: coefficients nearer to 0 by `by`, smaller ones 0."""
     return np.sign(c) * np.maximum(np.abs(c) - np.float32(by), 0)
 
 
@@ -71,8 +77,8 @@ class GroupModel:
         tracked: T tracked models. Later ones have more Gaussians at the end; removed ones have REMOVED_LOGIT.
         poses: T poses of the nodes; later ones have more nodes at the end.
         steps: quantization steps of the stream.
-        moved: [N] bool, Gaussians that tracking has optimised. Others have no residuals unless they start with some,
-            and nodes that carry only others stay where they are.
+        moved: [N] bool, Gaussians that tracking has optimised. Other Gaussians have no residuals unless they start
+            with some, and nodes that carry only other Gaussians are not corrected.
 
     Attributes:
         key: canonical Gaussians; the first `known` are those of the group before.
@@ -81,9 +87,9 @@ class GroupModel:
         free: [N] bool, Gaussians whose coefficients are optimised.
         log_scales: attribute -> [K] f32, log of the Laplace scale of its coefficients.
         turns, shifts: T times [M, 3], corrections of the poses of the nodes: rotation vectors, world units.
-        field: of the group, adds to them; None: there is none.
+        field: motion field of the group, added to `turns` and `shifts`; None: no field.
         carriers: [M, 1] bool, nodes that carry a Gaussian that moved; only these are corrected.
-        origin: [N] index of each Gaussian in the last frame of tracking; -1: it was added here.
+        origin: [N] index of each Gaussian in the last frame of tracking; -1: added by `append`.
     """
 
     def __init__(
@@ -108,7 +114,7 @@ class GroupModel:
         self.start = (counts[:, None] <= torch.arange(counts[-1])).sum(0)
         tracked = [_padded(m, tracked[-1]) for m in tracked]
         removed = torch.stack([~m.alive for m in tracked])
-        removed &= torch.arange(len(tracked))[:, None] > self.start  # the padding is of the last frame
+        removed &= torch.arange(len(tracked))[:, None] > self.start  # padding copies the last frame
         self.end = len(tracked) - removed.sum(0)
         self.known = 0 if key is None else len(key)
         self.key = self._canonical(key, tracked)
@@ -129,7 +135,7 @@ class GroupModel:
         }
 
     def select(self, keep: torch.Tensor) -> None:
-        """Keeps the Gaussians of `keep` ([N] bool), among them those of the group before."""
+        """Keeps the Gaussians of `keep` ([N] bool), which must include those of the group before."""
         self.key.select(keep)
         self.graph.select(keep)
         self.start, self.end, self.free, self.origin = (x[keep] for x in (self.start, self.end, self.free, self.origin))
@@ -173,7 +179,7 @@ class GroupModel:
         return Model(params)
 
     def _project(self, tracked: list[Model]) -> dict[str, np.ndarray]:
-        """Lowest frequencies of the difference between the tracked frames and what the nodes carry."""
+        """Lowest temporal frequencies of the tracked frames minus the canonical Gaussians as the nodes carry them."""
         p = self.key.params
         residual: dict[str, list] = {name: [] for name in self.settings.frequencies}
         for model, pose in zip(tracked, self._tracked_poses, strict=True):
@@ -194,12 +200,12 @@ class GroupModel:
         return out
 
     def at(self, name: str, t: int) -> np.ndarray:
-        """Residual at frame `t` for each coefficient of an attribute that is 1, [K] f32."""
+        """[K] f32, residual of an attribute at frame `t` per unit of each coefficient."""
         return self.unit[name] * self.basis[: len(self.coefficients[name]), t]
 
     def pose(self, t: int) -> tuple[Pose, torch.Tensor, FieldMotion | None]:
-        """Corrected pose of the nodes at frame `t`, their turn behind the tracked one, [M, 3] rotation vectors, and
-        what the field says of them."""
+        """Corrected pose of the nodes at frame `t`; their turn after the tracked rotation, [M, 3] rotation vectors;
+        motion from the field."""
         turn, shift, by_field = self.turns[t], self.shifts[t], None
         if self.field is not None:
             by_field = self.field(t)
@@ -220,8 +226,8 @@ class GroupModel:
         """Frame `t`.
 
         Args:
-            noise: attribute -> what is added to the canonical values; None: nothing.
-            shrinkage: quantization steps by which coefficients are nearer to 0.
+            noise: attribute -> noise added to the canonical values; None: no noise.
+            shrinkage: quantization steps by which coefficients are moved towards 0.
         """
         p, zone = self.key.params, self.settings.dead_zone + shrinkage
         if noise is not None:
@@ -249,8 +255,8 @@ class GroupModel:
         return Frame(params, pose, turn, by_field, means, p["means"], rotations, residual, inner, p["quats"], shown)
 
     def limit_sizes(self, t: int, frame: Frame, bound: SizeBound | None) -> float:
-        """Brings the trajectories of Gaussians that are larger than `bound` in `frame`, which is that at `t`, back to
-        it; returns by how much the largest was too large, as a natural log."""
+        """Corrects the trajectories of Gaussians that are larger than `bound` in `frame` (frame `t`) so that they meet
+        it; returns the largest excess of a size, natural log."""
         if bound is None:
             return 0.0
         excess = (frame.params["log_scales"] - bound.log_scales(frame.params["means"])).clamp(min=0)
@@ -261,8 +267,8 @@ class GroupModel:
         return float(excess.max()) if len(excess) else 0.0
 
     def gradients(self, frame: Frame, grads: dict[str, torch.Tensor]) -> tuple[dict, dict, torch.Tensor]:
-        """From the gradients by what is rendered: those by the residuals, attribute -> [N, C], 0 for Gaussians that are
-        not free; those by the canonical attributes; and that by the rotations of the nodes, [N, 4]."""
+        """Converts gradients by rendered attributes into those by the residuals, attribute -> [N, C], 0 for Gaussians
+        that are not free; by the canonical attributes; and by the rotations of the nodes, [N, 4]."""
         by_inner = quat_product(frame.residual, grads["quats"], inverse_a=True)
         by_residual = quat_product(grads["quats"], frame.inner, inverse_b=True)
         by_dq = by_residual[:, 1:] - by_residual[:, :1] * (frame.residual[:, 1:] / frame.residual[:, :1])
@@ -296,7 +302,7 @@ class GroupModel:
         )
 
     def nodes(self) -> NodeMotion:
-        """The carrying motion."""
+        """Motion of the nodes in all frames."""
         rotations, near = [], None
         poses = [self.pose(t)[0] for t in range(self.frames)]
         for pose in poses:
@@ -313,12 +319,12 @@ def _turned_back(model: Model, rotations: torch.Tensor) -> Model:
 
 
 def _padded(model: Model, last: Model) -> Model:
-    """The model, and the Gaussians that it does not have yet as they are in `last`."""
+    """The model, and the Gaussians that it does not have yet, copied from `last`."""
     return Model({n: torch.cat([p, last.params[n][len(p) :]]) for n, p in model.params.items()})
 
 
 def _at_rest_until_added(poses: list[Pose]) -> list[Pose]:
-    """Poses of all nodes; before a node is added it is where it is added."""
+    """Poses of all nodes; before it is added, a node has the pose with which it is added."""
     whole = poses[-1:]
     for pose in poses[-2::-1]:
         known, later = len(pose.nodes), whole[0]

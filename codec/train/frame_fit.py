@@ -1,8 +1,8 @@
 """Fit of one tracked frame: nodes and the Gaussians' own attributes are optimised together, from constant velocity.
 
 In: a tracker in the pose of the frame before. Out: the Gaussians' own attributes and the pose of the nodes. Means are
-those of the keyframe, carried by the whole motion since, plus an own offset. So motion that nodes can express is
-expressed by nodes, and does not accumulate in the Gaussians frame by frame.
+those of the keyframe, carried by the nodes' motion since then, plus an own offset. So the nodes hold all motion that
+they can express, and it does not accumulate in the Gaussians frame by frame.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class FrameFit:
     """Optimisation of the moving Gaussians of `tracker` and of the nodes that carry them.
 
     Attributes:
-        own: the Gaussians' own attributes, as of `Tracker`.
-        statistics: of the full-size views.
+        own: the Gaussians' own attributes (`Tracker.own`).
+        statistics: of the views at full size.
     """
 
     def __init__(self, tracker: Tracker, rng: np.random.Generator):
@@ -55,7 +55,7 @@ class FrameFit:
         self.statistics = Statistics(len(self.own), tracker.settings.keyframe.mse_min)
 
     def _pose(self) -> tuple[Pose, FieldMotion | None]:
-        """Pose of the nodes, and what the field says of them."""
+        """Pose of the nodes, and the motion from the field."""
         turn, shift, by_field = self._nodes["angular_velocity"], self._nodes["velocity"], None
         if self._field is not None:
             by_field = self._field()
@@ -63,13 +63,13 @@ class FrameFit:
         return replace(self.tracker.pose, angular_velocity=turn, velocity=shift).next(), by_field
 
     def step(self, target: Target, decay: float, *, full: bool, stiff: bool, slow: bool) -> float:
-        """One view; returns its image loss without the mask term.
+        """One step on one view; returns its image loss without the mask term.
 
         Args:
             decay: multiplies all learning rates.
             full: the view has its full size, and counts in the statistics.
-            stiff: nodes hold together, and slow: the Gaussians' own attributes follow slowly, where the velocity is
-                not known (`TrackingSettings.stiff_rigidity`, `slow_rates`, `searched_slow_rates`).
+            stiff: high rigidity of the nodes, where the velocity is not known (`TrackingSettings.stiff_rigidity`).
+            slow: low rates of the Gaussians' own attributes, there too (`slow_rates`, `searched_slow_rates`).
         """
         t, s = self.tracker, self.tracker.settings.tracking
         pose, by_field = self._pose()
@@ -94,7 +94,7 @@ class FrameFit:
     def _step_nodes(
         self, pose: Pose, by_field: FieldMotion | None, by_carried: tuple, rigidity: float, decay: float
     ) -> None:
-        """One step of the nodes along the gradients by where they carry the Gaussians, and along that of rigidity."""
+        """One step of the nodes along the gradients by the carried Gaussians and along that of the rigidity term."""
         graph, base = self.tracker.graph, (self.tracker.pose.rotations, pose.angular_velocity)
         by = graph.gradients(graph.means, base, pose, by_carried, rigidity)
         by = [g * self._carriers for g in by]

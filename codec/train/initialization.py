@@ -1,5 +1,5 @@
 """Initial model of a keyframe: Gaussians at the capture's own points and at points of depth images, of the visual hull
-or of a plane sweep, or at random ones where there is none of these."""
+or of a plane sweep, or at random points where there are none of these."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def initial_model(
     settings: TrainSettings,
     look: Callable[[int, int], View] | None = None,
 ) -> tuple[Model, float]:
-    """Gaussians on the surfaces that are known, and the radius of what they show: the capture's own points, and besides
-    what its depth images show, or else the visual hull of the masks; without either matched features and a plane sweep.
-    Around points of a plane sweep, or without masks, there is a far shell, too, which the radius does not count. They
-    are random, without a shell, where too little is found.
+    """Gaussians at points on known surfaces, and the radius of these points. The points are the capture's own and those
+    of its depth images, or else of the visual hull of the masks; without depth and masks, of matched features and a
+    plane sweep. Points of a plane sweep, or without masks, get a far shell around them, which does not count in the
+    radius. Where too few points are found, they are random, without a shell.
 
     Args:
-        count: of points, about.
+        count: number of points, about.
         look: (camera, frame) -> its picture, from a cache; None: `capture.view`.
 
     Raises:

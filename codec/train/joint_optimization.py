@@ -2,12 +2,12 @@
 frames. A field over place and time (motion_field.py) corrects the tracked motion of the nodes, beside variables of each
 node and frame.
 
-The loss is that of the image and a rate term (V3's residual-entropy loss, made differentiable): the entropy of the
+The loss is the image loss and a rate term (V3's residual-entropy loss, made differentiable): the entropy of the
 coefficients under noise-relaxed quantization at the step sizes of the stream, with a learned Laplace scale for each
-attribute and temporal frequency. It pulls coefficients to zero that lower the image loss by less than they cost.
+attribute and temporal frequency. It pulls coefficients to 0 that lower the image loss by less than their bits cost.
 Canonical attributes have noise in place of their quantization and a rate term of their own (entropy_model.py). The
-exposure of each camera is learned in each frame, since that of a keyframe may drift. A step has the gradients of some
-views of one frame. While they are rendered, the step before is taken: a gradient is one step old.
+exposure of each camera is learned in each frame, since that of a keyframe may drift. A step uses the gradients of some
+views of one frame. While these are rendered, the step before is applied: gradients are one step old.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from .motion_field import MotionField
 from .settings import FinetuneSettings, TrainSettings
 from .views import Target, Views, add_harmonics_prior, start_photometric_loss
 
-SIZE_PASSES = 8  # over the frames of a group, in which sizes come to their bound
-SIZE_EXCESS = 0.01  # natural log of a size over its bound, that is as good as none
+SIZE_PASSES = 8  # passes over the frames of a group that bring sizes to their bound
+SIZE_EXCESS = 0.01  # natural log of a size over its bound that is negligible
 
 
 class _Finetuner:
-    """State of one run; `step` is some views of one frame."""
+    """State of one run; a `step` uses some views of one frame."""
 
     def __init__(self, group: GroupModel, views: Views, frames: range, settings: TrainSettings, radius: float):
         self.group, self.views, self.frames, self.settings = group, views, frames, settings
@@ -47,15 +47,15 @@ class _Finetuner:
         canonical["means"] = f.canonical_means_rate * radius
         self.canonical_rates = canonical if group.known < len(group.key) else {}
         self.node_rates = {"turn": f.node_rotation_rate, "shift": f.node_translation_rate * radius}
-        self.loss = 0.0  # of a step, running mean
+        self.loss = 0.0  # loss of a step, running mean
         self.steps = 0
         self._look_at_gaussians()
-        self.started: tuple[int, Frame, list[Target], PendingLoss, float] | None = None  # as `step` says
+        self.started: tuple[int, Frame, list[Target], PendingLoss, float] | None = None  # the pending step
         self.bits = sum(self._step_coefficients(0, None, 0.0, 0.0))
 
     def step(self, t: int, decay: float) -> float:
-        """Starts some views of frame `t` of the group, whose step has all learning rates times `decay`, and meanwhile
-        takes the step along those before; returns the mean loss of a view of late."""
+        """Starts to render some views of frame `t` of the group, whose step has all learning rates times `decay`, and
+        meanwhile applies the step before; returns the running mean of the loss of a view."""
         frame, backend = self.group.frame(t, self.views.backend, self.noise), self.views.backend
         targets = [self.views.draw(self.frames[t]) for _ in range(self.settings.finetune.views)]
         pending = start_photometric_loss(frame.params, targets, self.settings, self.rng, backend)
@@ -64,7 +64,7 @@ class _Finetuner:
         return self.loss / self.settings.finetune.views
 
     def finish(self) -> None:
-        """Takes the step along the views that were started last."""
+        """Applies the step of the views that were started last."""
         if self.started is None:
             return
         t, frame, targets, pending, decay = self.started
@@ -87,8 +87,8 @@ class _Finetuner:
             self._step_canonical(canonical, decay)
 
     def limit_sizes(self) -> None:
-        """No Gaussian is larger than the views allow in any frame, up to what its temporal frequencies can say. What
-        brings one frame to the bound may move another beyond it, so that all come again."""
+        """Brings all Gaussians to their size bound in all frames, as far as their temporal frequencies allow. A
+        correction in one frame may break the bound in another, so there are several passes."""
         group, backend, bound = self.group, self.views.backend, self.views.size_bound
         if bound is None:
             return
@@ -97,8 +97,8 @@ class _Finetuner:
                 return
 
     def _step_canonical(self, grads: dict[str, torch.Tensor], decay: float) -> None:
-        """One step of the new canonical Gaussians along the gradients of the image and of the rate term, as that was at
-        most `canonical_rate_every` steps ago."""
+        """One step of the new canonical Gaussians along the gradients of the image loss and of the rate term; that of
+        the rate term is at most `canonical_rate_every` steps old."""
         s, group = self.settings, self.group
         if self.steps and self.steps % s.finetune.canonical_rate_every == 0:
             self._draw_canonical()
@@ -116,15 +116,15 @@ class _Finetuner:
             p[short] = before[n].lerp(p[short], slower.view(-1, *[1] * (p.dim() - 1)))
 
     def change_topology(self) -> None:
-        """Removes new Gaussians that all frames together do without, and gives a second one to those whose screen
-        gradient is still large: what the keyframe did not show, or a motion has stretched. Does nothing where too few
-        views have been drawn to tell."""
+        """Removes new Gaussians with a small contribution to all frames together, and splits or clones those whose
+        screen gradient is still large (parts that the keyframe did not show, or that a motion has stretched). Does
+        nothing if too few views have been drawn."""
         self.finish()
         group, k, stats = self.group, self.settings.keyframe, self.statistics
         if stats.views < self.settings.finetune.topology_views * len(self.views.train_cameras):
             return
         opacities = torch.sigmoid(group.key.params["logit_opacities"])
-        contribution = stats.contribution(opacities) / self._drawn_share()  # to the views that could show it
+        contribution = stats.contribution(opacities) / self._drawn_share()  # to the views of its lifetime
         keep = contributes(contribution, k) & (stats.max_weight > k.prune_weight)
         keep[: group.known] = True
         gradient = stats.mean_screen_gradient() * keep
@@ -141,26 +141,27 @@ class _Finetuner:
         self._look_at_gaussians()
 
     def _look_at_gaussians(self) -> None:
-        """What depends on which Gaussians there are, from here on."""
+        """Resets the state that depends on the set of Gaussians."""
         self.statistics = Statistics(len(self.group.key), self.settings.keyframe.mse_min)
         self.short_lived = self._short_lived()
         self._draw_canonical()
 
     def _drawn_share(self) -> torch.Tensor:
-        """[N], how much of what is drawn each Gaussian lives in."""
+        """[N], share of the drawn views in which each Gaussian lives."""
         often = torch.bincount(torch.tensor(_round_of_frames(self.group.frames))).float()
         until = torch.cat([torch.zeros(1), often.cumsum(0)])
         return (until[self.group.end] - until[self.group.start]) / until[-1]
 
     def _short_lived(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """[K] index of the Gaussians that few frames show, and [K] factors of their steps: behind each gradient of what
-        a share of the frames shows Adam goes on for 1 / sqrt(share) steps, and a size doubled for one picture."""
+        """[K] index of the Gaussians that live in few frames, and [K] factors of their steps. After each gradient of a
+        Gaussian that a share of the frames shows, Adam goes on for 1 / sqrt(share) steps: without the factors, sizes
+        doubled for one picture."""
         factor = self._drawn_share() / self.settings.finetune.short_life
         short = torch.nonzero(factor < 1)[:, 0]
         return short, factor[short]
 
     def _draw_canonical(self) -> None:
-        """The noise and the bits of the canonical Gaussians, held for some steps."""
+        """Sets the noise and the bits of the canonical Gaussians, which are held for some steps."""
         self.noise = self._noise()
         rate = self.group.canonical_rate
         self.canonical_bits, self.by_rate = rate.gradients(self.group.key.params, self.generator)
@@ -178,8 +179,8 @@ class _Finetuner:
         return noise
 
     def _step_coefficients(self, t: int, residuals: dict | None, weight: float, decay: float) -> list[float]:
-        """One step of all coefficients along the gradients by the residuals of frame `t` (None: 0), a bit weighing
-        `weight`; returns the bits of each attribute."""
+        """One step of all coefficients along the gradients by the residuals of frame `t` (None: 0) and by the bits,
+        each with `weight` in the loss; returns the bits of each attribute."""
         f, group, bits = self.settings.finetune, self.group, []
         rate = f.coefficient_rate * decay
         for n, c in group.coefficients.items():
@@ -198,8 +199,8 @@ class _Finetuner:
     def _step_nodes(
         self, t: int, frame: Frame, by_means: torch.Tensor, by_rotations: torch.Tensor, decay: float
     ) -> None:
-        """One step of the nodes at frame `t`, along the gradients by where they carry the Gaussians and that of the
-        rigidity of the graph."""
+        """One step of the nodes at frame `t`, along the gradients by the carried Gaussians and that of the rigidity
+        term."""
         if not self.node_rates["turn"] and self.group.field is None:
             return
         group, rigidity = self.group, self.settings.finetune.views * self.settings.rigidity
@@ -213,10 +214,10 @@ class _Finetuner:
     def _bit_weight(self) -> float:
         """Weight of a bit in the image loss.
 
-        Relative changes of bits and of loss count, so that a bit is cheap where there are many. All groups of a subject
-        count the canonical bits, as if each stood alone, so that a bit has the same weight in all of them. Of the
-        residuals as many count as a group usually has: where motion is fast or views are few, the more of them were
-        bought, the cheaper each would be, and frames would part from each other, which see the more together.
+        Relative changes of bits and of the loss are compared, so that a bit is cheap where there are many bits. Every
+        group of a subject counts the canonical bits, as if it stood alone, so that a bit has the same weight in all
+        groups. Residual bits count up to the usual number of a group: otherwise, with fast motion or few views, each
+        residual bit would make the next one cheaper, and frames would share less, although they see more together.
         """
         s = self.settings
         usual = s.finetune.residual_share * self.group.frames * self.canonical_bits
@@ -255,13 +256,13 @@ def finetune(
 
 
 def views_to_draw(group: GroupModel, settings: TrainSettings) -> int:
-    """Views for the fine-tuning of a group; a short one behind a keyframe has those of `frames_min` frames."""
+    """Number of views for the fine-tuning of a group; a short one after a keyframe has those of `frames_min` frames."""
     least = 0 if group.known else settings.finetune.frames_min
     return round(settings.finetune_steps * max(group.frames, least))
 
 
 def _rate(done: float, settings: FinetuneSettings) -> float:
-    """Share of the learning rates where this share of the steps is done."""
+    """Factor of the learning rates after a share `done` of the steps."""
     rising = min(1.0, done / settings.warmup) if settings.warmup else 1.0
     return rising * settings.rate_decay**done
 

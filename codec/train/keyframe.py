@@ -4,9 +4,9 @@ The recipe of 3D Gaussian Splatting (Kerbl et al. 2023), shortened: of the Gauss
 small ones are cloned and large ones split, and Gaussians with a small contribution to all views are pruned. Spherical
 harmonics are added on the way, and removed again where they lower the error by less than their bits cost. Without
 masks opacities decay and transparent Gaussians move at random (3DGS-MCMC, Kheradmand et al. 2024): few views of a room
-do not contradict what floats before the cameras. The nearer to a camera, the faster is the decay: what is black before
-black errs in no picture, and hides the subject from between the cameras. While one view is rendered, the step along the
-one before is taken: a gradient is one step old.
+do not contradict floaters before the cameras. The decay is faster near the cameras: a black floater before a black
+background causes no error in any training view, but hides the subject in views between the cameras. While one view is
+rendered, the step of the view before is applied: gradients are one step old.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from .model import REMOVED_LOGIT, Model
 from .settings import KeyframeSettings, TrainSettings
 from .views import Target, Views, add_harmonics_prior, start_photometric_loss, view_losses
 
-NOISE_POWER = 4  # of the transparency, in the noise of positions
+NOISE_POWER = 4  # power of the transparency in the noise of positions
 
 
 class Statistics:
     """Statistics of N Gaussians over the steps since the last round of densification.
 
     Args:
-        mse_min: error of an image below which shares of it mean nothing.
+        mse_min: mean squared error of an image below which shares of it have no meaning.
 
     Attributes:
         screen_gradient: [N], sum of the screen-space gradients.
         seen: [N], views that showed the Gaussian.
         max_weight: [N], largest blending weight.
-        squared_opacity_gradient: [N], sum; in units of the squared error of the image.
-        views: number of them.
+        squared_opacity_gradient: [N], sum of the squares; in units of the squared error of the image.
+        views: number of views.
     """
 
     def __init__(self, count: int, mse_min: float):
@@ -48,7 +48,7 @@ class Statistics:
         self.views = 0
 
     def add(self, result: RenderLoss, views: int = 1) -> None:
-        """The statistics of one step, whose loss is that of so many views."""
+        """Adds the statistics of one step, whose loss is the sum over `views` views."""
         weight = torch.as_tensor(result.max_weight)
         self.screen_gradient += torch.as_tensor(result.grad2d)
         self.seen.add_(weight > 0, alpha=views)
@@ -61,9 +61,9 @@ class Statistics:
     def contribution(self, opacities: torch.Tensor) -> torch.Tensor:
         """Increase of the error without each Gaussian, [N], in shares of the error; `opacities`: [N].
 
-        The pixel gradients of the absolute error are signs. Where training has converged they are as good as random,
+        The pixel gradients of the absolute error are signs. Where training has converged they are almost random,
         and the squared gradient by a parameter is the squared change of the image by it (Hutchinson's estimator of a
-        diagonal). The logit of an opacity changes the image by (1 - opacity) times what the whole Gaussian does.
+        diagonal). The logit of an opacity changes the image by (1 - opacity) times the change by the whole Gaussian.
         """
         views = max(self.views, 1)
         return self.squared_opacity_gradient / views / (1 - opacities).clamp(min=1e-3).square()
@@ -108,7 +108,7 @@ def train_keyframe(
 
 @dataclass(frozen=True)
 class _View:
-    """A view that is being rendered: its number, the camera of its `target`, and its loss."""
+    """A view that is being rendered: its step, its target, and its pending loss."""
 
     step: int
     target: Target
@@ -134,7 +134,7 @@ class _Run:
         views.reset_calibration(frame, model.params["means"].numpy().mean(0, dtype=np.float64), radius)
 
     def step(self, step: int) -> None:
-        """Starts one view, and meanwhile takes the step along the one before."""
+        """Starts to render one view, and meanwhile applies the step of the view before."""
         s, views = self.settings, self.views
         target = views.draw(self.frame, picture_scale(step / self.steps, views.largest_side, s.keyframe))
         params = _without_some(self.model.params, s.keyframe.dropout * step / self.steps, self.rng)
@@ -143,7 +143,7 @@ class _Run:
         self._started = _View(step, target, pending)
 
     def finish(self) -> None:
-        """Takes the last step that was started."""
+        """Applies the last step that was started."""
         if self._started is None:
             return
         view, self._started = self._started, None
@@ -165,7 +165,7 @@ class _Run:
             move_at_random(model.params, k.position_noise * means_decay, self.rng)
 
     def set_degree(self, degree: int | None) -> None:
-        """Gives the Gaussians harmonics of this degree; None: of the one that pays."""
+        """Gives the Gaussians harmonics of this degree; None: of the degree that pays for its bits."""
         self.finish()
         if degree is None:
             degree = harmonics_degree(self.model, self.views, self.frame, self.settings)
@@ -199,14 +199,14 @@ def add_opacity_decay(grads: dict[str, torch.Tensor], params: dict[str, torch.Te
 
 def move_at_random(params: dict[str, torch.Tensor], share: float, rng: np.random.Generator) -> None:
     """Moves each Gaussian by `share` of a random offset drawn from it, times its transparency to the power of
-    `NOISE_POWER`: one that holds nothing looks elsewhere."""
+    `NOISE_POWER`: transparent Gaussians try other places."""
     transparency = 1 - torch.sigmoid(params["logit_opacities"])
     params["means"].addcmul_(random_offset(params, rng), share * transparency.pow(NOISE_POWER)[:, None])
 
 
 def _without_some(params: dict[str, torch.Tensor], share: float, rng: np.random.Generator) -> dict[str, torch.Tensor]:
-    """The Gaussians of one step, a random share of them left out, so that what holds only from where a training camera
-    stands falls apart (DropGaussian, Park et al. 2025)."""
+    """The Gaussians of one step without a random share of them, so that structures that are right only from the
+    training cameras fall apart (DropGaussian, Park et al. 2025)."""
     if not share:
         return params
     gone = torch.from_numpy(rng.random(len(params["means"]), np.float32) < share)
@@ -214,8 +214,8 @@ def _without_some(params: dict[str, torch.Tensor], share: float, rng: np.random.
 
 
 def picture_scale(progress: float, side: int, settings: KeyframeSettings) -> float:
-    """Scale of the pictures at a share of the steps: coarse ones first, whose shapes are large and steps cheap
-    (DashGaussian, Chen et al. 2025). Halves, so that a picture is made small once.
+    """Scale of the pictures after a share `progress` of the steps: coarse pictures first, which show large shapes in
+    cheap steps (DashGaussian, Chen et al. 2025). Powers of 1/2, so that a picture is shrunk to few sizes, each once.
 
     Args:
         side: of the largest picture, pixels.
@@ -228,8 +228,8 @@ def picture_scale(progress: float, side: int, settings: KeyframeSettings) -> flo
 
 
 def harmonics_degree(model: Model, views: Views, frame: int, settings: TrainSettings) -> int:
-    """The lowest degree of spherical harmonics with which the error of the training views of `frame` grows by less than
-    the bits of the others are worth."""
+    """The lowest degree of spherical harmonics at which the error of the training views of `frame` grows by less than
+    the bits of the removed coefficients are worth."""
     k, shN = settings.keyframe, model.params["shN"]
 
     def error(count: int) -> float:
@@ -256,7 +256,7 @@ def price(count: int, settings: KeyframeSettings) -> float:
 
 
 def contributes(contribution: torch.Tensor, settings: KeyframeSettings) -> torch.Tensor:
-    """[N] bool: Gaussians that stay by their contribution; one round may remove a share of them (`thinning`)."""
+    """[N] bool: Gaussians whose contribution is large enough; one round removes a share `thinning` at most."""
     most = torch.quantile(contribution, settings.thinning).item()
     return contribution >= min(price(len(contribution), settings), most)
 

@@ -24,7 +24,8 @@ class SizeBound:
 
     Attributes:
         center: [3], world units.
-        near: distance from it below which the bound falls no more, world units. share: of the distance.
+        near: distance from `center` below which the bound is constant, world units.
+        share: largest scale over the distance.
     """
 
     center: torch.Tensor
@@ -64,7 +65,7 @@ class Model:
             self.limit_sizes(self._bound.log_scales(self.params["means"]))
 
     def limit_sizes(self, log_scales: torch.Tensor) -> None:
-        """Makes Gaussians as small as `log_scales` [N, 1]."""
+        """Limits the scales of each Gaussian to `log_scales` [N, 1], natural logs."""
         self.params["log_scales"] = torch.minimum(self.params["log_scales"], log_scales)
 
     def select(self, index: torch.Tensor) -> None:
@@ -102,7 +103,7 @@ class Model:
 
 
 def quat_product(a: torch.Tensor, b: torch.Tensor, *, inverse_a: bool = False, inverse_b: bool = False) -> torch.Tensor:
-    """Products [N, 4] of unit quaternions [N, 4] f32, of `a` or `b` their inverse; native and without a gradient."""
+    """Products [N, 4] of unit quaternions `a`, `b` [N, 4] f32, or of their inverses; native and without a gradient."""
     return torch.from_numpy(_native.quat_product(a.numpy(), b.numpy(), (inverse_a, inverse_b)))
 
 

@@ -1,10 +1,10 @@
 """Motion field of a group: a hash grid and an MLP, (rest position, time in the group) -> rigid motion.
 
-The field is evaluated at the nodes of the deformation graph, so that the stream does not change and a query costs next
-to nothing. Its coarse levels and the MLP move all nodes together where their gradients agree, its fine levels part of
-them; in fine-tuning the temporal encoding joins the frames of a group. It is added to the free variables of the nodes,
-which keep what a smooth field cannot say. Initially it is zero. After V3 (Wang et al. 2024), whose grid stands for one
-frame, is evaluated at every Gaussian, and is not joined over time.
+The field is evaluated at the nodes of the deformation graph, so that the stream does not change and a query is cheap.
+Its coarse levels and the MLP move all nodes together where their gradients agree, its fine levels groups of nodes; in
+fine-tuning the temporal encoding connects the frames of a group. The field is added to the free variables of the nodes,
+which keep the motion that a smooth field cannot express. Initially it is zero. After V3 (Wang et al. 2024), which has
+one grid for each frame, evaluates it at every Gaussian, and does not connect frames.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ from .settings import MotionFieldSettings
 
 @dataclass(frozen=True)
 class FieldMotion:
-    """What a field says of M nodes at one frame.
+    """Motion of M nodes at one frame from a field.
 
     Attributes:
-        turn, shift: [M, 3] rotation vectors, and [M, 3] translations in world units.
-        layers: input and output of the MLP, and what is between its layers, for the step along its gradients.
+        turn: [M, 3] rotation vectors.
+        shift: [M, 3] translations, world units.
+        layers: input of the MLP, values between its layers, and its output, for the gradients.
     """
 
     turn: torch.Tensor
@@ -40,8 +41,9 @@ class MotionField:
     Args:
         nodes: [M, 3] positions at rest, world units.
         radius: of the moving Gaussians, world units: the unit of translations.
-        frames: of the group; 1: the field does not depend on time.
-        backend: device of the optimiser; adam: its settings.
+        frames: number of frames in the group; 1: the field does not depend on time.
+        backend: device of the optimiser.
+        adam: settings of the optimiser.
     """
 
     def __init__(
@@ -59,7 +61,7 @@ class MotionField:
         self._radius, self._rates = radius, {"grid": settings.grid_rate, "mlp": settings.mlp_rate}
         times = (torch.arange(frames) + 0.5) / frames
         orders = torch.arange(min(settings.temporal_frequencies, frames) if frames > 1 else 0)
-        self._encoding = torch.cos(math.pi * times[:, None] * orders)  # [T, K], as the temporal transform has them
+        self._encoding = torch.cos(math.pi * times[:, None] * orders)  # [T, K], cosines of the temporal transform
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self._grid = HashGrid(

@@ -1,13 +1,13 @@
-"""Motion search: where a subject has gone that has moved out of reach of the gradient.
+"""Motion search: finds a subject that has moved out of reach of the gradient.
 
-In: a tracker before it fits a frame. Out: its pose with another step to that frame, where one fits much better than
-constant velocity does. First the whole subject is one rigid body, then it has some parts, which are bodies of their
-own. Small pictures of some views are compared. From several turns (the starts) a few steps of the gradient bring all
-parts to the nearest fit; of these motions each part takes the one with which the pictures fit best.
+In: a tracker before it fits a frame. Out: its pose with another velocity, if one fits that frame much better than
+constant velocity. Small pictures of some views are compared. First the whole subject is one rigid body, then each of
+some parts is one. From several rotations (the starts) a few gradient steps bring all parts to the nearest fit; each
+part takes the one of these motions with which the pictures fit best.
 
-Where that leaves much, limbs have swung out of reach, which the gradient hides behind the rest. Small cells without
-which the pictures fit better are lost; those beside each other are one limb, which is turned about either end of its
-longest axis to all directions. What moves besides is left to the fit of the frame.
+If a large error remains, limbs have swung out of reach, which the gradient hides behind the rest. Small cells are lost
+if the pictures fit better without them. Lost cells beside each other are one limb, which is rotated about either end of
+its longest axis to all directions. Other motion is left to the fit of the frame.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ END = 1.5  # standard deviations from the middle of a limb to its end: sqrt(3) f
 
 
 def search(tracker: Tracker, frame: int, ratio: float) -> Pose | None:
-    """The pose of `tracker`, in the frame before `frame`, with the step that fits `frame` best. None: constant velocity
-    fits well enough, its loss is less than `ratio` times that of the frame before; or what fits best takes little of
-    that away, since few views fit any frame far better than the next one, however slowly all moves."""
-    if not tracker.moving.any() or not tracker.views.show(frame):  # all that moved is gone
+    """The pose of `tracker`, in the frame before `frame`, with the velocity that fits `frame` best. None: constant
+    velocity fits well enough (its loss is less than `ratio` times that of the frame before), or the best motion lowers
+    the loss by little: with few views, any frame is fitted far better than the next one, however slow the motion is."""
+    if not tracker.moving.any() or not tracker.views.show(frame):  # no moving Gaussians or no subject
         return None
     s, whole = tracker.settings.motion_search, _Bodies(tracker, tracker.pose, frame, 1)
     usual, before = whole.loss(whole.still), whole.loss_before()
@@ -55,13 +55,13 @@ def search(tracker: Tracker, frame: int, ratio: float) -> Pose | None:
 
 
 def _loss(tracker: Tracker, pose: Pose, frame: int) -> float:
-    """Loss behind the step of `pose`."""
+    """Loss after the step of `pose`."""
     there = _Bodies(tracker, pose, frame, 1)
     return there.loss(there.still)
 
 
 def _with_limbs(tracker: Tracker, pose: Pose, frame: int) -> Pose:
-    """`pose` with another step, in which limbs that are lost are where they fit best."""
+    """`pose` with another velocity, which moves lost limbs to where they fit best."""
     s = tracker.settings.motion_search
     for _ in range(s.limb_rounds):
         cells = _Bodies(tracker, pose, frame, s.cells)
@@ -76,15 +76,15 @@ def _with_limbs(tracker: Tracker, pose: Pose, frame: int) -> Pose:
 
 
 def _starts(turn: float) -> np.ndarray:
-    """Motions [7, 6] of one part: none, and by `turn` radians either way about each axis."""
+    """Motions [7, 6] of one part: none, and rotations by `turn` radians either way about each axis."""
     turns = np.concatenate([np.zeros((1, 3)), turn * np.eye(3), -turn * np.eye(3)])
     return np.pad(turns, ((0, 0), (0, 3))).astype(np.float32)
 
 
 class _Bodies:
-    """The moving Gaussians of a tracker a frame after `pose` at its velocity, without a far background behind them, as
-    `parts` rigid bodies, and small views of `frame`. A motion [parts, 6] has for each a rotation vector about its
-    center and a translation in radii; that of `still` is 0."""
+    """The moving Gaussians of a tracker, one frame after `pose` at its velocity and without far background, as `parts`
+    rigid bodies; and small views of `frame`. A motion [parts, 6] has for each part a rotation vector about its center
+    and a translation in radii; `still` is 0."""
 
     def __init__(self, tracker: Tracker, pose: Pose, frame: int, parts: int):
         self.tracker, self.settings, self._pose, self._frame = tracker, tracker.settings.motion_search, pose, frame
@@ -103,7 +103,7 @@ class _Bodies:
         self.join(np.arange(len(self._seeds)))
 
     def join(self, part: np.ndarray) -> None:
-        """Makes one part of several: `part` says of each which one it belongs to from here on."""
+        """Merges parts: `part` is the new index of each part."""
         self._of_seed, count = torch.from_numpy(part), int(part.max()) + 1
         self._part = self._nearest(self._params["means"])
         of_moving = self._part[self._moving]
@@ -112,8 +112,8 @@ class _Bodies:
         self.still = np.zeros((count, 6), np.float32)
 
     def limbs(self) -> np.ndarray:
-        """For each part the limb that it belongs to, from 1, of those without which the pictures fit better; limbs lie
-        apart from each other. 0: it is where it should be."""
+        """[parts] int, limb of each part, from 1, if the pictures fit better without the part; else 0. Limbs lie apart
+        from each other."""
         from scipy.sparse.csgraph import connected_components
         from scipy.spatial import cKDTree
 
@@ -131,7 +131,7 @@ class _Bodies:
         return limb
 
     def with_limb(self, motion: np.ndarray, limb: int) -> np.ndarray:
-        """`motion`, or the same with this part where it fits best of all directions."""
+        """`motion`, with part `limb` in its best direction if that lowers the loss."""
         least, s = self.loss(motion), self.settings
         best, only = motion, np.zeros((len(motion), 1), np.float32)
         only[limb] = 1
@@ -143,12 +143,12 @@ class _Bodies:
         return best
 
     def _turns(self, part: int) -> list[np.ndarray]:
-        """Motions [6] of a part: none, and about either end of its longest axis, to directions that are not too far."""
+        """Motions [6] of a part: none, and about either end of its longest axis to directions within `limb_turn`."""
         center, turns = self._centers[part].numpy().astype(float), [np.zeros(6, np.float32)]
         points = self._means[self._part[self._moving] == part].numpy() - center
         _, sizes, axes = np.linalg.svd(points, full_matrices=False)
         half = END * sizes[0] / np.sqrt(len(points))
-        directions = fibonacci_directions(self.settings.directions) * (1, -1, 1)  # mirrored, as figures were measured
+        directions = fibonacci_directions(self.settings.directions) * (1, -1, 1)  # mirrored, as in the measurements
         for arm in (half * axes[0], -half * axes[0]):  # from the end to the center
             for direction in half * directions:
                 axis = np.cross(arm, direction)
@@ -165,11 +165,11 @@ class _Bodies:
         return {**self._params, "logit_opacities": opacities}
 
     def _near(self, points: torch.Tensor) -> torch.Tensor:
-        """[P] bool, which of `points` [P, 3] are not of a far background."""
+        """[P] bool: `points` [P, 3] that are not far background."""
         return (points - self._middle).norm(dim=1) <= self._reach
 
     def _nearest(self, points: torch.Tensor) -> torch.Tensor:
-        """Part of each of `points` [P, 3]."""
+        """[P] int, part of each of `points` [P, 3]."""
         return self._of_seed[torch.cdist(points, self._seeds).argmin(1)]
 
     def _loss(self, params: dict, frame: int) -> RenderLoss:
@@ -182,11 +182,11 @@ class _Bodies:
         return self._loss(self.tracker.model.params, self._frame - 1).loss
 
     def loss(self, motion: np.ndarray) -> float:
-        """Loss behind a motion."""
+        """Loss after a motion."""
         return self._loss(self._moved(motion), self._frame).loss
 
     def _turned(self, motion: np.ndarray, points: torch.Tensor, part: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Points [P, 3] of some parts behind a motion, and their rotations [P, 4]."""
+        """`points` [P, 3] of the parts `part` [P] after a motion, and their rotations [P, 4]."""
         values = torch.from_numpy(motion)
         turn, shift = rotvec_to_quat(values[:, :3])[part], self.tracker.radius * values[part, 3:]
         center = self._centers[part]
@@ -199,7 +199,7 @@ class _Bodies:
         return {**p, **{n: torch.where(self._moving[:, None], x, p[n]) for n, x in moved.items()}}
 
     def fitted(self, motion: np.ndarray, only: np.ndarray | float = 1.0) -> np.ndarray:
-        """The motion that some steps of the gradient reach from `motion`; `only`: [parts, 1], 1 for those that move."""
+        """The motion that some gradient steps reach from `motion`; `only`: [parts, 1], 1 for parts that may move."""
         t, s = self.tracker, self.settings
         values, adam = {"motion": motion.copy()}, Adam(t.views.backend, t.settings.tracking.node_adam)
         for step in range(s.steps):
@@ -215,7 +215,7 @@ class _Bodies:
         return values["motion"]
 
     def chosen(self, start: float, found: list[np.ndarray]) -> np.ndarray:
-        """For each part one of the motions `found`, or `still`, whose loss is `start`."""
+        """The best motion found: each part moves as in one of `found` or in `still`, whose loss is `start`."""
         s, still = self.settings, self.still
         losses = [self.loss(m) for m in found]
         best, least = min(zip(found, losses, strict=True), key=lambda x: x[1])
@@ -239,7 +239,7 @@ class _Bodies:
         return None if best is self.still else self.pose(best)
 
     def pose(self, motion: np.ndarray) -> Pose:
-        """The pose of the tracker with a step that ends behind `motion`."""
+        """The pose of the tracker with a velocity that includes `motion`."""
         there = self._pose.next()
         nodes, turn = self._turned(motion, there.nodes, self._nearest(there.nodes))
         whole = quat_multiply(turn, rotvec_to_quat(self._pose.angular_velocity))

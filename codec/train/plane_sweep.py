@@ -1,15 +1,15 @@
 """Initial points of a keyframe without masks: depth by plane sweep, kept where views agree.
 
 In: views of one frame. Out: points and colours. Each view is compared with its neighbours over planes parallel to its
-image (Collins 1996) by normalised cross-correlation in small windows, so that exposure does not matter. The better half
-of the neighbours makes the score, because the others may not see the surface (Kang et al. 2001). Between planes the
-depth is that of the vertex of a parabola through three scores. It is kept where the correlation is high and another
-depth map agrees.
+image (Collins 1996) by normalised cross-correlation in small windows, so that exposure does not matter. The score is
+the mean of the better half of the neighbours, because the others may not see the surface (Kang et al. 2001). Between
+planes the depth is at the vertex of a parabola through three scores. It is kept where the correlation is high and
+another depth map agrees.
 
 Two views that look from directions far apart see a surface at such different slants that windows parallel to one image
-never match. A view without near neighbours is compared with the nearest ones there are over planes of several
-directions (Gallup et al. 2007): level ones (floor, table) and upright ones. A depth is kept if no other one matches as
-well. Tiny pictures are left out, and those without much texture, since what is found would leave the rest bare.
+never match. A view without near neighbours is compared with the nearest views over planes of several directions (Gallup
+et al. 2007): level planes (floor, table) and upright planes. A depth is kept if no other depth matches as well. Tiny
+pictures and pictures with little texture are left out, since the points found would leave the rest bare.
 """
 
 from __future__ import annotations
@@ -81,15 +81,15 @@ def _neighbours(cameras, i: int, settings: PlaneSweepSettings) -> list[int]:
 
 
 def _textured(grey: np.ndarray, settings: PlaneSweepSettings) -> bool:
-    """Whether most of a picture has texture, so that the points of a sweep cover what it shows. In a tiny one a window
-    is most of what there is to match."""
+    """Whether most of a picture has texture, so that the points of a sweep cover it. False for tiny pictures, in which
+    a window covers most of the image."""
     if min(grey.shape) < settings.sides_min * settings.window:
         return False
     return float(np.mean(_windows(grey, settings.window)[1] >= settings.contrast_min)) > 0.5
 
 
 def world_normals(cameras, upright: int) -> list[np.ndarray]:
-    """Unit normals of level planes and of `upright` upright ones, evenly around; up is up in the mean image."""
+    """Unit normals of level planes and of `upright` upright planes, evenly around; up is that of the mean image."""
     up = -np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
     up /= max(np.linalg.norm(up), 1e-9)
     side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
@@ -119,7 +119,7 @@ def _agree(points: np.ndarray, camera, depths: np.ndarray, tolerance: float) -> 
 
 
 def _ray_map(camera, other, plane: np.ndarray) -> np.ndarray:
-    """[3, 3], from rays of `camera` to those of `other` by way of a plane n . x = 1 in the axes of `camera`."""
+    """[3, 3], maps rays of `camera` to those of `other` through the plane n . x = 1 in the axes of `camera`."""
     R = other.viewmat[:3, :3] @ camera.viewmat[:3, :3].T
     return R + np.outer(other.viewmat[:3, 3] - R @ camera.viewmat[:3, 3], plane)
 
@@ -140,8 +140,8 @@ def _windows(grey: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _Best:
-    """The best score of each pixel over planes, [H, W], and the inverse depth there; `second` is the best at another
-    depth.
+    """The best score of each pixel over planes, [H, W], and the inverse depth there; `second` is the best score at
+    another depth.
 
     Planes come in order of their distance, so that the scores on both sides of the best one are known.
     """
@@ -153,11 +153,11 @@ class _Best:
         self.start()
 
     def start(self) -> None:
-        """The next plane does not follow the last one."""
+        """Starts a new sequence of planes: the next plane is not beside the last one."""
         self._last, self._better = np.float32(-1), None
 
     def add(self, score: np.ndarray, inverse_depth: np.ndarray, step: np.ndarray) -> None:
-        """The scores of the next plane, its inverse depth, and the difference of that to the plane before; [H, W]."""
+        """Adds the scores of the next plane, its inverse depth, and its step from that of the plane before; [H, W]."""
         if self._better is not None:
             self._behind[self._better] = score[self._better]
         better = score > self.score
@@ -171,8 +171,8 @@ class _Best:
         self._last, self._better = score, better
 
     def depth(self) -> np.ndarray:
-        """[H, W], at the vertex of the parabola through the best score and those beside it; infinite where no plane has
-        a score."""
+        """[H, W] depth at the vertex of the parabola through the best score and its two neighbours; infinite where no
+        plane has a score."""
         bend = self._before - 2 * self.score + self._behind
         known = (self._before > -1) & (self._behind > -1) & (bend < 0)
         vertex = np.where(known, 0.5 * (self._before - self._behind) / np.where(known, bend, -1), 0)
@@ -185,7 +185,7 @@ class _Part:
 
     Attributes:
         camera, grey: of this part.
-        deviation: [H, W], contrast of the window around each pixel.
+        deviation: [H, W], standard deviation in the window around each pixel.
         rays: [H, W, 3], at unit depth.
     """
 
@@ -197,10 +197,10 @@ class _Part:
         self._slant = settings.slant_cosine_min * np.linalg.norm(self.rays, axis=2)
 
     def depth(self, neighbours: list[tuple], directions: list[np.ndarray], inverse: np.ndarray) -> np.ndarray:
-        """[H, W], 0 where it is unknown.
+        """[H, W] depth, 0 where unknown.
 
         Args:
-            neighbours: (camera, grey) of each.
+            neighbours: (camera, grey) of each neighbour.
             directions: normals [3] of the planes in the axes of the camera.
             inverse: [P], 1 / distance of the planes of each direction.
         """
@@ -220,8 +220,8 @@ class _Part:
         return depth
 
     def _correlation(self, other, grey: np.ndarray, plane: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """With the picture `grey` of the camera `other` by way of a plane n . x = 1, [H, W]; -1 where it does not see
-        the plane."""
+        """[H, W], correlation with the picture `grey` of the camera `other` through a plane n . x = 1; -1 where `other`
+        does not see the plane."""
         import cv2
 
         ray_map, size = _ray_map(self.camera, other, plane), (self._settings.window, self._settings.window)

@@ -15,7 +15,7 @@ from ..model.rig import Rig
 from .settings import TrainSettings
 from .train import segments, train_groups
 
-CPUS = 2  # of a job, and threads of its kernels: parallel segments gain more than more threads in one
+CPUS = 2  # of a job, and threads of its kernels: more segments in parallel gain more than more threads for one
 RETRIES = 5  # of a segment whose worker died
 
 
@@ -29,7 +29,7 @@ def cluster_groups(
     rig: Rig | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> Iterator[ParametricGroup]:
-    """Yields what `train_groups` does.
+    """Yields the groups that `train_groups` yields.
 
     Args:
         address: of the cluster, as `ray.init` takes it ("auto", "ray://host:10001"); "local" starts one here.
@@ -50,7 +50,7 @@ def cluster_groups(
     try:
         left = [s for s in segments(open_capture().frame_count, settings.gop, random_access) if s.stop > first_frame]
         cpus = int(min(CPUS, max(node["Resources"].get("CPU", 1) for node in ray.nodes())))
-        threads = {"env_vars": {"RAYON_NUM_THREADS": str(cpus), "OMP_NUM_THREADS": "1"}}  # of the kernels, of torch
+        threads = {"env_vars": {"RAYON_NUM_THREADS": str(cpus), "OMP_NUM_THREADS": "1"}}  # kernels, torch
         job = ray.remote(num_cpus=cpus, max_retries=RETRIES, runtime_env=threads)(train_segment)
         pending = [job.remote(open_capture, settings, random_access, s, rig) for s in left]
         for segment in left:
@@ -67,7 +67,7 @@ def cluster_groups(
         why = str(e).strip().splitlines()[0]
         raise UsageError(f"--ray {address}: the cluster failed ({why}); run the same command to go on") from e
     finally:
-        ray.shutdown()  # ends what is still running
+        ray.shutdown()  # ends running jobs
 
 
 def _knock(address: str) -> None:

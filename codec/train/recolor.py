@@ -1,8 +1,8 @@
-"""Colours of a group anew, by the pictures of a capture: its geometry and its motion stay as they are.
+"""Recolouring: the colours of a group are fitted to the pictures of a capture; geometry and motion stay as they are.
 
-In: a group, pictures. Out: the group in new colours, its trajectories included. First one affine map of all colours,
-since a grade or another light mostly is one; what no camera sees changes with it. Then Adam on harmonics and on the
-lowest temporal frequencies, for every Gaussian.
+In: a group, pictures. Out: the group with new colours and colour trajectories. First one affine map of all colours,
+since a grade or another light is mostly affine; it also changes Gaussians that no camera sees. Then Adam on the
+harmonics and the lowest temporal frequencies of every Gaussian.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ NAMES = ("sh0", "shN")
 def fit_colors(
     group: ParametricGroup, first: Iterable[Picture], pictures: Iterable[Picture], count: int, settings: RecolorSettings
 ) -> ParametricGroup:
-    """The group with the colours of its pictures.
+    """The group with colours fitted to pictures.
 
     Args:
-        first: pictures for the affine map. pictures: `count` of them, one a step.
+        first: pictures for the affine map.
+        pictures: `count` pictures, one a step.
     """
     fit = _Fit(group, settings)
     fit.map_colors(first)
@@ -58,7 +59,7 @@ class _Fit:
         self._adam = Adam(self._backend, AdamSettings(eps=1e-8))
 
     def _coefficients(self, name: str) -> np.ndarray:
-        """[N, K, C] f32; the constant part is 0, and in the canonical values."""
+        """[N, K, C] f32; the constant part is moved to the canonical values and 0 here."""
         c, (n, channels) = self._group.trajectories.get(name), self.values[name].shape
         least = min(self._settings.frequencies if name == "sh0" else 1, len(self._group))
         out = np.zeros((n, max(least, 0 if c is None else len(c)), channels), np.float32)
@@ -70,12 +71,12 @@ class _Fit:
         return out
 
     def frame(self, t: int) -> Gaussians:
-        """Frame `t` with the colours as they are."""
+        """Frame `t` with the current colours."""
         g = self._at_rest(t)
         return g if self._turns is None else replace(g, shN=turned_harmonics(g.shN, self._turns[t]))
 
     def _at_rest(self, t: int) -> Gaussians:
-        """`frame`, with harmonics that are not turned."""
+        """`frame` without the turn of the harmonics."""
         g, now = self._frames[t], {}
         for name, v in self.values.items():
             c = self.over_time[name]
@@ -85,7 +86,7 @@ class _Fit:
         return replace(g, sh0=correlate(now["sh0"]), shN=shN)
 
     def map_colors(self, pictures: Iterable[Picture]) -> None:
-        """Maps all colours by the affine map under which pixels of the group are nearest to those of the pictures."""
+        """Maps all colours by the affine map that brings rendered pixels nearest to the pictures."""
         ours, theirs = [], []
         for t, camera, background, picture in pictures:
             image, alpha = self._backend.render(params_of(self.frame(t)), camera, background)
@@ -96,7 +97,7 @@ class _Fit:
         if len(x) < self._settings.pixels_least:
             return
         x = np.column_stack([x, np.ones(len(x))])
-        prior = self._settings.prior * len(x)  # towards no change, for colours that hardly differ
+        prior = self._settings.prior * len(x)  # towards the identity, for colours that hardly vary
         A = np.linalg.solve(x.T @ x + prior * np.eye(4), x.T @ y + prior * np.eye(4, 3))  # [4, 3]
         turn, shift = A[:3].T, (0.5 * A[:3].sum(0) + A[3] - 0.5) / SH_C0
         by = np.linalg.inv(TO_RGB) @ turn @ TO_RGB  # on Y, Co, Cg
@@ -106,7 +107,7 @@ class _Fit:
         self.values["sh0"] += decorrelate(shift[None]).astype(np.float32)
 
     def step(self, picture: Picture, left: float) -> None:
-        """One step of Adam; `left`: share of the steps that are to come, by which rates fall."""
+        """One step of Adam; `left`: share of the steps that remain, a factor of the rates."""
         t, camera, background, target = picture
         off = lambda image: np.ascontiguousarray(image - target)  # noqa: E731
         turns = None if self._turns is None else self._turns[t]
@@ -118,7 +119,7 @@ class _Fit:
             c, moving = self.over_time[name], f"{name} over time"
             if c.shape[1] > 1:
                 at = self._basis[: c.shape[1], t].copy()
-                at[0] = 0  # the canonical values have it
+                at[0] = 0  # the constant is in the canonical values
                 params[moving], grads[moving] = c, at[:, None] * derivative[name][:, None]
                 rates[moving] = rate * self._settings.over_time
         self._adam.step(params, grads, rates)
@@ -137,7 +138,7 @@ class _Fit:
 
 
 def _shown(group: ParametricGroup, t: int) -> Gaussians:
-    """Frame `t` of the group; what is outside of its lifetime is transparent."""
+    """Frame `t` of the group; Gaussians outside of their lifetime are transparent."""
     g, life = group.frame(t), group.lifetimes
     if life is None:
         return g
@@ -146,5 +147,5 @@ def _shown(group: ParametricGroup, t: int) -> Gaussians:
 
 
 def picture_count(cameras: int, frames: int, settings: RecolorSettings) -> int:
-    """Steps for a group of so many frames of so many training cameras."""
+    """Steps for a group of `frames` frames of `cameras` training cameras."""
     return max(settings.steps_least, min(settings.passes * cameras, settings.frame_pictures) * frames)

@@ -1,8 +1,8 @@
-"""Last stage of training: the integers of a coded group are refined by the pictures of the capture.
+"""Last stage of training: the integers of a coded group are refined against the pictures of the capture.
 
-A trained model is only as near to its pictures as training came. Its rounded values are compared with the pictures and
-not with the model, so that errors of the model are made up for as well. The encoder hands over its quantizer, which
-takes the steps (`follow`); this stage draws the pictures and says how far a step goes.
+Decoded values are compared with the pictures and not with the trained model, so that errors left by training are
+corrected as well. The encoder hands over its quantizer, which takes the steps (`follow`); this stage draws the pictures
+and sets the size of the steps.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ class Quantizer(Protocol):
     """A group in integers that can be moved.
 
     Attributes:
-        frames: of the group. gaussians: that are coded.
+        frames: number of frames of the group.
+        gaussians: number of coded Gaussians.
     """
 
     frames: int
@@ -37,10 +38,10 @@ class Quantizer(Protocol):
 
 
 class PictureRefinement:
-    """Refines groups by the training pictures of `capture`, whose frame 0 is that of the stream.
+    """Refines groups against the training pictures of `capture`, whose frame 0 is that of the stream.
 
     Args:
-        views: pictures of each group; None: as `settings` say.
+        views: number of pictures for each group; None: from `settings`.
     """
 
     def __init__(self, capture: Capture, settings: RefinementSettings | None = None, views: int | None = None):
@@ -50,7 +51,7 @@ class PictureRefinement:
     def __call__(
         self, group: ParametricGroup, first_frame: int, quantizer: Quantizer, views: int | None = None
     ) -> None:
-        """Refines `group`, which begins at `first_frame`, by `views` pictures; None: by as many as the settings say.
+        """Refines `group`, which begins at `first_frame`, against `views` pictures; None: as set on construction.
 
         Raises:
             CaptureError: a picture cannot be read.
@@ -66,9 +67,9 @@ class PictureRefinement:
         quantizer.follow(self.pictures(group, first_frame, count), count, reach / count**0.5)
 
     def pictures(self, group: ParametricGroup, first_frame: int, count: int, seed: int = 0) -> Iterator[Picture]:
-        """`count` pictures of `group`, which begins at `first_frame`, in the order that `seed` draws: all cameras of a
-        frame before any one again, all frames in turn, each picture over a background of its own: a haze in the colour
-        of a known background would pass for opacity.
+        """`count` pictures of `group`, which begins at `first_frame`, in random order (`seed`): all frames in turn, all
+        cameras of a frame before one comes again. Each picture has a random background: with a known one, haze in its
+        colour would pass for transparency.
 
         Raises:
             CaptureError: a picture cannot be read.

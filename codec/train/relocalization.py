@@ -1,8 +1,8 @@
 """Relocalization: a batch of new Gaussians that has moved out of reach of the gradient is found again, or removed.
 
-In: the Gaussians of a frame at constant velocity, and those that came in together. Out: the shift that moves these to
-where the images show them, or None. They are lost if the images fit better without them. Then a plane sweep searches
-the pixels that are wrong without them, and the place that fits best is taken.
+In: the Gaussians of a frame at constant velocity, and the batch. Out: the shift that moves the batch to where the
+images show it, or None. A batch is lost if the images fit better without it. Then a plane sweep searches the pixels
+that are wrong without it, and the place that fits best is taken.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ def relocalize(
 
     Args:
         model: all Gaussians.
-        some: [N] bool, those that are searched for.
-        changes: fitted to `frame`.
-        masks: [h, w] bool of each training camera, its changed pixels.
+        some: [N] bool, the Gaussians to find.
+        changes: reference images, fitted to `frame`.
+        masks: [h, w] bool of each training camera, changed pixels.
     """
     s, views = settings.relocalization, changes.views
     hidden = torch.where(some, REMOVED_LOGIT, model.params["logit_opacities"])

@@ -1,7 +1,7 @@
-"""A rig in training: what it says of the nodes' step to the next frame, from which tracking starts.
+"""A rig in training: predicts the nodes' step to the next frame, from which tracking starts.
 
-So fast articulated motion is reached, and what is optimised is the residual: where a node was beside the prediction it
-stays beside it. Nodes that the rig does not move, among them those of newcomers, keep their constant velocity.
+So tracking reaches fast articulated motion and optimises the residual: a node keeps its offset from the prediction.
+Nodes that the rig does not move, among them nodes of Gaussians added later, keep their constant velocity.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ class RigPrediction:
         self._weights = skin_weights(rig, at_rest, graph.nodes[torch.from_numpy(graph.batch == 0)].numpy())
 
     def motion(self, nodes: int, frames: range) -> RigMotion:
-        """That of the first `nodes` nodes of the graph over some frames."""
+        """Predicted motion of the first `nodes` nodes of the graph over `frames`."""
         added = nodes - len(self._weights)
         return self.rig.motion(np.pad(self._weights, ((0, added), (0, 0))), self.at_rest, frames)
 
     def step(self, pose: Pose, graph: NodeGraph, frame: int) -> Pose:
-        """The pose of the frame before `frame`, with the step to it as the rig says."""
+        """The pose of the frame before `frame`, with the predicted step to `frame` as velocity."""
         motion = self.motion(len(graph), range(frame - 1, frame + 1))
         places, turned = (torch.from_numpy(a) for a in motion.at(graph.nodes.numpy()))
         turn = quat_multiply(turned[1], quat_conjugate(turned[0]))
-        beside = rotate(turn, pose.nodes - places[0])  # where a node is beside the prediction turns with it
+        beside = rotate(turn, pose.nodes - places[0])  # offset from the prediction, turned with it
         shift = places[1] + beside - pose.nodes
         moved = torch.from_numpy(motion.weights.any(1))[:, None]
         return replace(

@@ -1,8 +1,8 @@
-"""Sparse points as initial points of a keyframe: those of the capture that the pictures of the frame do not refute, or
-else matched features of its training cameras, triangulated.
+"""Sparse points as initial points of a keyframe: points of the capture that the pictures of the frame do not refute, or
+else triangulated matches of features of its training cameras.
 
-In: the points of the capture, which are of its frame 0, and the views of a frame. A point stays that lies in the mask
-of every view that has it in sight, so that of a subject that has moved on only what still fits is kept.
+In: the points of the capture, which are of its frame 0, and the views of a frame. A point is kept if it lies in the
+mask of every view that has it in sight, so that points of a subject that has moved on are dropped.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def known_points(points, views, count: int, seed: int) -> tuple[np.ndarray, np.n
 def triangulated(
     capture, frame: int, settings: InitializationSettings, look: Callable[[int], View] | None = None
 ) -> Points:
-    """Points of features of `frame` that are matched between neighbouring training cameras.
+    """Triangulated features of `frame` that are matched between neighbouring training cameras.
 
     Args:
         look: camera -> its picture at `frame`, where it is decoded already; None: as the capture gives it.
@@ -74,7 +74,7 @@ def triangulated(
 def _intersections(
     a: Camera, b: Camera, matches: Matches, settings: InitializationSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points [M, 3] of the matches, and [M] bool: where the rays meet before both cameras, at an angle that tells."""
+    """Points [M, 3] of the matches, and [M] bool: where the rays meet before both cameras, at a large enough angle."""
     import cv2
 
     x = cv2.triangulatePoints(a.K @ a.viewmat[:3], b.K @ b.viewmat[:3], matches.p.T, matches.q.T)

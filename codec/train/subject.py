@@ -1,4 +1,4 @@
-"""State that lasts from group to group: the tracked Gaussians and all that was decided with their keyframe."""
+"""State that lasts from group to group: the tracked Gaussians and the values fixed with their keyframe."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class Subject:
     """The Gaussians of a keyframe while they are tracked, from group to group.
 
     Attributes:
-        tracker: holds them as they are in the last frame.
-        first: frame of their keyframe.
-        loss: image loss of it.
-        radius: of the points that the keyframe started from, without the far shell, world units.
-        shown: pixels of the scene in its pictures, the median of the views.
+        tracker: holds the Gaussians as they are in the last frame.
+        first: frame of the keyframe.
+        loss: image loss of the keyframe.
+        radius: of the initial points of the keyframe, without the far shell, world units.
+        shown: pixels of the scene in the keyframe's pictures, median of the views.
         canonical: Gaussians that all groups since the keyframe refer to; None before the first is fine-tuned.
         parents: [N] index of each Gaussian in the group before.
         steps: quantization steps of all groups since the keyframe; None before the first is fine-tuned.
@@ -41,7 +41,7 @@ class Subject:
     steps: Steps | None = None
 
     def start_next_group(self, canonical: Model) -> None:
-        """Starts the next group from `canonical`, all Gaussians of the last one, without the removed ones."""
+        """Starts the next group from `canonical`, all Gaussians of the last group, without the removed ones."""
         alive = self.tracker.alive
         self.parents = np.flatnonzero(alive.numpy())
         self.tracker.select(alive)

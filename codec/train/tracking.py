@@ -3,14 +3,14 @@
 Optimised together against the views: the rigid motions of the nodes, which carry all Gaussians, and the Gaussians' own
 attributes (frame_fit.py). Colours must be free while nodes move: shading changes on a rotating surface, and with fixed
 colours the motion follows the shading instead of the surface (lumberjack after 6 frames: 22.5 dB, with free colours
-26.1). The first half of the first round sees small images, in which large motion is near and a step is cheap.
+26.1). The first half of the first round uses small images, in which large motion is few pixels and a step cheap.
 
 Gaussians behind pixels that do not change (change_detection.py) stay as they are, to the bit, and so do their nodes.
-New Gaussians (densification.py) have nodes of their own, unless they lie beside others. What moves too fast for the
-gradient is searched for: new Gaussians (relocalization.py), and the subject and its parts (motion_search.py). Gaussians
-that have faded, or lie outside of the masks, are removed.
+New Gaussians (densification.py) have nodes of their own, unless they lie beside others. A search finds motion too fast
+for the gradient: of new Gaussians (relocalization.py), of the subject and its parts (motion_search.py). Gaussians that
+have faded, or lie outside of the masks, are removed.
 
-A hash grid and an MLP move the nodes beside their own variables (motion_field.py), so that far motion is reached in
+A hash grid and an MLP move the nodes beside their own variables (motion_field.py), so that large motion is reached in
 fewer steps.
 """
 
@@ -54,17 +54,17 @@ class Tracker:
         own: see below.
         numbers: radius of the moving Gaussians in world units; `loss`, see below; `keyframe_gradient`, the reference
             of screen gradients (`gradient_quantile` of those in the keyframe).
-        changes: what has been fitted so far.
+        changes: reference images, as fitted so far.
 
     Attributes:
         own: the Gaussians in the pose of the keyframe; `means` are the offsets from where the nodes carry them.
         pose: of the nodes in the last frame.
         moving: [N] bool, Gaussians that were optimised in the last frame.
         loss: image loss of the last frame with changes, without the mask term.
-        masks: changed pixels of the last frame, as of `Changes.advance`.
-        screen_gradient: [N], mean in the last frame.
-        rig: says how the nodes move to the next frame; None: they go on as they did.
-        searched: the last frame was out of reach of the gradient, and a search has found it.
+        masks: changed pixels of the last frame, from `Changes.advance`.
+        screen_gradient: [N], mean screen gradient in the last frame.
+        rig: predicts the nodes' step to the next frame; None: constant velocity.
+        searched: the motion to the last frame was out of reach of the gradient, and a search has found it.
     """
 
     def __init__(
@@ -167,13 +167,13 @@ class Tracker:
         return any(m.any() for m in self.masks)
 
     def _missing(self, frame: int) -> float | None:
-        """`advance` where no Gaussian is left."""
+        """Result of `advance` where no Gaussian is left."""
         return np.inf if self._changed and self.views.show(frame) else None
 
     def _fit(self, frame: int, on_step: OnStep) -> None:
-        """Rounds of `motion_steps`, until the loss is near that of the frame before or falls no more. Stiff ones come
-        first if the velocity is that of a search or not known at all. Behind a search the nodes have another round
-        before the Gaussians follow: colours that change at once take what should move."""
+        """Rounds of `motion_steps`, until the loss is near that of the frame before or falls no more. Stiff rounds come
+        first if the velocity is unknown or from a search. After a search the nodes have another round before the
+        Gaussians follow: otherwise colours change in place of the motion."""
         fit = FrameFit(self, np.random.default_rng([self.settings.seed, frame, 1]))
         s = self.settings.tracking
         bound, loss = s.loss_ratio * self.loss + s.loss_floor, np.inf
@@ -193,14 +193,14 @@ class Tracker:
         self.screen_gradient = fit.statistics.mean_screen_gradient()
 
     def _of_usual(self, scale: float) -> float:
-        """`scale` of images of the usual size, which makes larger ones as small, to halves."""
+        """`scale` for images of the usual size; less for larger images, by a power of 1/2 that makes them as small."""
         return scale * 0.5 ** max(0, round(math.log2(self.views.largest_side / self.settings.tracking.usual_side)))
 
     def _round(
         self, fit: FrameFit, frame: int, on_step: OnStep, scale: float, *, stiff: bool = False, slow: bool = False
     ) -> float:
         """`motion_steps` views at `scale` times their size in the first half, or, if `stiff`, in all steps; returns the
-        image loss at the end. `stiff`, `slow`: as of `FrameFit.step`."""
+        image loss at the end. `stiff`, `slow`: see `FrameFit.step`."""
         s, steps = self.settings.tracking, self.settings.motion_steps
         losses = []
         for step in range(steps):
@@ -236,8 +236,8 @@ class Tracker:
         self.moving = self.moving[chosen]
 
     def adopt(self, group: GroupModel) -> None:
-        """Goes on from the last frame as fine-tuning left it. What moves goes on with smaller coefficients: those that
-        no picture asks for would grow from group to group, and each pays for them anew."""
+        """Continues from the last frame of the fine-tuned group. Moving Gaussians continue with smaller coefficients:
+        coefficients that no picture needs would grow from group to group, and each group would pay again."""
         backend, last = self.views.backend, group.frames - 1
         frame, smaller = group.frame(last, backend), group.frame(last, backend, shrinkage=group.settings.shrinkage)
         new = group.origin < 0
@@ -250,7 +250,7 @@ class Tracker:
         self.own = self._own(params, *self.graph.carry(rest, frame.pose))
 
     def densify(self, frame: int, on_step: OnStep = None) -> None:
-        """Adds the Gaussians that `frame` needs besides, after `advance`."""
+        """Adds new Gaussians that `frame` needs, after `advance`."""
         s, most = self.settings, self.settings.gaussians_max
         room = min(most - int(self.alive.sum()), s.tracking.stored_factor * most - len(self.own))
         gradient = self.screen_gradient / self.keyframe_gradient
@@ -271,16 +271,17 @@ class Tracker:
         self.moving = torch.cat([self.moving, torch.ones(len(spawned), dtype=torch.bool)])
 
     def _own(self, params: dict[str, torch.Tensor], means: torch.Tensor, rotations: torch.Tensor) -> Model:
-        """Inverse of `carried`: the own attributes of Gaussians that the nodes carry to `means` by `rotations`, with
-        harmonics as they are there."""
+        """Inverse of `carried`: the own attributes of Gaussians that the nodes carry to `means` by `rotations`;
+        harmonics are not changed."""
         own = {**params, "means": params["means"] - means}
         own["quats"] = quat_product(rotations, params["quats"], inverse_a=True)
         return Model(own)
 
     def _rest_positions(self, means: torch.Tensor) -> torch.Tensor:
-        """Where new Gaussians at `means` [K, 3] rest: beside the nearest Gaussian, whose nodes carry them, too.
+        """Rest positions [K, 3] of new Gaussians at `means` [K, 3]: beside the nearest Gaussian, whose nodes carry
+        them, too.
 
-        Those that are far from all others get nodes of their own, which also carry the new ones nearest to them.
+        Gaussians far from all others get nodes of their own, which also carry the new Gaussians nearest to them.
         """
         from scipy.spatial import cKDTree
 
@@ -304,8 +305,8 @@ class Tracker:
         return float(new.mean()) if len(new) else 0.0
 
     def jumps(self, frame: int) -> bool:
-        """Whether what moved in the last frame is far from where its velocity leads it in `frame`, the next one, and a
-        search finds it. Not told where a rig leads it."""
+        """Whether the moving Gaussians of the last frame are far from where their velocity leads them in `frame`, the
+        next one, and a search finds them. False with a rig."""
         return self.rig is None and search(self, frame, self.settings.motion_search.jump_ratio) is not None
 
     def _moving(self, frame: int) -> np.ndarray:

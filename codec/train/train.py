@@ -66,9 +66,10 @@ def train_groups(
 
     A group continues the Gaussians of the one before (`parents`). It ends early before a frame whose image loss is
     `cut_ratio` times that of the tracked frame before, or `drift_ratio` times that of the keyframe (unless few frames
-    are left), or which shows `shown_ratio` times as much as the keyframe; then the next group starts with a keyframe.
-    It also ends before one in which a large fraction of the Gaussians begins to change, or what moves jumps. Frames
-    without a subject, until a camera sees something, are a group without Gaussians.
+    are left), or which shows `shown_ratio` times as many pixels of the scene as the keyframe; then the next group
+    starts with a keyframe.
+    It also ends before a frame in which a large fraction of the Gaussians begins to change, or the moving ones jump.
+    Frames in which no camera sees a subject, up to the next frame with one, are a group without Gaussians.
     Every segment of `random_access` frames starts with a keyframe: a segment depends on no frames but its own.
 
     Args:
@@ -85,7 +86,7 @@ def train_groups(
     store = Checkpoint(checkpoints)
     run = _Run(capture, settings, backend or CpuBackend(), on_progress, rig)
     if not first_frame:
-        store.clear()  # an earlier run with other settings may have left some
+        store.clear()  # an earlier run with other settings may have left states
     state = store.load(first_frame) if first_frame else None  # absent after a cut, too
     if state is not None:
         run.subject = Subject.restored(state, run.views, run.settings, rig)
@@ -190,13 +191,14 @@ class _Run:
         return float(np.median(self.views.covered(frame)))
 
     def _track(self, frames: range, stop: int, track: _TrackedFrames) -> str:
-        """Tracks `frames` up to the end of the group and adds them to `track`; returns why that came early
-        (`ParametricGroup.ended`). Behind all reasons but "change" and "jump" the next group needs a keyframe.
+        """Tracks `frames` up to the end of the group and adds them to `track`; returns why the group ended early
+        (`ParametricGroup.ended`). After all reasons except "change" and "jump" the next group needs a keyframe.
 
         The group ends where a large fraction of resting Gaussians changes at once: with few temporal frequencies, a
-        light that is switched on would show in all frames of the group, and what was frozen without it shows it badly.
-        So would a jump behind frames that were followed without a search. Where a keyframe has lasted long, the few
-        frames that are left before `stop` lose little more by drift, and do not pay for another one.
+        light that is switched on would show in all frames of the group, and Gaussians that were frozen without it show
+        it badly. A jump after frames that were tracked without a search would show in all frames, too. Where a keyframe
+        has lasted long, the few frames left before `stop` lose little more by drift, and do not pay for another
+        keyframe.
         """
         subject, g = self.subject, self.settings.group
         for frame in frames:
@@ -209,7 +211,7 @@ class _Run:
             if long_enough and followed and subject.tracker.jumps(frame):
                 return "jump"
             near, far = self.settings.cut_ratio * subject.tracker.loss, g.drift_ratio * subject.loss
-            if subject.tracker.loss == subject.loss:  # a keyframe's own fit, which no tracked frame comes near
+            if subject.tracker.loss == subject.loss:  # the keyframe's own loss, which no tracked frame comes near
                 near = far
             if stop - frame < g.drift_share * (frame - subject.first):
                 far = np.inf
@@ -249,14 +251,14 @@ class _TrackedFrames:
     searched: list[bool] = field(default_factory=list)
 
     def add(self, tracker: Tracker) -> None:
-        """The last frame of `tracker`."""
+        """Adds the last frame of `tracker`."""
         self.models.append(tracker.model)
         self.poses.append(tracker.pose)
         self.moving.append(tracker.moving)
         self.searched.append(tracker.searched)
 
     def fullest(self) -> int:
-        """The frame in which most Gaussians live; of several the one nearest to the middle."""
+        """The frame in which most Gaussians live; of several frames the one nearest to the middle."""
         living = [int(m.alive.sum()) for m in self.models]
         return max(range(len(living)), key=lambda t: (living[t], -abs(t - len(living) // 2)))
 

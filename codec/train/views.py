@@ -55,8 +55,8 @@ class Target:
 class Views:
     """The training views of a capture and the calibration of their cameras.
 
-    All training goes through here, so this limits torch to one thread, in the whole process: it handles small tensors,
-    and its idle threads would take their cores from the native kernels. The number of threads changes sums in their
+    All training uses this class, so it limits torch to one thread, in the whole process: torch handles small tensors,
+    and its idle threads would take cores from the native kernels. The number of threads changes sums in their
     last bits.
 
     Args:
@@ -89,28 +89,28 @@ class Views:
 
     @property
     def largest_side(self) -> int:
-        """Of the pictures, pixels."""
+        """Largest side of the pictures, pixels."""
         return max(max(self.capture.cameras[i].width, self.capture.cameras[i].height) for i in self.train_cameras)
 
     @cached_property
     def working_distance(self) -> float:
-        """Of the training cameras (`camera.working_distance`), world units."""
+        """Working distance of the training cameras (`camera.working_distance`), world units."""
         return working_distance([self.capture.cameras[i] for i in self.train_cameras])
 
     @cached_property
     def meeting_point(self) -> np.ndarray:
-        """Of the optical axes of the training cameras (`camera.meeting_point`), [3] f64."""
+        """[3] f64, meeting point of the optical axes of the training cameras (`camera.meeting_point`), world units."""
         return meeting_point([self.capture.cameras[i] for i in self.train_cameras])
 
     def distance(self, means: np.ndarray) -> np.ndarray:
-        """[N] distances of `means` [N, 3] from there; 0 where there are masks, and nothing is far."""
+        """[N] distances of `means` [N, 3] from `meeting_point`; 0 where there are masks, since then nothing is far."""
         if self.capture.has_alpha:
             return np.zeros(len(means))
         return np.linalg.norm(means - self.meeting_point, axis=1)
 
     def nearness(self, means: np.ndarray, frame: int, margin: float) -> np.ndarray:
-        """[N], working distance over the depth of each of `means` [N, 3] in the nearest training camera that could draw
-        it if its picture were `margin` times as wide and high; 0: there is none."""
+        """[N], working distance over the depth of each of `means` [N, 3], in the nearest training camera that would
+        show it in a picture `margin` times as wide and high; 0: no camera would."""
         nearest = np.zeros(len(means))
         for index in self.train_cameras:
             camera = self.camera(index, frame)
@@ -122,7 +122,7 @@ class Views:
 
     @cached_property
     def size_bound(self) -> SizeBound | None:
-        """Of every Gaussian; None where there are masks."""
+        """Bound on the scales of all Gaussians; None where there are masks."""
         if self.capture.has_alpha:
             return None
         center, near = torch.from_numpy(self.meeting_point).float(), self._sizes.near * self.working_distance
@@ -186,8 +186,8 @@ class Views:
         return self._cache[key]
 
     def reset_calibration(self, frame: int, center: np.ndarray, radius: float) -> None:
-        """Colours and poses as the capture gives them, for a subject around `center` ([3], world units). Poses are
-        learned from `frame` on where the capture's own contradict its pictures."""
+        """Resets colours and poses to those of the capture, for a subject around `center` ([3], world units). Poses are
+        learned from `frame` on if those of the capture contradict its pictures."""
         self.exposure.reset()
         if self._poses_learn is None:
             error = epipolar_error(self.capture, frame, self.train_cameras, lambda i: self.view(i, frame))
@@ -223,7 +223,7 @@ class Views:
 
 
 def shrink(target: Target, scale: float) -> Target:
-    """The same view at `scale` times its size; each pixel is the mean of those it covers, its depth that of one."""
+    """The same view at `scale` times its size; a pixel is the mean of those it covers, with the depth of one."""
     import cv2
 
     height, width = target.rgb.shape[:2]
@@ -248,15 +248,16 @@ def _target_view(target: Target, rng: np.random.Generator) -> TargetView:
 def photometric_loss(
     params: dict, target: Target, settings: TrainSettings, rng: np.random.Generator, backend: Backend
 ) -> RenderLoss:
-    """Loss of Gaussians against one target (`Backend.photometric_loss`). Behind a target with alpha the background is
-    random: with a known one, Gaussians in its colour could stand for transparency. An opaque one is to be covered."""
+    """Loss of Gaussians against one target (`Backend.photometric_loss`). Targets with alpha have a random background:
+    with a known one, Gaussians in its colour could stand for transparency. Opaque targets have a grey background, which
+    Gaussians must cover."""
     return backend.photometric_loss(params, [_target_view(target, rng)], _weights(settings))
 
 
 def start_photometric_loss(
     params: dict, targets: Sequence[Target], settings: TrainSettings, rng: np.random.Generator, backend: Backend
 ) -> PendingLoss:
-    """`photometric_loss` of Gaussians as they are now against all `targets`, summed, beside the caller
+    """`photometric_loss` of Gaussians as they are now against all `targets`, summed, in parallel to the caller
     (`Backend.start_photometric_loss`)."""
     views = [_target_view(t, rng) for t in targets]
     return backend.start_photometric_loss(params, views, _weights(settings))
@@ -269,7 +270,7 @@ def _weights(settings: TrainSettings) -> LossWeights:
 def add_harmonics_prior(
     grads: dict[str, torch.Tensor], params: dict, settings: TrainSettings, pictures: int = 1
 ) -> None:
-    """Adds to the gradients of `pictures` those of half the square of the harmonics."""
+    """Adds to the gradients of `pictures` pictures those of half the square of the harmonics."""
     shN = params["shN"]
     grads["shN"].add_(shN, alpha=pictures * settings.harmonics_lambda / len(shN))
 

@@ -42,7 +42,7 @@ def _inside(points: np.ndarray, views, settings: VisualHullSettings) -> np.ndarr
 
 
 def colors_of(points: np.ndarray, views) -> np.ndarray:
-    """Colours of points, [N, 3] in 0..1: median over the views that have them in the subject. Occlusion is ignored."""
+    """Colours of points, [N, 3] in 0..1: median over the views with the point in their mask. Occlusion is ignored."""
     colors = np.full((len(views), len(points), 3), np.nan, np.float32)
     for i, (camera, rgb, alpha) in enumerate(views):
         p, depth = project(camera, points)
@@ -62,7 +62,7 @@ def hull_points(cameras, views, count: int, settings: VisualHullSettings) -> tup
     Args:
         cameras: training cameras.
         views: (camera, rgb u8, alpha u8) of each.
-        count: of points, about.
+        count: number of points, about.
 
     Returns:
         points [P, 3], colours [P, 3] in 0..1. P may be 0 if the masks agree nowhere.

@@ -74,24 +74,24 @@ class TrainSettings:
     """Budgets and weights of one training run, and the settings of its stages.
 
     Attributes:
-        gop: most frames in a group.
+        gop: largest number of frames in a group.
         keyframe_steps: optimisation steps of a keyframe of small pictures (budget.py).
         motion_steps: steps a frame for tracking, of small pictures.
         finetune_steps: views a frame for the joint fine-tuning of a group, of small pictures.
-        gaussians_max: bound on the count of Gaussians, and so on the memory; how many there are follows from the scene.
+        gaussians_max: bound on the count of Gaussians, and so on the memory; their number follows from the scene.
         initial_points: of a keyframe, about; None: as the scene needs (budget.py).
         sh_degree: bound on the degree of spherical harmonics; a keyframe keeps them where they lower the error.
         ssim_lambda: share of D-SSIM in the image loss (3D Gaussian Splatting: 0.2).
         mask_lambda: weight of the alpha loss where the capture has masks.
         depth_lambda: weight of the depth loss where the capture has depth images.
         harmonics_lambda: weight of half the square of the harmonics, mean over the Gaussians: they cost bits.
-        turned_harmonics: harmonics turn with the nodes; otherwise they stay in the world.
-        cut_ratio: a frame whose image loss exceeds that of the frame before by this factor starts anew.
+        turned_harmonics: harmonics turn with the nodes; otherwise they stay fixed in the world.
+        cut_ratio: a frame whose image loss exceeds that of the frame before by this factor gets a new keyframe.
         rigidity: weight of the as-rigid-as-possible term.
-        rate_lambda: share by which the image loss may rise where bits fall by one share.
+        rate_lambda: relative rise of the image loss that is allowed per relative fall of the bits.
         few_views: training cameras below which views are few, and above which they are many (`of_capture`).
         quality: quantization that the rate term assumes (0 to 100).
-        seed: of every random number.
+        seed: of all random numbers.
         cache_bytes: of decoded pictures held in memory, with no effect on the result.
     """
 
@@ -141,10 +141,10 @@ class TrainSettings:
             raise UsageError(f"--gop {self.gop} is out of range, expected at least 1 frame in a group")
 
     def of_capture(self, capture) -> TrainSettings:
-        """The settings for a capture. Few views contradict little of what a frame changes for its own pictures alone:
-        the fewer there are, the dearer is a bit, and the faster learns the field, which moves all that is near
-        together. Many say themselves what harmonics are worth, and which Gaussians stand alone. Where there are no
-        masks, they are those of a room, whose field would drag what stands still along.
+        """The settings for a capture. Few views hardly contradict changes that overfit the pictures of one frame: the
+        fewer views, the higher is the price of a bit, and the faster learns the motion field, which moves neighbours
+        together. Many views need a weaker harmonics prior and less dropout. A capture without masks gets the settings
+        of a room, in which the field would drag resting Gaussians along.
         """
         views = max(1, len(capture.indices("train")))
         few, many, field = max(1.0, self.few_views / views), max(1.0, views / self.few_views), self.motion_field
@@ -181,8 +181,8 @@ class TrainSettings:
         )
 
     def of_fast_motion(self, share: float) -> TrainSettings:
-        """The settings of a group of which a search has found this share of the frames: they change their light and
-        shape as fast, and more of each is its own."""
+        """The settings of a group in which a search has found the motion of this share of the frames: their light and
+        shape change fast, too, and the frames have less in common."""
         f = self.finetune
         steps, canonical = 1 + f.fast_steps * share, 1 + f.fast_canonical * share
         finetune = replace(
@@ -201,8 +201,8 @@ PRESETS = {
     "slow": {"keyframe_steps": 3500, "finetune_steps": 750},
 }
 PRICES = {"fast": 8e-4, "medium": KeyframeSettings.price, "slow": 1e-4}  # `KeyframeSettings.price`
-LOSS = {"fast": 0.5, "medium": 0.3, "slow": 0.3}  # decibels by which very fine steps may be better, without a quality
-LOSS_OF_ROOM = 0.5  # at least so many without masks: few views of a room are fitted far better than others see it
+LOSS = {"fast": 0.5, "medium": 0.3, "slow": 0.3}  # dB that coding may cost against very fine steps, without a quality
+LOSS_OF_ROOM = 0.5  # dB, at least, without masks: training fits few views of a room far better than other views
 
 
 MOTIONS = {  # --motion
@@ -212,7 +212,7 @@ MOTIONS = {  # --motion
 
 
 def coding_loss(preset: str, capture) -> float:
-    """Decibels of the PSNR on the capture's own pictures that coding may cost where nobody names a quality."""
+    """Decibels of the PSNR on the capture's own pictures that coding may cost where no quality is given."""
     return LOSS[preset] if capture.has_alpha else max(LOSS[preset], LOSS_OF_ROOM)
 
 
@@ -220,8 +220,8 @@ def train_settings(preset: str, quality: float | None = None, *, motion: str = "
     """Settings of a preset, with changes.
 
     Args:
-        motion: what moves the nodes, "field" (a hash grid and an MLP beside their own variables) or "nodes".
-        quality: of the stream; None: it is found when the first group is coded, and training assumes the usual one.
+        motion: "field" (a hash grid and an MLP move the nodes beside their own variables) or "nodes" (these only).
+        quality: of the stream; None: it is found when the first group is coded, and training assumes the default.
 
     Raises:
         UsageError: the preset does not exist or a value is out of range.

@@ -22,14 +22,14 @@ class FinetuneSettings:
 
     frequencies: dict[str, int] = field(default_factory=temporal_frequencies)
     frequencies_frames: int = FREQUENCIES_OF  # frames that `frequencies` is for
-    fast_frequencies: float = 1.0  # times as many besides, where all frames were searched for (`Tracker.searched`)
-    fast_steps: float = 4.0  # times as many steps a frame besides, there, since more of each frame is its own
-    fast_canonical: float = 1.0  # times as fast canonical attributes besides, there
-    fast_warmup: float = 0.1  # share of the steps in which rates rise, there: at once they undo what was tracked
-    warmup: float = 0.0  # the same elsewhere: what the first steps undo, they also free
-    free_min: float = 0.5  # quantization steps: a residual from the start, so that a resting Gaussian stays free
-    dead_zone: float = 0.1  # quantization steps more than half of one, below which a coefficient is not coded
-    shrinkage: float = 2.0  # quantization steps by which a predicted group starts nearer to the Gaussians at rest
+    fast_frequencies: float = 1.0  # added frequencies, times the usual, if all frames are `Tracker.searched`
+    fast_steps: float = 4.0  # added steps a frame there, times the usual: frames have less in common
+    fast_canonical: float = 1.0  # added rates of canonical attributes there, times the usual
+    fast_warmup: float = 0.1  # share of the steps in which rates rise there: full rates would undo the tracked motion
+    warmup: float = 0.0  # the same in other groups: the first steps undo tracked motion, but also free it
+    free_min: float = 0.5  # quantization steps: a resting Gaussian with a larger initial coefficient stays free
+    dead_zone: float = 0.1  # quantization steps beyond half of one, below which a coefficient is not coded
+    shrinkage: float = 2.0  # quantization steps by which the coefficients of a predicted group start nearer to 0
     coefficient_rate: float = 0.1  # quantization steps
     log_scale_start: float = -1.0  # log of a Laplace scale, quantization steps
     log_scale_rate: float = 0.02
@@ -42,18 +42,18 @@ class FinetuneSettings:
     canonical_noise: bool = True  # uniform noise in place of quantization, on canonical attributes
     rate_decay: float = 0.05  # rates at the last step, times those at the first
     topology_at: float = 0.3  # share of the steps at which Gaussians are removed and added
-    topology_views: int = 4  # times every camera must have been drawn before
-    short_life: float = 0.2  # share of the frames; a Gaussian that lives shorter takes steps smaller in proportion
-    views: int = 2  # of a frame, in one step: what a step costs besides is shared
-    frames_min: float = 20.0  # a shorter group behind a keyframe has the steps of so many
-    growth: float = 0.1  # share of the Gaussians that may be added then
-    residual_share: float = 0.115  # residual bits of a frame over canonical ones: where more are, a bit is no cheaper
-    rate_every: int = 8  # steps: the rate term has every coefficient, an image few; its weight grows by as much
+    topology_views: int = 4  # times that each camera must have been drawn before
+    short_life: float = 0.2  # share of the frames; a Gaussian that lives shorter takes proportionally smaller steps
+    views: int = 2  # of one frame, in one step: they share the other costs of a step
+    frames_min: float = 20.0  # a shorter group after a keyframe has the steps of this many frames
+    growth: float = 0.1  # share of the Gaussians that may be added at `topology_at`
+    residual_share: float = 0.115  # residual bits of a frame over canonical bits: more of them make no bit cheaper
+    rate_every: int = 8  # steps from one rate term to the next: it needs all coefficients; its weight grows by as much
     canonical_rate_every: int = 24  # steps for which the gradient of the canonical bits, and their noise, are held
     loss_smoothing: float = 0.05  # share of one step in the running mean of the loss
 
     def with_frequencies(self, times: float) -> FinetuneSettings:
-        """The same with so many times the frequencies."""
+        """The same settings with `times` as many frequencies."""
         return replace(self, frequencies={n: round(times * count) for n, count in self.frequencies.items()})
 
 
@@ -67,13 +67,15 @@ class EntropyModelSettings:
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """Refinement of the integers of a coded group by the pictures of the capture (`refinement.py`).
+    """Refinement of the integers of a coded group against the pictures of the capture (`refinement.py`).
 
     Attributes:
-        passes: times that each training picture of a frame is used; frame_pictures: pictures of a frame at most.
-        reach: quantization steps that the first picture moves a value, times the root of the pictures, for one pixel
-            per Gaussian; it grows with the root of the pixels per Gaussian, since few pixels are soon overfitted.
-        reach_max: bound on it.
+        passes: times that each training picture of a frame is used.
+        frame_pictures: pictures of a frame at most.
+        reach: quantization steps by which the first picture moves a value, times the root of the number of pictures,
+            for one pixel per Gaussian; grows with the root of the pixels per Gaussian, since few pixels are soon
+            overfitted.
+        reach_max: bound on the grown `reach`.
         cache_bytes: of pictures held in memory.
     """
 

@@ -21,7 +21,7 @@ class LearningRates:
         return self.by_attribute[attribute]
 
     def but(self, **rates: float) -> LearningRates:
-        """The same with other rates of some attributes."""
+        """The same rates, but for those of some attributes."""
         return LearningRates(self.by_attribute | rates)
 
     def scaled(self, radius: float, factor: float = 1.0) -> dict[str, float]:
@@ -30,5 +30,5 @@ class LearningRates:
 
 
 def keyframe_rates() -> LearningRates:
-    """Those of the attribute table, at the first step of a keyframe."""
+    """Rates of the attribute table, for the first step of a keyframe."""
     return LearningRates({a.name: a.learning_rate for a in ATTRIBUTES})

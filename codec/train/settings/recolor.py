@@ -1,4 +1,4 @@
-"""Settings of colours that are fitted anew over the geometry of a stream."""
+"""Settings of recolouring: colours fitted to pictures over the geometry of a stream."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ class RecolorSettings:
     """Fit of colours (`train/recolor.py`).
 
     Attributes:
-        passes: times that each training picture of a frame is used; frame_pictures: pictures of a frame at most;
-            steps_least: of a group, however short it is.
-        map_pictures: from which the affine map of all colours is found. opaque: alpha above which a pixel counts for
-            it; pixels_least: fewer leave the colours as they are. prior: share of a pixel that speaks for no change.
-        rates: learning rates of the harmonics at the first step; over_time: of coefficients, times those.
-        frequencies: temporal ones of sh0 in a group, with the constant, if the stream has no more.
+        passes: times that each training picture of a frame is used.
+        frame_pictures: pictures of a frame at most.
+        steps_least: steps of a group at least, however short it is.
+        map_pictures: number of pictures for the affine map of all colours.
+        opaque: alpha above which a pixel counts for the map.
+        pixels_least: with fewer pixels the map is left out.
+        prior: weight of the identity map, per pixel.
+        rates: learning rates of the harmonics at the first step.
+        over_time: learning rates of coefficients, times `rates`.
+        frequencies: temporal frequencies of sh0 in a group, with the constant, if the stream has no more.
     """
 
     passes: int = 4
