@@ -1,4 +1,4 @@
-"""What a view of a tenth of a million Gaussians fetches and decodes in the page, in headless Chromium.
+"""Bytes fetched and decoding time in headless Chromium for a view of a tenth of a million Gaussians.
 
 usage: GSCODEC_DATA=... python -m bench.player_tiles FOLDER        writes bench/results/player_tiles.json
 

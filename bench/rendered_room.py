@@ -1,4 +1,4 @@
-"""A room to choose parameters on, which is not reported: path-traced with Blender's Python package.
+"""A room for choosing parameters, not for reported results: path-traced with Blender's Python package.
 
 Two heads of an ape turn, a ring rolls, floor and globe are glossy. 14 cameras for training stand in two arcs of 110
 degrees, 4 val cameras between them. `python -m bench.rendered_room FOLDER FRAMES` takes about 100 seconds a frame on

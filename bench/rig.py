@@ -1,4 +1,4 @@
-"""What a rig saves: the walking figure of bench/articulated.py without and with its rig, and posed anew.
+"""Bytes saved by a rig: the walking figure of bench/articulated.py without and with its rig, and posed anew.
 
 usage: python -m bench.rig [--cases splats,training,posed] [--out FILE]
 

@@ -1,5 +1,6 @@
-"""Where each figure of README.md and docs/ comes from: its file in bench/results, the command that makes it, the commit
-at which it was measured, without uncommitted changes, and the number of cores that other work kept busy meanwhile.
+"""Source of each figure of README.md and docs/: its file in bench/results, command, commit, and load by other work.
+
+Figures are measured at the commit, without uncommitted changes. Load: the number of cores that other work kept busy.
 
 usage: python -m bench.sources        writes the table into docs/figures.md; a test compares both
 """

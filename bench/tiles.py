@@ -1,4 +1,4 @@
-"""What tiles cost and buy: bytes by their side, decoding on one core and on all, views of a tenth of a million, damage.
+"""Cost and gain of tiles: bytes by tile side, decoding on one core and all, views of a tenth of the Gaussians, damage.
 
 usage: GSCODEC_DATA=... python -m bench.tiles [PAYLOAD]        writes bench/results/tiles.json
 

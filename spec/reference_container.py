@@ -124,7 +124,7 @@ def find_box(data, box, path):
 
 
 def find_leniently(data, box, path):
-    """As `find_box`; None also where a box on the way is malformed: that of a track which readers ignore."""
+    """`find_box`, but None also if a box on the path is malformed: readers ignore that track."""
     try:
         return find_box(data, box, path)
     except BitstreamError:
@@ -153,7 +153,7 @@ class Config:
     cameras: list
     timescale: int = 0
     track_id: int = 0
-    defaults: dict = field(default_factory=dict)  # of trex: duration, size, flags
+    defaults: dict = field(default_factory=dict)  # in trex: duration, size, flags
     audio: "Audio | None" = None
     placement: "Placement" = field(default_factory=lambda: Placement())
     tracks: int = 1  # gsv tracks of the file
@@ -416,7 +416,7 @@ def read_moof(data, moof, config):
 
 
 def read_sound(data, moof, audio, group):
-    """Clause 2.7: (media time, [(size, duration)]) of the samples in front of a group, None if there are none."""
+    """Clause 2.7: (media time, [(size, duration)]) of the audio samples in front of a group, None without samples."""
     for base, defaults, time, trun in read_trafs(data, moof, audio.track_id, audio.defaults):
         start, samples = read_run(trun, base, defaults)
         end = start + sum(size for size, _ in samples)
@@ -428,7 +428,7 @@ def read_sound(data, moof, audio, group):
 
 
 def read_run(trun, base, defaults):
-    """Clause 2.7: offset of the first sample of a trun of sound, and [(size, duration)]."""
+    """Clause 2.7: offset of the first sample in an audio trun, and [(size, duration)]."""
     flags, count = trun.u32() & 0xFFFFFF, trun.u32()
     if count > 65536:
         raise LimitError(f"traf of the audio track: {count} samples, at most 65536 are allowed")

@@ -66,8 +66,8 @@ def sh_basis(d):
 
 
 def turned_harmonics(shN, q):
-    """Clause 13.4: coefficients [N, K, 3] of the functions that unit quaternions [N, 4] have turned, by their values in
-    many directions."""
+    """Clause 13.4: spherical harmonics [N, K, 3] rotated by unit quaternions [N, 4]: coefficients fitted to the values
+    of the rotated functions in 100 directions."""
     directions = np.random.default_rng(0).standard_normal((100, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     count = shN.shape[1]
@@ -84,7 +84,7 @@ def rotation(r):
 
 
 def average(q, weights, first):
-    """Clause 13.3: quaternions [N, n, 4] blended by [N, n]; the signs are those nearer to q[first]."""
+    """Clause 13.3: quaternions [N, n, 4] blended by weights [N, n]; each takes the sign that is nearer to q[first]."""
     before = np.take_along_axis(q, first[:, None, None], 1)
     sign = np.where((q * before).sum(-1) < 0, -1, 1)
     total = ((weights * sign)[..., None] * q).sum(1)
@@ -106,14 +106,14 @@ def joint_motions(places, parents, poses):
 
 
 def predict_nodes(group, n, t):
-    """Clause 13.3: nodes at n [M, 3] -> y [M, 3], p [M, 4]."""
+    """Clause 13.3: node positions n [M, 3] -> positions y [M, 3] and rotations p [M, 4] predicted by the joints."""
     h, rig = group.header, group.rig
     steps = np.repeat([h.joint_rotation_step, h.joint_translation_step], 3)
     places = np.array(h.origin) + h.grid_step * rig.joints
     poses = steps * np.einsum("kcj,k->jc", rig.poses.astype(float), basis(h.frames, h.frames, t))
     now = joint_motions(places, rig.parents, poses)
     before = joint_motions(places, rig.parents, steps * rig.bind)
-    y, turned = [], []  # by each joint alone
+    y, turned = [], []  # predicted by each joint alone
     for (q, s), (q0, s0) in zip(now, before, strict=True):
         back = q0 * [1, -1, -1, -1]
         turned.append(quaternion_product(q, back))
@@ -163,7 +163,7 @@ def canonical(header, attribute, integers):
 
 
 def rotations(header, channels, near):
-    """Clause 13.1: quats0 [N, 4] of the births of a layer; `near`: the neighbours of each."""
+    """Clause 13.1: quats0 [N, 4] of the births of a tile; `near`: the neighbours of each Gaussian."""
     steps, offsets = (np.array(v) for v in header.channels[QUATS])
     octaves = -canonical(header, LOG_SCALES, channels[LOG_SCALES]) @ np.array(header.scale_exponents).T
     own_steps = np.minimum(1, steps * 2.0 ** np.clip(octaves, -64, 64))

@@ -66,7 +66,7 @@ class Rig:
 
 @dataclass
 class Group:
-    """A decoded group: the header and all of its integers, i32, of all layers and with survivors."""
+    """A decoded group: the header and the integers (i32) of all layers, survivors included."""
 
     header: Header
     counts: list  # Gaussians of each decoded layer
@@ -95,8 +95,8 @@ def settled(model):
 def decode_tile(payload, tile, k, header, reference, models, spend):
     """Clauses 3.3, 8 to 10 and 12: one tile -> positions [n, 3], channels, quats0, lifetimes or None, trajectories.
 
-    `reference`: its Group and the (first, count) of the tile there, of a tile of survivors. `models`: (kind, attribute)
-    -> model, those that are missing are made and left as they are at the end of the stream.
+    `reference`: for a tile of survivors, the reference Group and (first, count) of the tile in it. `models`: (kind,
+    attribute) -> model; missing models are added, and each keeps its state at the end of its stream.
     """
     shifts, streams = header.shifts[k], split_tile(payload, tile, header)
 
@@ -139,7 +139,7 @@ def decode_tile(payload, tile, k, header, reference, models, spend):
 
 
 def decode_layer(found, k, header, reference, spend):
-    """Clause 7.4: the tiles of a layer, those that start others first -> {index: what decode_tile gives}."""
+    """Clause 7.4: the tiles of a layer, leading tiles first -> {index: result of decode_tile}."""
     layer, seeds, decoded = header.layers[k], {}, {}
     leading = layer.leading()
     for t in sorted(range(len(layer.tiles)), key=lambda t: (t not in leading, t)):
@@ -156,7 +156,7 @@ def decode_layer(found, k, header, reference, spend):
 
 
 def empty_tile(header):
-    """What decode_tile gives for no Gaussians."""
+    """Result of decode_tile for 0 Gaussians."""
     channels = {a: np.zeros((len(steps), 0), np.int32) for a, (steps, _) in header.channels.items()}
     trajectories = {
         a: np.zeros((K, channel_count(a, header.sh_degree), 0), np.int32) for a, (K, _) in header.trajectories.items()
@@ -168,8 +168,9 @@ def empty_tile(header):
 def decode_group(payload, level, frames=None, reference=None, layers=256, tiles=None):
     """Clauses 3 to 12: a sample -> Group.
 
-    `frames`: its duration in the container, if it comes out of one. `reference`: the Group to which a predicted one
-    refers. `layers`: how many are decoded. `tiles`: (layer, index) -> whether the tile is; leading ones always are.
+    `frames`: duration of the sample in the container, None without a container. `reference`: the Group to which a
+    predicted one refers. `layers`: number of decoded layers. `tiles`: (layer, index) -> whether the tile is decoded;
+    leading tiles always are.
     """
     limit(len(payload), LEVELS[level][4], "bytes", level)
     header = read_group_header(read_header_bytes(payload)[0], reference and reference.header)

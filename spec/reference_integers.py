@@ -194,7 +194,7 @@ def decode_lifetimes(payload, frames, near, what, model):
 
 
 def decode_deaths(payload, near, survivors, what):
-    """Clause 10.1: -> list of the indices that survive."""
+    """Clause 10.1: -> list of the indices of survivors."""
     model = Model(RangeDecoder(payload, what))
     dead = []
     for neighbors in near:
@@ -252,7 +252,7 @@ def decode_rig(payload, joints, near, what):
 
 
 def ancestors(parents):
-    """Clause 11.2: for each joint its parent, the parent of that, and so on."""
+    """Clause 11.2: for each joint up to four ancestors, the parent first."""
     near = []
     for j, parent in enumerate(parents):
         near.append([parent, *near[parent]][:4] if parent < j else [])
@@ -268,7 +268,7 @@ def class_trajectories(k, c):
 
 def decode_trajectories(payload, coefficients, channels, near, class_of, spend, what, models=None):
     """Clauses 11 and 12: -> for each i the list of its coefficients, [C] values each; calls spend(C) before each.
-    `models`: of the lengths, of the values."""
+    `models`: (model of the lengths, model of the values)."""
     decoder = RangeDecoder(payload, what)
     lengths, values = models or (Model(), ValueModel())
     lengths.decoder = values.decoder = decoder

@@ -1,7 +1,7 @@
 """Clause 2.8 of gsv.md for the reference decoder: a file with tracks -> the Gaussians that a frame of the scene shows.
 
-In float64. Spherical harmonics are rotated by what defines it: the coefficients of f(R^-1 d), found from the values of
-f at many directions.
+In float64. Spherical harmonics are rotated by definition: their coefficients are fitted to the values of f(R^-1 d) in
+many directions.
 """
 
 from fractions import Fraction
@@ -53,7 +53,7 @@ def shown_frame(config, frames, u):
 
 
 def scene_frame(data, index):
-    """Frame `index` of the scene: the attributes of all Gaussians that are shown, track behind track."""
+    """Frame `index` of the scene: the attributes of all Gaussians that are shown, track after track."""
     first, _ = decode(data)
     parts = []
     for k in range(first.tracks):

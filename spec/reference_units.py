@@ -54,8 +54,8 @@ def read_header_bytes(payload):
 
 
 def read_units(payload, layers=256, tiles=None):
-    """Clause 3: the units of the first layers of a group behind the header, with all rules that do not need its other
-    fields. `tiles`: (layer, index) -> whether a tile is wanted; the bytes of others are not looked at."""
+    """Clause 3: the units behind the header, of the first `layers` layers, checked by all rules that need only the
+    directory. `tiles`: (layer, index) -> whether a tile is wanted; the bytes of other tiles are not checked."""
     header, start = read_header_bytes(payload)
     units, directory = [], read_opening(Reader(header, 0, len(header), "group_header"))[3]
     reader = Reader(payload, start, len(payload), "unit 1")

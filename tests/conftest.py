@@ -1,4 +1,4 @@
-"""Fixtures of more than one file: a stream, its server, a browser."""
+"""Fixtures shared by test files: a stream, its server, a browser."""
 
 import http.server
 import os
@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch, before it is imported: as the commands limit it
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported; the commands set the same limit
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_sessionfinish(session):
-    """Where CI is set, everything is there that a test needs: one that is skipped has failed."""
+    """Fails the session in CI (variable CI) if a test is skipped: CI has everything that the tests need."""
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")
     skipped = reporter.stats.get("skipped", []) if reporter else []
     if os.environ.get("CI") and skipped and session.exitstatus == pytest.ExitCode.OK:
@@ -22,7 +22,7 @@ def pytest_sessionfinish(session):
 
 @pytest.fixture(scope="session")
 def gsv(tmp_path_factory) -> Path:
-    """A stream of 5 groups of 6 frames, whose harmonics turn."""
+    """A stream of 5 groups of 6 frames; its harmonics turn with the nodes."""
     from playing import FPS, LENGTH, cameras, sequence
     from synthetic import encode_sequence
 
@@ -62,13 +62,13 @@ def browsers():
 
 @pytest.fixture(scope="module")
 def browser(browsers):
-    """Without WebGL."""
+    """A browser without WebGL."""
     return browsers.start("--disable-gpu", "--disable-3d-apis")
 
 
 @pytest.fixture(scope="module")
 def gl_browser(browsers):
-    """With WebGL2 in software, as Chromium has it where there is no GPU and it is told to."""
+    """A browser with WebGL2 in software, as Chromium offers it by a flag on machines without a GPU."""
     from bench.browser import SOFTWARE_GL
 
     return browsers.start(*SOFTWARE_GL)
@@ -76,7 +76,7 @@ def gl_browser(browsers):
 
 @pytest.fixture
 def other(gsv):
-    """Starts servers of another origin: other(data, **what goes wrong) -> URL, handler."""
+    """Starts servers of another origin: other(data, **faults) -> URL, handler."""
     from playing import Trouble, serving
 
     started = []

@@ -1,4 +1,4 @@
-"""A capture of a textured wall, drawn by homographies: features match, and everything about it is known."""
+"""A capture of a textured wall, drawn by homographies: features match, and the ground truth is known."""
 
 import json
 
@@ -22,14 +22,14 @@ def texture(side=600):
 def wall_picture(view, gain=1.0):
     """[H, W, 3] u8, the wall from the pose `view`."""
     K = np.array([[FOCAL, 0, W / 2 - 0.5], [0, FOCAL, H / 2 - 0.5], [0, 0, 1]])
-    plane = np.stack([view[:3, 0], view[:3, 2], view[:3, 3]], 1)  # of x and z
+    plane = np.stack([view[:3, 0], view[:3, 2], view[:3, 3]], 1)  # axes x and z, and the origin
     to_plane = np.array([[3 / 600, 0, -1.5 + 1.5 / 600], [0, 3 / 600, -1.5 + 1.5 / 600], [0, 0, 1]])
     picture = cv2.warpPerspective(texture(), K @ plane @ to_plane, (W, H), flags=cv2.INTER_LINEAR)
     return np.clip(gain * picture, 0, 255).astype(np.uint8)
 
 
 def write_wall(root, gains=(1, 1, 1, 1), tilts=(0, 0, 0, 0), test=(), masks=False):
-    """Writes the capture as transforms.json; `tilts`: radians by which the poses in the file are wrong."""
+    """Writes the capture as transforms.json; `tilts`: errors of the poses in the file, radians about x."""
     data = {"w": W, "h": H, "fl_x": FOCAL, "frames": []}
     for k, (gain, tilt) in enumerate(zip(gains, tilts, strict=True)):
         view = look_at((0.5 * k - 0.75, -2.5, 0.2 * (-1) ** k), (0, 0, 0), (0, 0, 1))

@@ -1,7 +1,7 @@
 """`gscodec` in a process that stops itself at a named moment, and a capture for it to work on.
 
-Moments are (where, n): the n-th step of a stage of training ("keyframe", "track", "fine-tune"), or half-way through
-the n-th write of a file ("state", "checkpoint", "fragment", "index", "sequence").
+A moment is (where, n): the n-th step of a stage of training ("keyframe", "track", "fine-tune"), or the middle of the
+n-th write of a file ("state", "checkpoint", "fragment", "index", "sequence").
 """
 
 import os
@@ -11,7 +11,7 @@ from multiprocessing import get_context
 
 import cv2  # noqa: F401
 import scipy.spatial  # noqa: F401
-import torch._dynamo  # noqa: F401  (what an optimizer imports; here it is imported once, not in every process)
+import torch._dynamo  # noqa: F401  (optimizers import it; here it is imported once, not in every process)
 from training import AS_SET
 
 from bench.procedural import Scene, write_transforms
@@ -53,7 +53,7 @@ def gscodec(*args, at=None, by=signal.SIGKILL) -> int:
 
 
 def _run(args: list[str], at: tuple[str, int] | None, by: int) -> None:
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background jobs ignore
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell ignore SIGINT
     settings.PRESETS["fast"], sensitivity.SIZE = TINY, 128
     if at:
         _arm(*at, lambda: os.kill(os.getpid(), by))
@@ -74,7 +74,7 @@ def _arm(where: str, n: int, stop) -> None:
                 stop()
 
     def half(name, write):
-        """`write(path, data)`, which stops half-way when it comes."""
+        """`write(path, data)` that stops half-way at the moment."""
 
         def written(path, *data):
             if arrived(name):

@@ -1,7 +1,8 @@
-"""Makes tests/data: two small trained groups, and the figures that test_regression.py holds the code to.
+"""Makes tests/data: two small trained groups, and the recorded figures for test_regression.py.
 
-usage: python tests/make_trained.py [groups] [codec] [capture]   (after a change that is meant to change them; look at
-                                                                  the diff; all three by default, capture takes minutes)
+usage: python tests/make_trained.py [groups] [codec] [capture]   (all three by default; capture takes minutes)
+
+Run it after a change that is meant to change the figures, and check the diff.
 """
 
 import json
@@ -29,7 +30,7 @@ main()
 
 
 def groups() -> None:
-    """Trains the groups; harmonics of degree 1 stay, although these few Gaussians gain nothing by them."""
+    """Trains the groups; harmonics of degree 1 are kept, although these few Gaussians gain nothing by them."""
     settings = train_settings("fast", gop=GOP, gaussians_max=1200, initial_points=900, sh_degree=1)
     settings = replace(settings, keyframe=replace(settings.keyframe, harmonics_gain_min=-1.0))
     save_groups(list(train_groups(capture(), settings, random_access=FRAMES)))
@@ -37,13 +38,13 @@ def groups() -> None:
 
 
 def codec() -> dict:
-    """Figures of the cases, which code the trained groups."""
+    """Figures of the cases: the trained groups, coded in several ways."""
     with tempfile.TemporaryDirectory() as folder:
         return {name: measure(case, Path(folder) / "a.gsv") for name, case in CASES.items()}
 
 
 def encoded(seed: int, folder: Path) -> dict:
-    """Figures of the bundled capture, encoded as users do, but for the random numbers."""
+    """Figures of the bundled capture, encoded as users do, but with the random seed `seed`."""
     stream, command = folder / "b.gsv", [sys.executable, "-c", WITH_SEED, str(seed)]
     subprocess.run([*command, "encode", EXAMPLE, stream, "--preset", "fast", "--frames", "0:8"], check=True)
     done = subprocess.run([*command, "eval", stream, EXAMPLE, "--json"], check=True, capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""What the tests of the player share: a stream, servers with faults, and what is asked of a page."""
+"""Shared by the tests of the player: a stream, servers with faults, and queries to a page."""
 
 import base64
 import http.client
@@ -20,7 +20,7 @@ FPS, GROUPS, LENGTH = 30, 5, 6
 
 
 def sequence(n=400, sh_count=0) -> GaussianSequence:
-    """A blob that turns, in groups; every second group has lifetimes."""
+    """A turning blob in groups; every second group has lifetimes."""
     still, groups = blob(n, sh_count=sh_count), []
     for k in range(GROUPS):
         frames = [moved(still, [0, 0.05 * t, 0], [0.01 * t, 0, 0]) for t in range(k * LENGTH, (k + 1) * LENGTH)]
@@ -56,7 +56,7 @@ def ask(server, path="/stream.gsv", method="GET", **headers):
 
 
 class Trouble(http.server.BaseHTTPRequestHandler):
-    """A plain server with Range and CORS, and what may go wrong with one."""
+    """A plain server with Range and CORS; its attributes set faults."""
 
     protocol_version = "HTTP/1.1"
     data = b""
@@ -98,7 +98,7 @@ class Trouble(http.server.BaseHTTPRequestHandler):
         if self.drop_after is not None and end - start > self.drop_after:
             self.wfile.write(self.data[start : start + self.drop_after])
             self.wfile.flush()
-            time.sleep(0.2)  # what was sent arrives before the news that it is all
+            time.sleep(0.2)  # the sent bytes arrive before the end of the connection
             self.connection.shutdown(socket.SHUT_RDWR)
             self.close_connection = True
             return
@@ -117,7 +117,7 @@ class Trouble(http.server.BaseHTTPRequestHandler):
 
 
 class Static(http.server.SimpleHTTPRequestHandler):
-    """What a static host with CORS does; it ignores ranges."""
+    """A static host with CORS that ignores ranges."""
 
     def end_headers(self):
         self.send_header("Access-Control-Allow-Origin", "*")
@@ -142,9 +142,9 @@ def load(browser, url, **options) -> None:
 
 
 def pixels(browser, canvas: str) -> np.ndarray:
-    """[H, W, 3] u8: what is on the canvas that a JavaScript expression or its promise gives.
+    """[H, W, 3] u8: pixels of the canvas that a JavaScript expression or its promise returns.
 
-    Read in the task that has drawn it, since a WebGL canvas may be empty afterwards.
+    The canvas is read in the task that draws it, since a WebGL canvas may be empty afterwards.
     """
     script = f"""Promise.resolve({canvas}).then((from) => {{
         const copy = Object.assign(document.createElement("canvas"), {{ width: from.width, height: from.height }});
@@ -159,12 +159,12 @@ def pixels(browser, canvas: str) -> np.ndarray:
 
 
 def canvas(browser) -> np.ndarray:
-    """[H, W, 3] u8: what the CPU has drawn."""
+    """[H, W, 3] u8: the picture drawn by the CPU."""
     return pixels(browser, part("canvas"))
 
 
 def screenshot(browser, element: str) -> np.ndarray:
-    """[H, W, 3] u8: what the screen shows where an element is."""
+    """[H, W, 3] u8: the screen at the place of an element."""
     box = browser.eval(
         f"(({{ x, y, width, height }}) => ({{ x, y, width, height }}))({element}.getBoundingClientRect())"
     )
@@ -179,7 +179,7 @@ def camera_of(view: list[float]) -> Camera:
 
 
 def show(browser, t: int) -> Camera:
-    """Stops at frame `t`; the camera it is seen with."""
+    """Stops at frame `t`; returns the camera of the view."""
     return camera_of(browser.eval(f"{PLAYER}.show({t}).then((d) => Array.from(d.view))"))
 
 

@@ -10,7 +10,7 @@ from gscodec.model.attributes import ATTRIBUTES
 
 
 def surface_group(n=4000, frames=1, sh_coefficients=0, seed=0):
-    """A group like a scan: points on a bumpy sphere, attributes that vary over it and noise."""
+    """A group like a scan: points on a bumpy sphere, attributes that vary over it, and noise."""
     rng = np.random.default_rng(seed)
     v = rng.normal(size=(n, 3))
     v /= np.linalg.norm(v, axis=1, keepdims=True)
@@ -76,8 +76,8 @@ COMPANDING = {
 
 
 def layered_group(n=300):
-    """`moving_group` with everything else that an independent group may have: layers, shifts, corrections, companding,
-    scale exponents."""
+    """`moving_group` with all other tools of an independent group: layers, shifts, corrections, companding, scale
+    exponents."""
     group = moving_group(n)
     first = np.arange(n) % 3 == 0
     group = take(group, np.concatenate([np.flatnonzero(first), np.flatnonzero(~first)]))
@@ -99,7 +99,8 @@ def layered_group(n=300):
 
 
 def predicted_group(reference):
-    """A group predicted from `reference`, which has layers: in each layer every fifth Gaussian dies, a few are born."""
+    """A group predicted from `reference`, a group with layers: in each layer every fifth Gaussian dies, a few are
+    born."""
     ends = np.cumsum(reference.layers)
     index, parents, layers = [], [], []
     for first, last in zip(ends - reference.layers, ends, strict=True):
@@ -113,12 +114,12 @@ def predicted_group(reference):
 
 
 def with_channels(group, name, **change):
-    """The group with other fields of the channels of one attribute."""
+    """The group with changed fields (`change`) in the channels of one attribute."""
     return replace(group, channels={**group.channels, name: replace(group.channels[name], **change)})
 
 
 def assert_same(a, b, path="group"):
-    """Compares two groups field by field. `a` may leave out layers and corrections where there is one layer."""
+    """Compares two groups field by field. `a` may leave out layers and corrections if there is one layer."""
     if isinstance(a, QuantizedGroup):
         a = replace(a, layers=a.layers or (len(a),))
         a = replace(a, corrections=np.zeros((len(a.layers), 2)) if a.corrections is None else a.corrections)

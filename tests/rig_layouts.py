@@ -1,4 +1,4 @@
-"""One rig, written in each layout that has a reader; and the same one, moving."""
+"""One rig, static or moving, written in each layout that has a reader."""
 
 import json
 import struct
@@ -21,7 +21,7 @@ SHADES = np.array([(255, 0, 0), (10, 20, 30), (0, 0, 255)], np.uint8)
 
 
 def dots(camera, frame, channels=4):
-    """A picture with a blob in each channel, where the rig has one of DOTS."""
+    """A picture with a blob in each channel, at the projection of one of DOTS."""
     x = DOTS @ VIEWS[camera][:3, :3].T + VIEWS[camera][:3, 3]
     p = FOCAL * x[:, :2] / x[:, 2:] + [W / 2, H / 2]
     y, x = np.mgrid[:H, :W] + 0.5
@@ -90,7 +90,7 @@ def one_model(root):
 
 
 def transforms(root):
-    """Each entry with intrinsics of its own."""
+    """transforms.json; each entry has intrinsics of its own."""
     write_images(lambda name, t: root / f"images/{name}/{t}.png")
     data = {"ply_file_path": "sparse_pc.ply", "fps": 30, "frames": []}
     for name, view in zip(NAMES, VIEWS, strict=True):
@@ -119,7 +119,7 @@ def dynamic3dgs(root):
 def zju_mocap(root):
     write_images(lambda name, t: root / f"{name}/{t:06}.png", channels=3)
     for k, name in enumerate(NAMES):
-        for t in range(FRAMES):  # labels: not 0 is the subject
+        for t in range(FRAMES):  # labels: values other than 0 are the subject
             write_image(root / f"mask_cihp/{name}/{t:06}.png", (pixels(k, t)[..., 3:] > 40).astype(np.uint8) * 5)
     K = np.array([[FOCAL, 0, W / 2 - 0.5], [0, FOCAL, H / 2 - 0.5], [0, 0, 1]])
     cams = {"K": [K] * 3, "D": [np.zeros((5, 1))] * 3, "R": [v[:3, :3] for v in VIEWS]}
@@ -186,7 +186,7 @@ def yaml_pair(folder, views):
 
 
 def write_videos(path):
-    """A video of twice the size for each camera, at `path(name)`."""
+    """A video for each camera, at twice the size, at `path(name)`."""
     for k, name in enumerate(NAMES):
         path(name).parent.mkdir(exist_ok=True)
         video = cv2.VideoWriter(str(path(name)), cv2.VideoWriter_fourcc(*"mp4v"), 30, (2 * W, 2 * H))
@@ -207,7 +207,7 @@ def n3dv(root):
 
 
 def qualisys(root):
-    """Videos at twice the calibrated size, which cameras of 1/64 pixel and of mm are for."""
+    """Videos at twice the calibrated size, and a calibration in mm and 1/64 pixel."""
     write_videos(lambda name: root / f"videos/{name}.mp4")
     numbers = lambda keys, values: " ".join(f'{k}="{v}"' for k, v in zip(keys, values, strict=True))  # noqa: E731
     elements = []

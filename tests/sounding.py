@@ -1,4 +1,4 @@
-"""What the tests of sound share: a tone whose frequency tells the time, and a stream that has it."""
+"""Shared by the tests of sound: a tone whose frequency tells the time, and a stream with this tone."""
 
 import wave
 
@@ -31,7 +31,7 @@ def read_tone(path) -> tuple[np.ndarray, int]:
 
 
 def told_time(samples: np.ndarray, rate: int) -> float:
-    """Second of the tone in the middle of a piece of it, by its frequency."""
+    """Time (s) in the tone at the middle of `samples`, from their frequency."""
     up = np.flatnonzero((samples[:-1] < 0) & (samples[1:] >= 0))
     crossings = up + samples[up] / (samples[up] - samples[up + 1])
     middle = (crossings[0] + crossings[-1]) / 2
@@ -40,7 +40,7 @@ def told_time(samples: np.ndarray, rate: int) -> float:
 
 
 def tone_stream(path, audio, *, groups=4, length=15, fps=FPS, **settings) -> None:
-    """A stream of a small blob with the sound of a file, None: without."""
+    """Writes a stream of a small blob with the sound of a file; None: without sound."""
     still = blob(60)
     frames = [moved(still, [0, 0.05 * t, 0], [0.01 * t, 0, 0]) for t in range(groups * length)]
     sequence = GaussianSequence(fps, [DenseGroup(frames[k * length : (k + 1) * length]) for k in range(groups)])

@@ -17,7 +17,7 @@ def encode(ply: Path, out: Path) -> None:
     head, data = ply.read_bytes().split(b"end_header\n", 1)
     lines = [line.split() for line in head.decode().split("\n") if line.startswith("property")]
     cloud = np.frombuffer(data, [(name, KINDS[kind]) for _, kind, name in lines])
-    cloud = cloud[np.lexsort([cloud[n] for n in "xyz"])]  # an order of its own
+    cloud = cloud[np.lexsort([cloud[n] for n in "xyz"])]  # not the order of the input
     assert len(np.unique(cloud[list("xyz")])) == len(cloud), "two points in one place"
     places = np.stack([cloud[n] for n in "xyz"], 1).astype("<f8")
     names = [n for n in cloud.dtype.names if n not in "xyz"]

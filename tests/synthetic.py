@@ -16,7 +16,7 @@ from gscodec.model.rotations import quat_multiply, quat_to_matrix, rotvec_to_qua
 
 
 def blob(n: int, seed: int = 0, sh_count: int = 0) -> Gaussians:
-    """N Gaussians on a unit sphere, with scales, turns and colours that vary smoothly and a little at random."""
+    """N Gaussians on a unit sphere; scales, rotations and colours vary smoothly and a little at random."""
     r = np.random.default_rng(seed)
     x = r.standard_normal((n, 3))
     x /= np.linalg.norm(x, axis=1, keepdims=True)
@@ -32,7 +32,7 @@ def blob(n: int, seed: int = 0, sh_count: int = 0) -> Gaussians:
 
 
 def moved(g: Gaussians, rotvec: np.ndarray, shift: np.ndarray) -> Gaussians:
-    """`g` turned about the origin and shifted."""
+    """`g` rotated about the origin and shifted."""
     R = quat_to_matrix(rotvec_to_quat(np.asarray(rotvec, float)))
     q = quat_multiply(np.broadcast_to(rotvec_to_quat(np.asarray(rotvec, float)), g.quats.shape), g.quats.astype(float))
     return Gaussians(
@@ -46,7 +46,7 @@ def moved(g: Gaussians, rotvec: np.ndarray, shift: np.ndarray) -> Gaussians:
 
 
 def turning(n: int = 300, frames: int = 6, sh_count: int = 0, lifetimes: bool = False) -> GaussianSequence:
-    """One group in which a blob turns 0.1 rad a frame and drifts."""
+    """One group: a blob turns 0.1 rad a frame and drifts."""
     g = blob(n, sh_count=sh_count)
     group = [moved(g, np.array([0, 0.1 * t, 0.02 * t]), np.array([0.03 * t, 0, 0])) for t in range(frames)]
     life = None
@@ -58,7 +58,7 @@ def turning(n: int = 300, frames: int = 6, sh_count: int = 0, lifetimes: bool = 
 
 
 def covariances(g: Gaussians) -> np.ndarray:
-    """[N, 3, 3], what a Gaussian's (quat, scale) means, whatever its form."""
+    """Covariance matrices [N, 3, 3], the same for all (quat, scale) of the same Gaussian."""
     w, x, y, z = g.quats.astype(np.float64).T
     R = np.stack(
         [
@@ -73,7 +73,7 @@ def covariances(g: Gaussians) -> np.ndarray:
 
 
 def gaussians(n, k=0, seed=0):
-    """`n` Gaussians without any order, with `k` harmonics."""
+    """`n` Gaussians in random order, with `k` harmonics."""
     rng = np.random.default_rng(seed)
 
     def normal(*shape):
@@ -85,7 +85,7 @@ def gaussians(n, k=0, seed=0):
 
 
 def assert_close(a, b, means=1e-6, log_scales=1e-6, angle=1e-5, opacity=1e-6, sh0=1e-6, shN=1e-6):
-    """Of two sets of Gaussians."""
+    """Compares two sets of Gaussians."""
     np.testing.assert_allclose(b.means, a.means, atol=means)
     np.testing.assert_allclose(b.log_scales, a.log_scales, atol=log_scales)
     np.testing.assert_allclose(np.abs((a.quats * b.quats).sum(1)), 1, atol=angle)
@@ -95,8 +95,8 @@ def assert_close(a, b, means=1e-6, log_scales=1e-6, angle=1e-5, opacity=1e-6, sh
 
 
 def encode_sequence(sequence, path, config, settings=None, turned=False, **options):
-    """A dense sequence -> a .gsv file; returns the report. `turned`: its harmonics turn with the nodes, whatever those
-    of the sequence do. `options` go to StreamOutput (fingerprint)."""
+    """A dense sequence -> a .gsv file; returns the report. `turned`: the coded harmonics turn with the nodes, even if
+    those of the sequence do not. `options` go to StreamOutput (fingerprint)."""
     settings = settings or EncodeSettings(50.0)
     groups = sequence.groups
 
@@ -109,7 +109,7 @@ def encode_sequence(sequence, path, config, settings=None, turned=False, **optio
 
 
 def coded(group: DenseGroup | ParametricGroup, quality: float, *, cameras=(), **settings):
-    """One independent group on its own, unrefined unless `settings` say so -> CodedGroup and its integers."""
+    """One independent group -> CodedGroup and its integers, without refinement by default (`settings`)."""
     coder = GroupCoder(EncodeSettings(**{"refine": 0, "random_access": 0, **settings}), cameras=lambda _: cameras)
     fitted = next(fit_groups([group], quality=quality))
     result, _ = coder.code(None, fitted, coder.measure(fitted, 0), quality, 0)

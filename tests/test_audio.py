@@ -1,4 +1,4 @@
-"""Sound of a stream: what goes in comes out at its time, by ffmpeg, which knows nothing of gsv; and what is refused."""
+"""Sound of a stream: ffmpeg, a decoder without knowledge of gsv, gets each sound at its time; errors are named."""
 
 import json
 import subprocess
@@ -26,7 +26,7 @@ def ffmpeg(*args) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """A rising tone of 3 s as .wav, AAC and Opus; 10 frames of splats."""
+    """Folder with a rising tone of 3 s as .wav, AAC and Opus, and 10 frames of splats."""
     path = tmp_path_factory.mktemp("sound")
     write_tone(path / "tone.wav", 3)
     ffmpeg("-i", path / "tone.wav", "-c:a", "aac", path / "tone.m4a")
@@ -45,7 +45,7 @@ def check_times(wav: Path, seconds: float, *, start: float = 0.0, within: float 
 
 @pytest.mark.parametrize("name", ["tone.wav", "tone.m4a", "tone.opus"])
 def test_ffmpeg_finds_the_sound_at_its_time(folder, tmp_path, name):
-    """2 s of 3 s, with audio frames that straddle groups, read by a stranger."""
+    """2 s of 3 s, with audio frames across group boundaries, read by ffmpeg."""
     tone_stream(tmp_path / "a.gsv", folder / name)
     ffmpeg("-i", tmp_path / "a.gsv", "-map", "0:a:0", tmp_path / "out.wav")
     check_times(tmp_path / "out.wav", 2)
@@ -73,7 +73,7 @@ def test_groups_are_the_same_with_sound_and_without(folder, tmp_path):
 
 
 def test_command_line(folder, tmp_path):
-    """encode, info and render; frames of a part have the sound of that part."""
+    """encode, info and render; a part of the frames has the sound of that part."""
     out = tmp_path / "a.gsv"
     done = run("encode", folder / "plys", out, "--refine", 0, "--audio", folder / "tone.m4a")
     assert done.returncode == 0, done.stderr
@@ -111,7 +111,7 @@ def test_what_has_no_sound_is_refused(folder, tmp_path):
 
 
 def test_sound_that_starts_late_is_filled_up(folder, tmp_path):
-    """AAC that a container starts after its video: encoded anew, with silence in front."""
+    """AAC that starts after the video in its container: encoded again, with silence in front."""
     late = tmp_path / "late.mp4"
     inputs = ("-f", "lavfi", "-i", "color=s=16x16:d=2", "-itsoffset", "0.5", "-i", folder / "tone.m4a")
     ffmpeg(*inputs, "-c:a", "copy", "-t", "2", late)

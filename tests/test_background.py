@@ -1,4 +1,4 @@
-"""Pictures before a background of one colour, without masks: what differs from it is the subject."""
+"""Pictures before a background of one colour, without masks: pixels that differ from it are the subject."""
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ BLACK, WHITE = (0, 0, 0), (255, 255, 255)
 
 
 def subject(shift=0):
-    """[SIDE, SIDE, 3] colours and [SIDE, SIDE] alpha of a ring with a texture and soft borders, four times as fine."""
+    """[SIDE, SIDE, 3] colours and [SIDE, SIDE] alpha of a textured ring; borders are soft (4 x 4 supersampling)."""
     fine = 4 * SIDE
     alpha = np.zeros((fine, fine), np.float32)
     cv2.circle(alpha, (fine // 2 + shift, fine // 2), fine // 4, 1, -1)
@@ -41,7 +41,7 @@ def test_a_subject_is_cut_out_as_if_its_alpha_were_known(color, quality, most):
     assert (np.abs(background_of([seen, seen]) - color) <= 1).all()
     found = cut_out(seen, np.asarray(color, np.float32))
     assert found[1][SIDE // 2, SIDE // 2] == 0, "the hole does not touch the border"
-    for other in (BLACK, WHITE, (128, 128, 128)):  # before any other background it looks as it should
+    for other in (BLACK, WHITE, (128, 128, 128)):  # composited over any other background it is correct
         error = over(found[0], found[1] / 255, other).astype(float) - over(rgb, alpha, other)
         assert np.sqrt((error**2).mean()) < most
 

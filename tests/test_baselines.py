@@ -1,4 +1,4 @@
-"""Each peer gives back what it was given, as exactly as its finest setting allows; rd.json is kept entry by entry."""
+"""Each peer codec returns its input as exactly as its finest setting allows; rd.json is kept entry by entry."""
 
 import json
 import os
@@ -42,7 +42,7 @@ def test_a_baseline_gives_its_input_back(name, tmp_path, monkeypatch):
     assert len(decoded) == 3
     for given, got in zip(frames, decoded, strict=True):
         away = np.linalg.norm(given.means[:, None] - got.means[None], axis=2)
-        index = away.argmin(1)  # in whatever order they come
+        index = away.argmin(1)  # the codecs return any order
         assert away.min(1).max() < 0.01
         assert len(set(index)) == 60
         assert np.abs(got.sh0[index] - given.sh0).max() < 0.15

@@ -1,4 +1,4 @@
-"""Benchmarks write what the charts read; scripts rely on the keys."""
+"""Benchmarks write the values that the charts read; scripts rely on the keys."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""The bitstream core through its Python face: integers survive, damage is named, the container can be cut and split."""
+"""The bitstream core by its Python API: integers survive, damage is named, the container can be cut and split."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_contexts_beat_a_memoryless_code():
             p = np.unique(channel, return_counts=True)[1] / channel.size
             memoryless -= (p * np.log2(p)).sum()
         assert bits[name] < 0.92 * memoryless, name
-    assert bits["positions"] < 13.5  # 30 raw; 17.2 if they were anywhere in the cube, in no order
+    assert bits["positions"] < 13.5  # 30 raw; 17.2 for an unordered set of points anywhere in the cube
 
 
 def expected_frame(group, t):
@@ -139,7 +139,7 @@ def test_nodes_carry_their_gaussians():
     group = surface_group(800, frames=2)
     nodes = group.positions[::40]
     c = np.zeros((1, 6, len(nodes)), np.int32)
-    c[0, 3] = 8  # every node moves by the same
+    c[0, 3] = 8  # every node has the same translation
     decoded = _native.DecodedGroup(_native.encode_group(node_group(group, nodes, c, 0.01, 0.25))[0], 1)
     rest = group.origin + group.grid_step * group.positions
     np.testing.assert_allclose(decoded.frame(1)["means"] - rest, [[8 * 0.25 / np.sqrt(2), 0, 0]] * 800, atol=1e-3)
@@ -209,7 +209,7 @@ def test_damage_is_an_error():
 
 
 def flipped(payload, unit_type, index=0):
-    """The payload with a bit near the end of one unit changed."""
+    """The payload with one changed bit near the end of a unit."""
     u = next(u for u in _native.units(payload) if (u["type"], u["index"]) == (unit_type, index))
     bad = bytearray(payload)
     bad[u["offset"] + u["bytes"] - 2] ^= 4
@@ -217,7 +217,7 @@ def flipped(payload, unit_type, index=0):
 
 
 def tiled_group(count=600):
-    """Tiles of 256 Gaussians."""
+    """A group in tiles of 256 Gaussians."""
     return replace(moving_group(count), tile_side_log2=4)
 
 
@@ -274,7 +274,7 @@ def test_streams_tell_of_damage(tmp_path):
     stream = open_stream(path, strict=False)
     assert len(stream.frame(0)) > len(stream.frame(frames)) > 0
     assert stream.frame_count == 4 * frames
-    for i in (0, 2, 3, 1):  # decoded again, told once
+    for i in (0, 2, 3, 1):  # decoded again, reported once
         stream.group(i)
     [damage] = stream.damage
     assert (damage["group"], damage["unit"], damage["type"], damage["tile"]) == (1, unit, "tile", 2)
@@ -283,7 +283,8 @@ def test_streams_tell_of_damage(tmp_path):
 
 
 def test_damage_anywhere_behind_the_index_costs_one_group_and_its_followers():
-    """Every byte of boxes, some of the payloads: all other groups are as before, and the damage is told."""
+    """Damage at every byte of boxes and some bytes of payloads: all other groups are unchanged, the damage is
+    reported."""
     group = moving_group(30)
     known = _native.DecodedGroup(_native.encode_group(group)[0], 1)
     later = replace(known.quantized(), reference=2, parents=np.arange(30, dtype=np.int32))
@@ -333,7 +334,7 @@ def test_maps_hold_every_value():
     assert (layout.width, layout.height, layout.side) == (16, 48, 16)
     for name, values in planes(decoded.quantized()):
         np.testing.assert_array_equal(layout.collect(layout.arrange(values)), values, err_msg=name)
-    for t in range(3):  # a tile is a square
+    for t in range(3):  # a tile is a square of 16 x 16
         own = slice(256 * t, 256 * (t + 1))
         assert (layout.x[own] // 16 == 0).all()
         assert (layout.y[own] // 16 == t).all()
@@ -420,4 +421,4 @@ def test_decoding_releases_the_gil():
         _native.DecodedGroup(payload, 1)
     done.set()
     thread.join()
-    assert len(ticks) >= 6  # one or two per call if it were held
+    assert len(ticks) >= 6  # one or two per call if the GIL were held

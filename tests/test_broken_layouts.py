@@ -1,4 +1,4 @@
-"""Captures that are damaged or lack something: what is wrong is named, and a camera that cannot be used is left out."""
+"""Damaged and incomplete captures: the error is named, and a camera that cannot be used is left out."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Capture readers on tiny captures made here: what they read, what they leave out with a warning, what they refuse."""
+"""Capture readers on tiny captures made here: values read, entries left out with a warning, and errors."""
 
 import json
 import sys
@@ -74,7 +74,7 @@ def test_reads_cameras_frames_and_alpha(rig):
 
 @pytest.mark.parametrize("masked", [[], [1]])
 def test_an_alpha_channel_without_masks_says_nothing(rig, masked):
-    """Many tools write one: all of it would pass for the subject."""
+    """Many tools write an opaque alpha channel: as a mask it would make the whole picture the subject."""
     folder, _, save = rig
     for k in {0, 1, 2} - {*masked}:
         opaque = pixels(k, 0)
@@ -102,7 +102,7 @@ def test_near_plane_is_the_files_or_a_share_of_the_distance(rig):
 
 
 def test_a_world_of_map_coordinates_is_moved(rig):
-    """Single precision has half a metre there."""
+    """Map coordinates in single precision have steps of half a metre."""
     _, data, save = rig
     usual = save()
     for f in data["frames"]:
@@ -226,7 +226,7 @@ def test_a_broken_camera_is_left_out(rig, harm, message):
 
 
 def test_a_camera_may_move(rig):
-    """Each frame has its own pose and intrinsics, also in a part of the capture and at another scale."""
+    """Each frame has its own pose and intrinsics, also in a part of the capture and after scaling."""
     _, data, save = rig
     assert not save().moves
     data["frames"][3] |= {"transform_matrix": pose(9).tolist(), "fl_x": 40.0}
@@ -393,7 +393,7 @@ def test_undistortion_moves_pixels_where_opencv_projects_them():
     assert not pinhole.distortion.size
     point = np.array([[[0.15, -0.1, 1.0]]])
     zero = np.zeros(3)
-    u, v = cv2.projectPoints(point, zero, zero, K, camera.distortion)[0].ravel()  # half-integer pixel centres
+    u, v = cv2.projectPoints(point, zero, zero, K, camera.distortion)[0].ravel()  # pixel centres are at half-integers
     y, x = np.mgrid[:64, :96] + 0.5
     image = np.exp(-((x - u) ** 2 + (y - v) ** 2) / 8) * 255
     out = lens.view(View(np.dstack([image] * 3).astype(np.uint8)), camera).rgb[..., 0].astype(float)

@@ -1,4 +1,4 @@
-"""`gscodec info` of a capture: what it recognises, measures and misses, and the contact sheet."""
+"""`gscodec info` of a capture: recognised layout, measurements, defects, and the contact sheet."""
 
 import json
 

@@ -1,5 +1,5 @@
-"""A capture into tracks: the still room is coded once, the subject has groups of its own, and together they are the
-scene."""
+"""A capture into tracks: the static room is coded once, the subject has groups of its own, and both together are
+the scene."""
 
 import dataclasses
 
@@ -36,7 +36,7 @@ def room(t):
 
 
 def ball(t):
-    """Rises through the room, so that from no camera a place is covered in most frames."""
+    """A ball that rises through the room, so that it covers no place in most frames of any camera."""
     return [placed(True, (0.2,) * 3, (-0.5 + 0.2 * t, -0.2, -0.5 + 0.22 * t), (0.9, 0.4, 0.2))]
 
 
@@ -51,7 +51,7 @@ def rig(shapes, masks, size=48):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The room and the ball as pictures, and masks of the ball."""
+    """Folder with pictures of the room and the ball, and masks of the ball."""
     path = tmp_path_factory.mktemp("capture")
     whole, empty = rig(lambda t: room(t) + drift(t), False), rig(room, False)
     write_transforms(whole, path)
@@ -140,7 +140,7 @@ def test_a_damaged_subject_leaves_the_room(scene, tmp_path):
 
 
 def pair(apart):
-    """12 frames of a blob that stands and one that moves away: `apart` at first, groups predicted from each other."""
+    """12 frames of a static blob and one that moves away, `apart` at first; groups are predicted from each other."""
     still, other = blob(200, 1), blob(100, 2)
     frames = [concatenate([still, moved(other, [0, 0.1 * t, 0], [apart + 0.2 * t, 0, 0])]) for t in range(12)]
     same = np.arange(len(frames[0]))

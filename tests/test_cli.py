@@ -1,4 +1,4 @@
-"""The command line as a user meets it: help, results on stdout, one clear sentence for what went wrong."""
+"""The command line as a user meets it: help, results on stdout, one clear sentence for each error."""
 
 import json
 import subprocess
@@ -16,7 +16,7 @@ from gscodec.splats import write_sequence
 
 
 def run(*args, cwd=None):
-    """`gscodec ARGS`, as its own process."""
+    """Runs `gscodec ARGS` in its own process."""
     code = "import sys; from gscodec.cli import main; main()"
     return subprocess.run([sys.executable, "-c", code, *map(str, args)], capture_output=True, text=True, cwd=cwd)
 
@@ -33,7 +33,7 @@ def folder(tmp_path_factory):
 
 
 def fails(result, *words, code=1):
-    """One sentence on stderr, no traceback, nothing on stdout."""
+    """Checks for one sentence on stderr, no traceback, nothing on stdout."""
     assert result.returncode == code, result.stderr
     assert "Traceback" not in result.stderr
     assert result.stdout == ""
@@ -65,7 +65,7 @@ def test_info_accounts_for_every_byte(folder):
 
 
 def png_header(path):
-    """Width, height and bit depth."""
+    """Width, height and bit depth of a .png file."""
     header = path.read_bytes()[16:26]
     return int.from_bytes(header[:4], "big"), int.from_bytes(header[4:8], "big"), header[8]
 

@@ -1,4 +1,4 @@
-"""Training on a Ray cluster, a local one of two processors: the bytes of a local run, also when a worker dies."""
+"""Training on a local Ray cluster of two processors: the same bytes as a local run, also when a worker dies."""
 
 import os
 import signal

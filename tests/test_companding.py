@@ -1,4 +1,4 @@
-"""Companding of sizes and opacities: the curve that the decoder expands, where it spends steps, what it saves."""
+"""Companding of sizes and opacities: the curve that the decoder expands, and the distribution of its steps."""
 
 import numpy as np
 import pytest

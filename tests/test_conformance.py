@@ -1,7 +1,7 @@
 """Conformance: the native decoder and the reference decoder against the vectors and against each other.
 
 The case lists spec/vectors/valid_cases.py and invalid_cases.py drive these tests and, by make.py, write the files; the
-manifest holds what must come out.
+manifest holds the expected results.
 """
 
 import hashlib
@@ -36,13 +36,13 @@ INVALID = {Path(entry["file"]).stem: entry for entry in MANIFEST["invalid"]}
 
 
 def native_groups(data, track=None):
-    """[(fragment, DecodedGroup)] of a track of a file, by the package."""
+    """[(fragment, DecodedGroup)] of a track of a file, by the native decoder."""
     stream = Stream(data, track=track)
     return [(fragment, stream.group(i)) for i, fragment in enumerate(stream.groups)]
 
 
 def decode_all(data):
-    """Every group of every track, by who knows both the file and the group, and so compares them."""
+    """Every group of every track, by the native reader of files, which also checks that groups agree with the file."""
     count = _native.track_count(data)
     return [group for k in range(count) for _, group in native_groups(data, k or None)]
 
@@ -91,7 +91,7 @@ def test_valid(name):
 
 
 def compare(name, data, decoded, native, groups):
-    """The groups of a track, by both decoders and as the manifest has them."""
+    """Compares the groups of a track: both decoders and the manifest."""
     assert len(decoded) == len(native) == len(groups)
     for (sample, group), (fragment, ours), facts in zip(decoded, native, groups, strict=True):
         assert reference.group_hash(group) == native_hash(ours.quantized()) == facts["sha256"]
@@ -111,7 +111,7 @@ def compare(name, data, decoded, native, groups):
 
 @pytest.mark.parametrize("name", [name for name in VALID if name.startswith("track")])
 def test_scene(name):
-    """Frames of a scene, placed and behind one another, by both decoders."""
+    """Frames of a scene by both decoders: tracks are placed and concatenated."""
     data = (VECTORS / VALID[name]["file"]).read_bytes()
     scene = read_scene(data)
     assert scene.frame_count > 1
@@ -124,7 +124,7 @@ def test_scene(name):
 
 @pytest.mark.parametrize("name", VALID)
 def test_encoder_still_makes_these_integers(name):
-    """The encoder may write other bytes than it did when the vectors were made, but they must mean the same."""
+    """The encoder may write other bytes than when the vectors were made, but the same integers."""
     groups = [native_hash(group.quantized()) for _, group in native_groups(VALID_CASES[name][1]())]
     assert groups == [facts["sha256"] for facts in VALID[name]["groups"]]
 
@@ -152,7 +152,7 @@ def test_reference_stops_at_the_cap_of_symbols(monkeypatch):
 
 @pytest.mark.parametrize("name", ["layers", "layers_most", "layers_predicted", "layer_corrections", "tiles_layers"])
 def test_prefix(name):
-    """Both decoders decode the first layers alone, also where the sample ends behind them."""
+    """Both decoders decode the first layers alone, also if the sample ends behind them."""
     data = (VECTORS / VALID[name]["file"]).read_bytes()
     _, samples = reference.read_container(data)
     for layers in (1, 2, 3):
@@ -173,7 +173,7 @@ def test_prefix(name):
 
 @pytest.mark.parametrize("name", ["tiles", "tiles_predicted", "tiles_layers"])
 def test_some_tiles(name):
-    """Both decoders decode the same tiles alone, also where the bytes of others are not there."""
+    """Both decoders decode the same tiles alone, also if the bytes of other tiles are missing."""
     data = (VECTORS / VALID[name]["file"]).read_bytes()
     _, samples = reference.read_container(data)
     for wanted in ({(0, 2)}, {(0, 1), (0, 4), (1, 1)}, set()):
@@ -195,7 +195,7 @@ def test_some_tiles(name):
 
 
 def test_a_missing_leading_tile_says_who_needs_it():
-    """Tile 2 is asked for, and the bytes of tile 0, from which it starts, are not there."""
+    """Tile 2 is requested; the bytes of tile 0, its leading tile, are missing."""
     data = (VECTORS / VALID["tiles"]["file"]).read_bytes()
     _, (sample,) = reference.read_container(data)
     first = next(u for u in _native.units(sample.payload) if u["type"] == "tile")
@@ -246,7 +246,7 @@ def test_rendering_is_as_written():
 
 
 def test_reference_hash_is_as_written():
-    """Clause 16 spelled out once: T = 2, grid_bits = 3, one Gaussian, nothing else but positions."""
+    """Clause 16 written out for one case: T = 2, grid_bits = 3, one Gaussian, positions only."""
     arrays = [np.array([[1, 2, 7]])] + [None] * 14
     words = [2, 3, 2, 1, 3, 1, 2, 7] + [0] * 14
     serialized = b"".join(word.to_bytes(4, "little") for word in words)

@@ -1,4 +1,4 @@
-"""Depth: rendered and differentiated by the rasterizer, read by captures, and what training makes of it."""
+"""Depth: rendered and differentiated by the rasterizer, read by captures, used in training."""
 
 import json
 from dataclasses import replace
@@ -24,7 +24,7 @@ SH_C0 = 0.28209479177387814
 
 
 def reference_depth(params: list[torch.Tensor], cam) -> tuple[torch.Tensor, torch.Tensor]:
-    """Sum of weight times depth, and alpha, [H, W] each: the reference with depth for colours."""
+    """Sum of weight times depth, and alpha, [H, W] each: the reference rasterizer with depths as colours."""
     z = project(*params[:3], cam)[2]
     colour = ((z - 0.5) / SH_C0)[:, None].expand(-1, 3)
     image, alpha, _ = rasterize_reference(*params[:4], colour, params[5][:, :0], cam)
@@ -163,7 +163,7 @@ def test_distances_along_rays_become_depth():
 
 
 def test_depth_images_of_easyvolcap(tmp_path):
-    """Distances from the camera, as its loader has them by default."""
+    """Values are distances from the camera, the default of EasyVolcap's loader."""
     easyvolcap(tmp_path)
     for name in NAMES:
         (tmp_path / "depths" / name).mkdir(parents=True)
@@ -181,7 +181,7 @@ def test_points_of_depth_images_lie_on_their_surface():
     rgb = np.full((cam.height, cam.width, 3), 51, np.uint8)
     depth = np.full((cam.height, cam.width), 3, np.float32)
     flying = depth.copy()
-    flying[10:20, 10:20] = 1.5  # between the camera and a wall that the others see
+    flying[10:20, 10:20] = 1.5  # between the camera and a wall that the other cameras see
     views = [(cam, rgb, None), (other, rgb, None), (other, rgb, None)]
     points, colors = depth_points(views, [flying, depth, depth], 2000, 0, 0.03)
     z = points @ cam.viewmat[2, :3] + cam.viewmat[2, 3]

@@ -1,4 +1,4 @@
-"""Draco point clouds: out and in again, through the command line too."""
+"""Draco point clouds: written and read back, also by the command line."""
 
 import numpy as np
 import pytest

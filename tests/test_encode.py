@@ -1,4 +1,4 @@
-"""Encoder: integers keep the content, motion is found, the file grows, stops and goes on."""
+"""Encoder: integers keep the content, motion is found, and a file can grow, stop and be resumed."""
 
 import itertools
 import json
@@ -186,7 +186,7 @@ def test_lifetimes_survive(tmp_path):
 
 
 def test_what_lives_in_one_frame_of_a_room_is_measured_there():
-    """Within an opaque shell, which hides it from all views but those of the capture."""
+    """The Gaussians are inside an opaque shell: only the cameras of the capture see them."""
     frames, each, rng = 20, 4, np.random.default_rng(0)
     shell, inside = (rng.normal(size=(n, 3)) for n in (3000, frames * each))
     shell *= 3 / np.linalg.norm(shell, axis=1, keepdims=True)
@@ -204,7 +204,7 @@ def test_what_lives_in_one_frame_of_a_room_is_measured_there():
 
 
 def test_what_lives_in_one_frame_matters_if_any_camera_sees_it():
-    """Cameras look away from each other, and each newcomer is before one of them: two views a frame are too few."""
+    """Cameras look away from each other, and only one sees each new Gaussian: two views a frame are too few."""
     frames, each, rng = 12, 2, np.random.default_rng(0)
     away = np.array([[1, 0, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1.0]])
     K = np.array([[60, 0, 32], [0, 60, 32], [0, 0, 1.0]])
@@ -221,7 +221,8 @@ def test_what_lives_in_one_frame_matters_if_any_camera_sees_it():
 
 
 def test_a_trainers_nodes_carry_newcomers_from_where_these_rest():
-    """A blob that turns; half of it is born late, rests beside the rest of it and has nodes of its own: no residual."""
+    """A turning blob; half of it is born late, has its rest position beside the other half and nodes of its own: no
+    residual."""
     n, frames = 400, 6
     group = turning(n, frames).groups[0]
     x, young = group.frames[0].means, np.arange(n) >= n // 2
@@ -229,7 +230,7 @@ def test_a_trainers_nodes_carry_newcomers_from_where_these_rest():
     seeds = np.concatenate([np.arange(12), n // 2 + np.arange(12)])
     turn = np.stack([np.tile([0, 0.1 * t, 0.02 * t], (24, 1)) for t in range(frames)])
     moves = np.stack([group.frames[t].means[seeds] for t in range(frames)]) - rest[seeds]
-    moves[:, 12:] = np.where(np.arange(frames)[:, None, None] < 3, moves[3:4, 12:], moves[:, 12:])  # wait at birth
+    moves[:, 12:] = np.where(np.arange(frames)[:, None, None] < 3, moves[3:4, 12:], moves[:, 12:])  # still until birth
     turn[:3, 12:] = turn[3, 12:]
     lifetimes = np.stack([np.where(young, 3, 0), np.full(n, frames)], 1).astype(np.int32)
     own = np.where(young, 12, 0)[:, None] + np.arange(4)
@@ -263,7 +264,7 @@ def test_frames_in_any_order_are_the_same(tmp_path):
 
 
 def changing(frames=6) -> list[DenseGroup]:
-    """Two groups of a turning body: in the second, 40 Gaussians have gone and 40 are new."""
+    """Two groups of a turning body: in the second group 40 Gaussians are removed and 40 are new."""
     whole = turning(400, frames=2 * frames).groups[0]
     take = lambda t, index: whole.frames[t].take(index)  # noqa: E731
     first, second = np.arange(360), np.arange(400)[::-1][:360]
@@ -299,7 +300,7 @@ def test_a_predicted_group_costs_less_and_keeps_the_content(tmp_path, layers):
     assert stream.group(1).reference == 1
     assert (stream.group(1).parents() < 0).sum() == 40
     independent = open_stream(tmp_path / "alone.gsv")
-    for t in (6, 8, 11):  # the predicted one first: a seek
+    for t in (6, 8, 11):  # the predicted group first: a seek
         a = sequence.frame(t)
         errors = []
         for s in (independent, stream):
@@ -330,7 +331,7 @@ def test_layers_have_the_steps_of_their_sensitivity():
 
 
 def test_black_stays_black(tmp_path):
-    """The rasterizer cuts colours off there, so that the picture has no derivative by them."""
+    """The rasterizer clamps colours at 0, so the picture has no derivative by negative colours."""
     g = blob(1000)
     black = np.arange(1000) % 2 == 0
     colors = np.where(black[:, None], -0.5 / SH_C0 - 1e-6, g.sh0).astype(np.float32)
@@ -342,7 +343,7 @@ def test_black_stays_black(tmp_path):
 
 
 def test_a_gaussian_that_has_faded_leaves_a_predicted_group():
-    """It costs nothing to keep, but would be as opaque as the reference has it."""
+    """A kept Gaussian costs no bits, but would keep the opacity of the reference."""
     g = blob(300)
     faded = replace(g, logit_opacities=np.where(np.arange(300) < 20, -9, g.logit_opacities).astype(np.float32))
     groups = [DenseGroup([g]), DenseGroup([faded], parents=np.arange(300))]
@@ -360,7 +361,7 @@ def test_a_group_that_refers_to_a_damaged_one_is_named(tmp_path):
     write(turning().with_groups(changing()), tmp_path / "a.gsv")
     data = bytearray((tmp_path / "a.gsv").read_bytes())
     group = Stream(data).groups[0]
-    data[group["offset"] + 20] ^= 1  # in the header
+    data[group["offset"] + 20] ^= 1  # in the group header
     with pytest.raises(BitstreamError, match=r"group 1 .*group 0 .*CRC"):
         Stream(data, strict=False).group(1)
 
@@ -459,7 +460,7 @@ def test_a_changed_input_is_named(tmp_path):
 
 
 def test_the_state_of_the_coder_survives_a_file(tmp_path):
-    """What a resumed run predicts from is what an undisturbed one has."""
+    """A resumed run predicts from the same state as an undisturbed run."""
     first, second = fit_groups(changing(), random_access=60)
     coder = GroupCoder(EncodeSettings(refine=0, keep_all=True))
     _, state = coder.code(None, first, coder.measure(first, 0), 60, 0)

@@ -36,7 +36,7 @@ def capture():
 
 
 def resting(count, frames):
-    """A group of so many Gaussians that rest."""
+    """A group of `count` Gaussians that do not move."""
     key, everything = from_gaussians(blob(count)), torch.ones(count, dtype=torch.bool)
     nodes = dataclasses.replace(TINY.graph, nodes=8)
     graph = NodeGraph.of(key.params["means"], torch.ones(count), 1.0, everything, nodes)
@@ -66,7 +66,7 @@ def test_laplace_bits_are_code_lengths():
 
 
 def test_rate_term_tracks_the_coders_bits():
-    """The loss and the coder agree on what a set of residual trajectories costs, up to 20 %."""
+    """The loss and the coder agree on the bits of residual trajectories up to 20 %."""
     sequence = turning(6000, frames=4)
     _, integers = one_group(sequence.groups[0], 50, keep_all=True)
     n = len(integers)
@@ -91,7 +91,7 @@ def test_rate_term_tracks_the_coders_bits():
 
 
 def test_canonical_rate_is_what_the_coder_pays_and_falls_along_its_gradient():
-    """Estimated and coded bits of each attribute; coded bits after a descent on nothing but the rate."""
+    """Estimated and coded bits of each attribute; coded bits after a descent on the rate alone."""
     model, steps = from_gaussians(blob(3000, sh_count=3)), steps_for(62, 1.0)
     rate, noise = CanonicalRate(model.params["means"], steps, TINY.entropy_model), torch.Generator().manual_seed(0)
     names = ("quats", "log_scales", "logit_opacities", "sh0", "shN")
@@ -130,7 +130,7 @@ def coded_bits(rate, model, quality):
 
 
 def test_fine_tuning_removes_and_adds_gaussians(capture, monkeypatch):
-    """The next group goes on from them."""
+    """The next group continues with the changed Gaussians."""
     changes = []
     append, select = GroupModel.append, GroupModel.select
     monkeypatch.setattr(GroupModel, "append", lambda g, c, p: (changes.append(len(p)), append(g, c, p))[1])
@@ -145,7 +145,7 @@ def test_fine_tuning_removes_and_adds_gaussians(capture, monkeypatch):
 
 
 def test_what_one_frame_shows_takes_one_step_for_each_gradient(capture):
-    """Adam alone goes on for some five steps behind a gradient in one of 22 steps."""
+    """Adam alone takes about five more steps after a gradient that occurs in one of 22 steps."""
     frames, rounds = 20, 5
     group = resting(60, frames)
     group.start[:20], group.end[:20] = 4, 5
@@ -196,7 +196,7 @@ def test_many_views_need_no_prior_and_no_dropout(capture):
 
 @pytest.mark.parametrize("drift", [0.2, 0.0])
 def test_a_camera_whose_brightness_drifts_is_followed(capture, drift):
-    """In each frame, up to what all cameras share; one that does not drift is the same in all frames."""
+    """In each frame, up to a gain common to all cameras; a camera without drift has the same gain in all frames."""
     gains = np.exp(drift * np.linspace(0, 1, 3)[:, None] * np.sin(np.arange(len(capture.cameras))))
 
     def rolled(camera, frame):
@@ -214,7 +214,7 @@ def test_a_camera_whose_brightness_drifts_is_followed(capture, drift):
 
 
 def test_a_group_goes_on_from_what_was_fine_tuned(capture):
-    """The tracker shows the last frame as the group does, whatever fine-tuning changed, but for small coefficients."""
+    """The tracker's last frame equals that of the fine-tuned group, except for small coefficients."""
     key = from_gaussians(turning(300, frames=5).frame(0))
     tracker = Tracker.start(key, Views(capture, TINY, CpuBackend()), TINY, 0.01, range(3))
     models, poses = [tracker.model], [tracker.pose]
@@ -246,7 +246,7 @@ def test_what_moves_in_a_predicted_group_starts_nearer_to_rest():
     brighter = torch.linspace(0, 1, 30).repeat(2)[:, None]
     frames = [Model({**key.params, "sh0": key.params["sh0"] + brighter})] * 4
     group = GroupModel(graph, key, frames, [Pose.rest(graph)] * 4, steps_for(50, 1.0), moved, TINY)
-    steps = (2 * brighter / group.unit["sh0"]).numpy()  # the square root of 4 frames
+    steps = (2 * brighter / group.unit["sh0"]).numpy()  # 2: square root of 4 frames
     found = group.coefficients["sh0"][0]
     np.testing.assert_allclose(found[30:], np.broadcast_to(steps[30:], (30, 3)), atol=1e-3)
     smaller = np.maximum(steps[:30] - TINY.finetune.shrinkage, 0)

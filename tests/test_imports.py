@@ -1,7 +1,7 @@
-"""Imports follow the data flow: which part of codec/ may import which, resolved by path, and no circles.
+"""Imports follow the data flow: the allowed imports between parts of codec/, resolved by path, without cycles.
 
 A part is a folder of codec/ or a single module in it; a module is named by its path, e.g. "encode.coder". Imports in
-codec/ are relative. bench/ and tests/ may import everything, and nothing but two commands may import bench.
+codec/ are relative. bench/ and tests/ may import everything; only two commands may import bench.
 """
 
 import ast
@@ -53,7 +53,7 @@ STUDIO = {
 
 @cache
 def modules() -> dict[str, Path]:
-    """Module of codec/ -> its file; a package has the name of its folder, codec/__init__.py has ""."""
+    """Module of codec/ -> its file; a package has the name of its folder, codec/__init__.py the name ""."""
     found = {}
     for path in CODEC.rglob("*.py"):
         parts = path.relative_to(CODEC).with_suffix("").parts

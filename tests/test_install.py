@@ -1,4 +1,4 @@
-"""The wheel in a foreign folder, in an environment of the player's side: numpy, typer and rich, and no extra."""
+"""The wheel in a foreign folder, in an environment for playback: numpy, typer and rich, without extras."""
 
 import os
 import subprocess
@@ -12,7 +12,7 @@ from synthetic import encode_sequence, turning
 from gscodec.splats import write_sequence
 
 ROOT = Path(__file__).parent.parent
-# Without what would put another gscodec in front of the wheel's.
+# Without the variables that would put another gscodec before the wheel's.
 OUTSIDE = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
 
 

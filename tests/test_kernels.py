@@ -45,7 +45,7 @@ def test_image_loss_of_equal_images_is_zero():
 
 
 def test_image_loss_of_local_differences_matches_the_reference():
-    # Mostly equal images: the kernels skip what is equal, and must not skip more.
+    # Mostly equal images: the kernels must skip equal pixels only.
     g = torch.Generator().manual_seed(3)
     target = torch.rand(90, 400, 3, generator=g, dtype=torch.float64)
     exact = target.clone()
@@ -110,7 +110,7 @@ def test_adam_counts_the_steps_of_each_array():
 
 
 def test_adam_follows_rows_that_come_and_go():
-    """Rows that stay move as if nothing had happened around them; new ones start with zero moments."""
+    """Kept rows move as if no others were added or removed; new rows start with zero moments."""
     rng = np.random.default_rng(0)
     settings, start, grads = AdamSettings(), rng.normal(size=(6, 3, 2)), rng.normal(size=(3, 6, 3, 2))
     start, grads = start.astype(np.float32), grads.astype(np.float32)
@@ -194,8 +194,8 @@ def test_trajectory_step_is_that_of_torch():
     bits = laplace_bits(leaf + shifted, log_scales)
     loss = (torch.from_numpy(at)[:, None, None] * leaf * torch.from_numpy(grad)).sum() + 0.2 * bits.sum()
     loss.backward()
-    first, second = leaf.grad.numpy(), at[:, None, None] * grad  # gradients of two steps, the second without a price
-    variance = np.array([(g * g).mean(0) for g in (first, second)])  # of the three coefficients together
+    first, second = leaf.grad.numpy(), at[:, None, None] * grad  # gradients of two steps, the second without rate term
+    variance = np.array([(g * g).mean(0) for g in (first, second)])  # mean over the three coefficients
     wanted = coefficients - 0.1 * first / np.sqrt(variance[0])
     adam = TrajectoryAdam(CpuBackend(), AdamSettings(eps=1e-8))
     of_each = adam.step("means", coefficients, grad, at, (0.2, scales, noise), 0.1)
@@ -209,7 +209,7 @@ def test_trajectory_step_is_that_of_torch():
 
 
 def test_offset_of_a_camera_is_added_to_the_light_of_the_gaussians():
-    """The loss of a picture that is brighter by gain and offset, and its gradients by both."""
+    """The loss for a picture brightened by gain and offset, and its gradients by both."""
     g = torch.Generator().manual_seed(5)
     params = {
         "means": 0.3 * torch.randn(30, 3, generator=g),

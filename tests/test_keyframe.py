@@ -59,11 +59,11 @@ def test_sweep_finds_a_textured_wall():
 
 
 def test_far_shell_is_opaque_and_far():
-    """White pictures, and so a white shell: it fills every picture before black, from far behind the wall's place."""
+    """White pictures give a white shell: it fills every picture before black, and lies far behind the wall."""
     views = [(c, np.full((c.height, c.width, 3), 255, np.uint8), None) for c in arc()]
     shell = far_shell(views, TINY.far_shell).gaussians()
     assert (shell.means[:, 1] > 8).all()
-    middles = [render_image(shell, c, (0, 0, 0))[8:-8, 8:-8] for c, _, _ in views]  # it ends where no camera looks
+    middles = [render_image(shell, c, (0, 0, 0))[8:-8, 8:-8] for c, _, _ in views]  # shell ends where no camera looks
     assert min(m.min() for m in middles) > 225
 
 
@@ -77,7 +77,7 @@ def test_nothing_around_a_scene_without_masks_grows_up_to_the_cameras():
 
 
 def test_depth_of_a_sweep_lies_between_its_planes():
-    """A painted wall y = 0. Planes are 0.15 apart there, so that planes alone are off by 0.04."""
+    """A painted wall y = 0. Planes are 0.15 apart there: without interpolation depth is off by 0.04."""
     views = []
     for camera in arc():
         y, x = np.mgrid[: camera.height, : camera.width]
@@ -90,7 +90,7 @@ def test_depth_of_a_sweep_lies_between_its_planes():
 
 
 def test_sweep_finds_a_floor_seen_from_sides_far_apart():
-    """Windows parallel to an image never match between views that are more than 60 degrees apart; level ones do."""
+    """Windows parallel to an image do not match between views more than 60 degrees apart; horizontal windows do."""
     wall, turned = splat_wall(height=4.0), np.sqrt(0.5).astype(np.float32)
     floor = dataclasses.replace(wall, means=wall.means[:, [0, 2, 1]], quats=wall.quats * turned)
     K = np.array([[150.0, 0, 64], [0, 150.0, 48], [0, 0, 1]])
@@ -101,12 +101,12 @@ def test_sweep_finds_a_floor_seen_from_sides_far_apart():
     points, _ = sweep(views, 1000, 0, settings)
     assert len(points) == 1000
     assert (np.abs(points[:, 2]) < 0.15).mean() > 0.7, "two views agree by chance, too"
-    parallel = dataclasses.replace(settings, scored_neighbours=0)  # no view is without near neighbours then
+    parallel = dataclasses.replace(settings, scored_neighbours=0)  # now no view lacks near neighbours
     assert len(sweep(views, 1000, 0, parallel)[0]) == 0
 
 
 def test_initial_points_do_without_shell_or_sweep():
-    """The ablations of the initial points, by settings alone."""
+    """Ablations of the initial points, by settings."""
     wall = splat_wall()
     cameras = [dataclasses.replace(c, split="train") for c in arc()]
     read = lambda camera, _: View(render_image(wall, cameras[camera], (0, 0, 0)), None)  # noqa: E731
@@ -144,7 +144,7 @@ def test_each_picture_is_decoded_once_for_the_initial_points():
 
 
 def test_a_keyframe_starts_from_depth_images():
-    """They take the place of the plane sweep, and cameras without them are no obstacle."""
+    """Depth images replace the plane sweep; some cameras may have none."""
     wall, cameras = splat_wall(), [dataclasses.replace(c, split="train") for c in arc()]
     params = {name: getattr(wall, name) for name in PARAMETERS}
 
@@ -161,7 +161,7 @@ def test_a_keyframe_starts_from_depth_images():
 
 @pytest.mark.parametrize("masks", [True, False])
 def test_a_keyframe_starts_from_the_captures_points(masks):
-    """Those that the pictures do not refute; what else is known of the surface comes besides."""
+    """Points that the pictures do not refute are kept; other initial points of the surface are added."""
     plain = capture_of(turning(3000, frames=1), masks)
     means = np.float32([(0, 0, 0.1), (0, 0.1, 0), (0, 0, 1.6), (50, 0, 0)])  # two in all masks, one outside, one unseen
     points = Points(means, np.uint8([(255, 0, 0), (0, 255, 0), (0, 0, 255), (9, 9, 9)]))
@@ -192,7 +192,7 @@ def test_projection_is_the_renderers(capture):
 @pytest.mark.parametrize("masks", [True, False])
 def test_keyframe_learns_a_view_it_has_not_seen(masks):
     capture = capture_of(turning(300, frames=1), masks=masks)
-    points = 300 if masks else 2000  # a random box has most of its points where nothing is
+    points = 300 if masks else 2000  # most points of a random box are in empty space
     settings = dataclasses.replace(TINY, initial_points=points, gaussians_max=2 * points)
     model, radius = initial_model(capture, 0, points, settings)
     losses = []
@@ -213,7 +213,7 @@ def test_keyframe_learns_a_view_it_has_not_seen(masks):
 
 @pytest.mark.parametrize("darkest", [0.75, 1.0])
 def test_exposure_of_each_camera_is_found(darkest):
-    """Up to what all cameras share; equal ones stay equal."""
+    """Gains are found up to a common factor; equal ones stay equal."""
     capture = capture_of(turning(300, frames=1))
     gains = np.random.default_rng(2).uniform(darkest, 1, len(capture.cameras))
 
@@ -234,7 +234,7 @@ def test_exposure_of_each_camera_is_found(darkest):
 
 @pytest.mark.parametrize("wrong", [0.0, 0.03])
 def test_pose_of_each_camera_is_found(wrong):
-    """Up to what all cameras share; right ones stay as they are."""
+    """Poses are found up to a common change; correct ones stay unchanged."""
     capture = capture_of(turning(300, frames=1))
     count = len(capture.cameras)
     told, trained = Extrinsics(count, list(range(count - 1)), TINY, CpuBackend()), slice(0, -1)
@@ -249,8 +249,8 @@ def test_pose_of_each_camera_is_found(wrong):
 
 
 def glossy(gloss: float) -> GaussianSequence:
-    """Two frames of the turning blob, whose colours change by `gloss` with the direction, each in its own way: equal
-    ones would look like cameras of different brightness."""
+    """Two frames of the turning blob; colours change by `gloss` with the direction, differently for each Gaussian:
+    equal changes would look like cameras of different brightness."""
     group = turning(300, frames=2).groups[0]
     shN = gloss * np.random.default_rng(4).choice([-1, 1], (300, 3, 3)).astype(np.float32)
     frames = [dataclasses.replace(g, shN=shN) for g in group.frames]
@@ -259,7 +259,7 @@ def glossy(gloss: float) -> GaussianSequence:
 
 @pytest.mark.parametrize(("gloss", "kept"), [(0.0, 0), (0.3, 3)])
 def test_harmonics_stay_where_colours_depend_on_the_view(gloss, kept):
-    """From keyframe to stream; a whole run, since every stage has to carry them."""
+    """A whole run, from keyframe to stream, since every stage must keep the harmonics."""
     capture = capture_of(glossy(gloss))
     settings = dataclasses.replace(TINY, gop=2, keyframe_steps=500)
     (group,) = train_groups(capture, settings)

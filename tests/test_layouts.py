@@ -1,5 +1,5 @@
-"""One rig written in each layout that has a reader: the same cameras, pictures and points come back, also of a moving
-rig, and known points are where the pictures show them."""
+"""One rig, static or moving, written in each layout that has a reader: cameras, pictures and points read back are the
+same, and known points project to their blobs in the pictures."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_the_same_rig_comes_back(tmp_path, layout):
     numbers = [int(c.name[3:]) for c in capture.cameras]
     assert sorted(numbers) == [0, 2, 10]
     assert capture.frame_count == FRAMES
-    video = name in ("n3dv", "qualisys")  # at twice the size, without alpha
+    video = name in ("n3dv", "qualisys")  # videos: twice the size, no alpha
     scale, apart = (2, 6) if video else (1, 0)
     assert capture.has_alpha != video
     assert capture.indices("test") == TEST.get(name, [])
@@ -56,7 +56,7 @@ def test_known_points_are_where_the_pictures_show_them(tmp_path, layout, monkeyp
 
 
 def centroids(rgb):
-    """[3, 2] middle of what each channel shows, pixels."""
+    """[3, 2] centroid of the blob in each channel, pixels."""
     y, x = np.mgrid[: rgb.shape[0], : rgb.shape[1]] + 0.5
     blobs = np.where(rgb > 30, rgb, 0).astype(float)
     return np.stack([(blobs * v[..., None]).sum((0, 1)) / blobs.sum((0, 1)) for v in (x, y)], 1)

@@ -1,5 +1,5 @@
-"""Lenses of real rigs: known points, drawn through each lens by OpenCV, are where the pinhole cameras of the capture
-see them. Fisheye lenses, several lenses in one model, and D-NeRF's single camera that moves."""
+"""Lenses of real rigs: known points, drawn through each lens by OpenCV, are at their projections by the pinhole
+cameras of the capture. Fisheye lenses, several lenses in one model, and D-NeRF's single moving camera."""
 
 import json
 import struct
@@ -23,7 +23,7 @@ OPENCV = (4, (100.0, 102.0, 82.0, 58.0, -0.2, 0.05, 0.004, -0.003), 4)
 FISHEYE = (5, (60.0, 61.0, 81.0, 59.0, 0.05, -0.02, 0.01, -0.003), 4)
 EQUIDISTANT = (8, (62.0, 80.0, 60.0, 0.03), 1)
 FULL = (6, (105.0, 104.0, 79.0, 60.0, 0.1, -0.05, 0.002, 0.001, 0.01, 0.3, -0.1, 0.02), 8)
-LENSES = [OPENCV, FISHEYE, EQUIDISTANT, FULL]  # COLMAP's number and parameters, how many of them are distortion
+LENSES = [OPENCV, FISHEYE, EQUIDISTANT, FULL]  # COLMAP's model id, parameters, number of distortion parameters
 
 
 def pinhole_of(lens):
@@ -34,7 +34,7 @@ def pinhole_of(lens):
 
 
 def drawn(view, lens):
-    """A picture with a blob in each channel where the lens shows one of DOTS, as OpenCV projects it."""
+    """A picture with a blob in each channel at the projection of one of DOTS by OpenCV."""
     number, params, terms = lens
     K, zero = pinhole_of(lens), np.zeros(3)
     x = (DOTS @ view[:3, :3].T + view[:3, 3])[:, None]
@@ -51,7 +51,7 @@ def drawn(view, lens):
 def assert_dots_are_there(capture):
     for t in range(capture.frame_count):
         for i in range(len(capture.cameras)):
-            camera, rgb = capture.camera(i, t), blend(capture.view(i, t), (0, 0, 0))  # black is cut out
+            camera, rgb = capture.camera(i, t), blend(capture.view(i, t), (0, 0, 0))  # alpha cuts the black background
             assert not camera.fisheye
             assert not camera.distortion.size
             p = (DOTS @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T
@@ -115,7 +115,7 @@ def test_a_fisheye_lens_shows_as_much_as_its_image_has():
     assert ((seen >= -1e-6) & (seen <= [W + 1e-6, H + 1e-6])).all()
     angle = np.degrees(np.arccos(1 / np.linalg.norm(corners / corners[:, 2:], axis=1)))
     assert angle.max() < WIDEST + 1e-6
-    assert angle.max() > WIDEST - 1  # this lens sees more than a plane shows well
+    assert angle.max() > WIDEST - 1  # the lens is wider than the widest pinhole view
 
 
 def test_what_is_no_lens_is_refused(tmp_path):
@@ -144,7 +144,7 @@ def test_d_nerf_has_one_view_a_time_step(tmp_path):
     assert (capture.frame_count, capture.moves, capture.has_alpha) == (5, True, True)
     assert [(c.name, c.split) for c in capture.cameras] == [("test", "test"), ("train", "train")]
     assert [capture.view(1, t).alpha[0, 0] for t in range(5)] == [255, 254, 253, 252, 251]
-    assert [capture.view(0, t).alpha[0, 0] for t in range(5)] == [251, 252, 253, 254, 255]  # ordered by their times
+    assert [capture.view(0, t).alpha[0, 0] for t in range(5)] == [251, 252, 253, 254, 255]  # frames are ordered by time
     assert_dots_are_there(capture)
 
 

@@ -1,4 +1,4 @@
-"""Masks that are made: from a plate and from what moves, against the drawn truth; where they go, what is refused."""
+"""Generated masks, from a plate or from motion, against the drawn ground truth; their files; refused inputs."""
 
 import json
 
@@ -23,7 +23,7 @@ def background(camera):
 
 
 def truth(t):
-    """[H, W] bool: a disc that crosses the picture."""
+    """[H, W] bool: ground truth mask, a disc that crosses the picture."""
     y, x = np.mgrid[:H, :W]
     return (x - 35 - 14 * t) ** 2 + (y - 60) ** 2 < 22**2
 
@@ -53,7 +53,7 @@ def write_scene(root, light=lambda t: 1.0, frames=FRAMES, **options):
 
 def plates(root, name="plate"):
     for k in range(2):
-        write_image(root / name / f"cam{k}.png", (1.1 * background(k)).astype(np.uint8))  # of another exposure
+        write_image(root / name / f"cam{k}.png", (1.1 * background(k)).astype(np.uint8))  # with another exposure
     return root / name
 
 
@@ -84,7 +84,7 @@ def test_what_moves_is_the_subject_and_light_is_not(tmp_path):
 
 @pytest.mark.filterwarnings("ignore:.*nothing is found")
 def test_a_subject_of_the_colours_of_the_background_is_seen_where_other_frames_show_that(tmp_path):
-    write_scene(tmp_path, alike=True, frames=20)  # it leaves the picture after ten
+    write_scene(tmp_path, alike=True, frames=20)  # the disc leaves the picture after ten
     make_masks(open_capture(tmp_path))
     capture = open_capture(tmp_path)
     seen = np.stack([capture.view(0, t).alpha > 127 for t in range(20)])
@@ -94,7 +94,7 @@ def test_a_subject_of_the_colours_of_the_background_is_seen_where_other_frames_s
 
 @pytest.mark.parametrize("layout", sorted(LAYOUTS))
 def test_masks_go_where_the_reader_of_the_layout_looks(tmp_path, layout):
-    """An edited mask is what is trained with."""
+    """Training reads the edited masks."""
     _, write = LAYOUTS[layout]
     write(tmp_path)
     capture = open_capture(tmp_path)

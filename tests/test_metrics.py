@@ -1,4 +1,4 @@
-"""Metrics against values known from their definitions, and the evaluations against a renderer that is a stand-in."""
+"""Metrics against values known from their definitions; evaluations with a stand-in for the renderer."""
 
 import json
 import sys
@@ -31,7 +31,7 @@ from gscodec.model.camera import Camera
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.model.gaussians import Gaussians
 
-# what scripts read (README, bench)
+# keys that scripts read (README, bench)
 KEYS = {"frames", "gaussians", "bytes", "kb_per_frame", "bits_per_gaussian_frame", "psnr", "psnr_fg", "ssim", "vmaf"}
 KEYS |= {"flicker", "per_frame", "codec_psnr", "codec_psnr_fg"}
 
@@ -78,7 +78,7 @@ def test_ssim():
     a = noise()
     assert ssim(a, a) == pytest.approx(1)
     assert ssim(a, 255 - a) < -0.9
-    c1 = (0.01 * 255) ** 2  # of two constants only the luminance term is left
+    c1 = (0.01 * 255) ** 2  # for two constants only the luminance term is left
     assert ssim(grey(100), grey(120)) == pytest.approx((2 * 100 * 120 + c1) / (100**2 + 120**2 + c1), abs=1e-6)
     with pytest.raises(UsageError, match="at least 11x11 pixels, got 40x5"):
         ssim(grey(0, 5), grey(0, 5))
@@ -104,7 +104,7 @@ def test_flicker_looks_at_still_pixels_only():
         image[:, 30:] += np.uint8(4 * (t % 2))
         meter.add(reference, image)
     still_share, expected = 20, np.std([0, 4, 0, 4, 0])
-    own = 1 * np.std([0, 1, 0, 1, 0])  # the column whose reference itself stirs
+    own = 1 * np.std([0, 1, 0, 1, 0])  # the column with a varying reference
     assert meter.flicker == pytest.approx((10 * expected + own) / still_share, rel=1e-5)
 
 
@@ -233,7 +233,7 @@ def gaussians(n=200, level=0.0):
 
 @pytest.fixture
 def stub(monkeypatch):
-    """A renderer that paints the middle half of the image in the level that sh0 of the first Gaussian says."""
+    """A renderer that paints the middle half of the image with sh0 of the first Gaussian as grey level."""
 
     def render_rgba(gaussians, camera):
         out = np.zeros((camera.height, camera.width, 4), np.float32)

@@ -1,4 +1,4 @@
-"""The data model: the attribute table beside the native one, ParametricGroup beside a plain evaluation, rotations."""
+"""The data model: the attribute table against the native one, ParametricGroup against a plain evaluation, rotations."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def unit(q):
 
 
 def hamilton(a, b):
-    """Product of quaternions [..., 4] by the table of i, j, k."""
+    """Product of quaternions [..., 4] by the multiplication table of i, j, k."""
     table = [[(0, 1), (1, 1), (2, 1), (3, 1)], [(1, 1), (0, -1), (3, 1), (2, -1)]]
     table += [[(2, 1), (3, -1), (0, -1), (1, 1)], [(3, 1), (2, 1), (1, -1), (0, -1)]]
     out = np.zeros(np.broadcast_shapes(a.shape, b.shape))
@@ -137,7 +137,7 @@ def test_groups_follow_a_plain_evaluation(options):
 
 
 def test_large_rotations_need_signs():
-    """Else the case above would not test that quaternions are aligned before they are blended."""
+    """Without opposite signs the case above would not test the alignment of quaternions before blending."""
     group = random_group(**GROUPS["large rotations"])
     _, q = rodrigues(group.nodes.rotations)
     near = q[:, group.nodes.neighbors]
@@ -206,8 +206,8 @@ def f32(*arrays):
 
 
 def random_nodes(n, m, k, flipped, seed=0):
-    """Positions at rest [M, 3], rotations [M, 4] near each other up to their signs, positions [M, 3]; and rest [N, 3],
-    neighbors [N, k], weights [N, k]."""
+    """Nodes: rest positions [M, 3], rotations [M, 4] near each other up to signs, positions [M, 3]. Gaussians: rest
+    positions [N, 3], neighbors [N, k], weights [N, k]."""
     rng = np.random.default_rng(seed)
     q = unit([1, 0, 0, 0] + 0.2 * rng.normal(size=(m, 4)))
     if flipped:
@@ -317,7 +317,7 @@ def test_rotation_vectors_are_quaternions():
 
 
 def test_rotation_vectors_near_the_one_before_have_no_jumps():
-    """Five turns and back, about an axis that wanders, both from the quaternion and from its negative."""
+    """Five turns and back about a moving axis, from the quaternion or its negative."""
     t = np.linspace(0, 1, 400)[:, None]
     axis = unit(np.concatenate([np.cos(t), np.sin(t), t], 1))
     want = axis * (0.1 + 10 * np.pi * np.sin(np.pi * t))
@@ -328,7 +328,7 @@ def test_rotation_vectors_near_the_one_before_have_no_jumps():
         got.append(near)
     np.testing.assert_allclose(got, want, atol=1e-6)
     alone = rotations.quat_to_rotvec(quats)
-    assert np.linalg.norm(np.diff(alone, axis=0), axis=1).max() > 5  # which is what `near` is for
+    assert np.linalg.norm(np.diff(alone, axis=0), axis=1).max() > 5  # jumps without `near`
 
 
 def test_normalized_quaternions_have_unit_length():
@@ -372,7 +372,7 @@ def test_rotation_vectors_have_a_gradient_at_zero():
 
 
 def test_harmonics_turn_with_the_nodes():
-    """What a Gaussian shows in a direction is what it shows at rest in the direction turned back; spec 13.4."""
+    """The colour in a direction is the colour at rest in the direction rotated back; spec 13.4."""
     group = random_group()
     turned, directions = replace(group, turned_harmonics=True), unit(np.random.default_rng(1).normal(size=(20, 3)))
     basis = lambda d: sh_basis(torch.from_numpy(d.reshape(-1, 3)), 3).numpy().reshape(*d.shape[:-1], 3)  # noqa: E731

@@ -73,7 +73,7 @@ def centroid(alpha: np.ndarray) -> np.ndarray:
 
 
 def test_parts_of_a_capture_keep_their_poses():
-    """Frames, a scale, other test cameras and every other frame."""
+    """Parts: a range of frames, a scale, other test cameras, every other frame."""
     capture = rig().capture("rig")
     last = capture.frames(2).scaled(0.5)
     np.testing.assert_array_equal(last.camera(1, 1).viewmat, capture.camera(1, 3).viewmat)
@@ -90,7 +90,7 @@ def test_parts_of_a_capture_keep_their_poses():
 
 
 def test_wrong_poses_stay_as_wrong_as_they_are():
-    """What the calibration has wrong about a moving camera is the same in all frames, as in one that stands still."""
+    """The calibration error of a moving camera is the same in all frames, as for a static camera."""
     true, told = (rig(pose_noise=n).capture("rig") for n in ((0, 0), (0.5, 0.01)))
     wrong = [told.camera(1, t).viewmat @ np.linalg.inv(true.camera(1, t).viewmat) for t in range(4)]
     assert np.linalg.norm(wrong[0][:3, 3]) == pytest.approx(0.01)

@@ -1,4 +1,4 @@
-"""The player's page in a real Chromium: its picture, its controls, its decoder against the native one."""
+"""The player's page in a real Chromium: picture, controls, and decoder against the native one."""
 
 import base64
 import json
@@ -48,13 +48,13 @@ def test_reference_cameras(browser, server, gsv):
     want = render_image(stream.frame(2), stream.cameras[1], tuple(stream.config["background"]))
     assert psnr(canvas(browser), want) >= 35
     before = browser.eval(f"Array.from({PLAYER}.camera.view(256, 192))")
-    browser.eval(f"{PLAYER}.camera.orbit(0, 0)")  # a drag goes on from there
+    browser.eval(f"{PLAYER}.camera.orbit(0, 0)")  # a drag starts from this view
     after = browser.eval(f"Array.from({PLAYER}.camera.view(256, 192))")
     np.testing.assert_allclose(np.array(after)[6:18], np.array(before)[6:18], atol=2e-3)
 
 
 def test_a_view_from_where_a_camera_stood_is_never_empty(browser, server, other, tmp_path):
-    """Cameras amid the Gaussians: their pictures, and those of the free view that goes on from there."""
+    """Cameras amid the Gaussians: their pictures, and those of the free view that starts from them."""
     K, magenta = np.array([[90.0, 0, 80], [0, 90, 60], [0, 0, 1]]), (1.0, 0.0, 1.0)
     eyes = ([0.0, 0, 0], [0.3, 0.2, -0.4])
     views = [look_at(np.array(e), np.add(e, [1, 0.1, 0.3]), np.array([0, 1.0, 0])) for e in eyes]
@@ -93,7 +93,7 @@ def test_background_and_controls_of_a_page_that_embeds_it(browser, server):
 def test_it_plays_loops_and_ends(browser, server):
     load(browser, server.url, size="160x120")
     browser.wait(f"{PLAYER}.frame > {LENGTH + 2}")
-    browser.wait(f"{PLAYER}.frame < {LENGTH}")  # around
+    browser.wait(f"{PLAYER}.frame < {LENGTH}")  # loops
     assert not browser.eval(f"{PLAYER}.paused")
     browser.eval(f"{PLAYER}.removeAttribute('loop')")
     browser.wait(f"{PLAYER}.paused")
@@ -159,11 +159,11 @@ def test_fingers_turn_move_and_zoom(browser, server):
         browser.fingers([(150, 300), (200, 310), (260, 320)])
         turned = view()
         assert np.abs(turned[:, :3] - start[:, :3]).max() > 0.1
-        browser.fingers([(150, 300), (100, 300)], [(200, 300), (250, 300)])  # apart
+        browser.fingers([(150, 300), (100, 300)], [(200, 300), (250, 300)])  # fingers move apart
         near = view()
         np.testing.assert_allclose(near[:, :3], turned[:, :3], atol=1e-6)
         assert near[2, 3] < turned[2, 3] / 2
-        browser.fingers([(150, 300), (150, 360)], [(200, 300), (200, 360)])  # both down
+        browser.fingers([(150, 300), (150, 360)], [(200, 300), (200, 360)])  # both fingers move down
         assert view()[1, 3] > near[1, 3] + 0.05
         assert browser.eval("visualViewport.scale") == 1, "the page itself does not zoom"
     finally:
@@ -216,7 +216,7 @@ def test_predicted_groups_and_their_layers(browser, server, other, tmp_path):
         want = render_image(stream.frame(t), camera, tuple(stream.config["background"]))
         assert psnr(canvas(browser), want) >= 35, t
 
-    for t in (4 * LENGTH + 1, LENGTH, 2 * LENGTH + 3):  # the references are behind
+    for t in (4 * LENGTH + 1, LENGTH, 2 * LENGTH + 3):  # references come earlier
         compare(open_stream(path, layers=1), t)
     asked = [tuple(map(int, value[6:].split("-"))) for value in handler.log][1:]
     fetched = set().union(*(range(a, b + 1) for a, b in asked))  # a busy machine may ask for a range twice
@@ -230,7 +230,7 @@ def test_predicted_groups_and_their_layers(browser, server, other, tmp_path):
 
 
 def test_layers_follow_the_device(browser, server):
-    """Fewer when it is too slow for some looks in a row, more again after a while."""
+    """Fewer layers after several slow measurements in a row, more again after a while."""
     browser.goto(server.url + "?src=none.gsv")
     script = """(async () => {
         const { constructor: LayerChoice } = document.querySelector("gsv-player").engine.choice;
@@ -251,7 +251,7 @@ def test_layers_follow_the_device(browser, server):
     assert browser.eval(script) == [3, 2, 1, link, 2, 3, None, 3, 3, 2, device, 1, 1, 2, 2, 3]
 
 
-# The module itself, without the page
+# The wasm module alone, without the page
 
 INSTANCE = """
 const { Native, load } = await import("/native.js");

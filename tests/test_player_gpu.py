@@ -1,4 +1,4 @@
-"""The player's GPU path, drawn by Spark on a WebGL2 in software, beside the CPU renderer; and who draws when."""
+"""The player's GPU path, drawn by Spark with WebGL2 in software, against the CPU renderer; choice of GPU or CPU."""
 
 import time
 
@@ -63,7 +63,7 @@ def test_it_plays_and_goes_back_to_the_cpu(on_gpu, gsv):
 
 
 # A headset whose head is at the origin and looks along -z: two eyes of 200 x 200 pixels, 6 cm apart, side by side on
-# the canvas. `window.eyes` is a copy of what the last frame has drawn, `window.session` the session.
+# the canvas. `window.eyes` is a copy of the last drawn frame, `window.session` the session.
 HEADSET = """
 class Session extends EventTarget {
     renderState = {};
@@ -97,7 +97,7 @@ navigator.xr.requestSession = async () => window.session;
 
 
 def comes_to(picture, want) -> bool:
-    """A session, and the page after it, sort and draw at their own pace."""
+    """Waits for the picture: splats are sorted and drawn asynchronously, in a session and after it."""
     for _ in range(100):
         if psnr(picture(), want) >= 35:
             return True
@@ -147,7 +147,7 @@ def test_augmented_reality_stands_on_the_floor_and_goes_where_one_taps(on_gpu, g
     turn = np.reshape(level[6:18], (3, 4))[:, :3]
 
     def standing(x, z):
-        """Both eyes at the origin of the floor; the room behind the scene is black in a copy of the canvas."""
+        """Picture of both eyes at the origin of the floor; the room behind is black in a copy of the canvas."""
         want = []
         for eye in (-0.03, 0.03):
             moved = flip @ np.array([x - eye, 0, z]) * radius - turn @ np.array(foot)  # a scene becomes 2 m high

@@ -1,7 +1,7 @@
-"""The sound of the page against its pictures, by what is heard: a tone whose frequency tells the time.
+"""Synchronisation of sound and pictures in the page, measured by a tone whose frequency tells the time.
 
-The offset is that between the second of the tone that leaves the loudspeaker while a picture appears, by the clock of
-the AudioContext, and the time of the picture.
+Offset: the time of the tone that leaves the loudspeaker while a picture appears (clock of the AudioContext) minus the
+time of the picture.
 """
 
 import statistics
@@ -15,8 +15,8 @@ from gscodec.player.server import Server
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
-FPS, LENGTH = 100, 50  # of the stream: 2 s in 4 groups, frames of 10 ms
-MOST = 0.04  # seconds between sound and picture
+FPS, LENGTH = 100, 50  # stream: 2 s in 4 groups, frames of 10 ms
+MOST = 0.04  # largest offset, seconds
 PICTURES, TRIES = 9, 4  # a busy machine may be late once
 
 LISTEN = f"""
@@ -58,7 +58,7 @@ window.listen = (player) => {{
 
 @pytest.fixture(scope="module")
 def streams(tmp_path_factory):
-    """A stream with Opus, and one with AAC."""
+    """Paths of a stream with Opus and one with AAC."""
     path, ffmpeg = tmp_path_factory.mktemp("sound"), imageio_ffmpeg.get_ffmpeg_exe()
     write_tone(path / "tone.wav", 3)
     for name in ("tone.opus", "tone.m4a"):
@@ -86,7 +86,7 @@ def page(browsers, streams):
 
 
 def in_sync(browser) -> None:
-    """Sound and pictures, from now on."""
+    """Checks that sound and pictures are synchronous from now on."""
     found = []
     for _ in range(TRIES):
         found.append(statistics.median(browser.eval(f"offsets({PICTURES})")))
@@ -127,7 +127,7 @@ def test_aac(page, streams):
 
 
 def test_the_rest_of_the_file_is_not_needed(page, streams, other):
-    """The file is cut short, with its index, and without."""
+    """The file is truncated, with and without its index."""
     data = streams[0].read_bytes()
     sidx = data.index(b"sidx") - 4
     whole = data[:sidx] + data[data.index(b"moof") - 4 :]

@@ -1,4 +1,4 @@
-"""The player's page and groups of many tiles: shared by workers, and with headers of any length."""
+"""The player's page and groups of many tiles: shared by workers, headers of any length, decoding by view."""
 
 import json
 from dataclasses import replace
@@ -30,7 +30,7 @@ UP = np.array([0, 1.0, 0])
 
 @pytest.fixture(scope="module")
 def tiled(tmp_path_factory) -> Path:
-    """Five groups of two layers in tiles of 256 Gaussians, of which all but the first and the fourth are predicted."""
+    """Five groups of two layers in tiles of 256 Gaussians; all but the first and the fourth group are predicted."""
     folder = tmp_path_factory.mktemp("tiles")
     s, same = sequence(4000), np.arange(4000, dtype=np.int32)
     s = s.with_groups([replace(g, parents=same if k else None) for k, g in enumerate(s.groups)])
@@ -51,7 +51,7 @@ def tiled(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize("workers", [1, 2, 3])
 def test_workers_share_a_group(browser, server, other, tiled, workers):
-    """The picture is that of the whole group, predicted or not, however many workers hold its tiles."""
+    """The picture is that of the whole group, predicted or not, for any number of workers."""
     url, _ = other(tiled.read_bytes())
     load(browser, server.url, src=url, size="160x120", autoplay="off", loop="off", layers="all")
     browser.eval(f"{PLAYER}.engine.shares = {workers}, {PLAYER}.engine.forget()")
@@ -66,7 +66,7 @@ def test_workers_share_a_group(browser, server, other, tiled, workers):
 
 
 def test_a_group_of_thousands_of_tiles(browser, server, other, tmp_path):
-    """The header of a group may be as long as its tiles need; a length that no group has is refused."""
+    """The header of a group may be as long as its tiles need; an impossible length is refused."""
     group = replace(surface_group(300_000), tile_side_log2=SIDE)
     writer = StreamWriter(tmp_path / "a.gsv", stream_config(fps=25, sh_degree=0, gaussians=300_000, frames=1), {})
     writer.append(_native.encode_group(group)[0], 1)
@@ -97,7 +97,7 @@ ALL_THERE = f"""(({{ engine }}) => (engine.scene?.tracks ?? [{{ engine }}]).ever
 
 
 def open_partly(browser, server, url: str) -> None:
-    """Opens a stream of which the page fetches only what is in view, whatever its size."""
+    """Opens a stream so that the page fetches only tiles in view, also of a small file."""
     browser.goto(f"{server.url}?autoplay=off&loop=off&layers=all&size=160x120")
     browser.eval(f"{PLAYER}.engine.constructor.partly = 0")
     browser.eval(f"{PLAYER}.setAttribute('camera', 'first'), {PLAYER}.setAttribute('src', {json.dumps(url)})")
@@ -105,7 +105,8 @@ def open_partly(browser, server, url: str) -> None:
 
 
 def compare(browser, stream, t: int, camera: Camera) -> int:
-    """Compares a picture by `camera` with that of the whole group, once all is there; Gaussians that were decoded."""
+    """Compares a picture by `camera` with that of the whole group, after all tiles in view are decoded; returns the
+    number of decoded Gaussians."""
     k = [camera.K[i] for i in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2))]
     c = {"width": camera.width, "height": camera.height, "near": 0.01, "low_pass": 0.3, "k": k}
     c |= {"viewmat": camera.viewmat[:3].flatten().tolist()}
@@ -120,7 +121,7 @@ def compare(browser, stream, t: int, camera: Camera) -> int:
 
 
 def test_only_the_tiles_in_view_are_decoded(browser, server, other, tiled):
-    """Of predicted and independent groups; what the view turns to is added."""
+    """Predicted and independent groups; when the view turns, the new tiles in view are added."""
     stream, (url, _) = open_stream(tiled), other(tiled.read_bytes())
     open_partly(browser, server, url)
     means = stream.frame(0).means
@@ -134,7 +135,7 @@ def test_only_the_tiles_in_view_are_decoded(browser, server, other, tiled):
 
 
 def test_of_the_tracks_of_a_scene_only_the_tiles_in_view_are_decoded(browser, server, other, tiled, tmp_path):
-    """Each track comes in parts, by the view of where it is placed; the transform moves every piece of it."""
+    """Tiles of each track are chosen by the view of the placed track; its transform moves every piece."""
     key = (0, tuple(rotvec_to_quat(np.array([0, 0.5, 0.3])).tolist()), (3.0, 0.5, 0.0), 0.5)
     placements = Placement("one"), Placement("other", keys=(key, (60, (1.0, 0.0, 0.0, 0.0), (-3.0, 0.0, 1.0), 0.8)))
     stream = open_scene(tiled).tracks[0].stream
@@ -151,7 +152,8 @@ def test_of_the_tracks_of_a_scene_only_the_tiles_in_view_are_decoded(browser, se
 
 
 def test_only_the_tiles_in_view_are_fetched(browser, server, other, tmp_path):
-    """From amid a hollow ball: few bytes for a view, as many more for the opposite one, and none for what is there."""
+    """A camera inside a hollow ball: few bytes for a view, as many more for the opposite view, none for fetched
+    tiles."""
     group = surface_group(80_000)
     small = replace(group.channels["log_scales"], steps=np.full(3, 0.1, np.float32))
     group = replace(group, tile_side_log2=SIDE, channels=group.channels | {"log_scales": small})

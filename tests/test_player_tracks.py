@@ -1,4 +1,4 @@
-"""The page with a scene of several tracks: its picture is that of the renderer, the list hides, damage stays put."""
+"""The page with a scene of several tracks: picture against the renderer, hiding in the list, damage to one track."""
 
 import dataclasses
 
@@ -24,7 +24,8 @@ PATH = [
 
 @pytest.fixture(scope="module")
 def scene(gsv, tmp_path_factory):
-    """The stream of the other tests, and a ball at half its rate that is 0.2 s late, moves and plays without end."""
+    """The stream of the other tests, and a moving ball at half its frame rate that starts 0.2 s late and repeats
+    endlessly."""
     folder = tmp_path_factory.mktemp("scene")
     own = dataclasses.replace(sequence(150, sh_count=3), fps=FPS / 2)
     config = stream_config(fps=FPS / 2, sh_degree=1, gaussians=150, frames=LENGTH)
@@ -52,7 +53,7 @@ def test_the_scene_is_that_of_the_renderer(browser, server, other, scene):
     load(browser, server.url, src=url, size="320x200", autoplay="off")
     assert browser.eval(f"{part('.tracks')}.innerText").split() == ["man", "ball"]
     assert browser.eval(f"{PLAYER}.frameCount") == open_scene(scene).frame_count == 60 + 6
-    for t in (0, 7, 25, 35):  # without the ball, with both, behind the end of the man
+    for t in (0, 7, 25, 35):  # without the ball, with both, after the end of the man
         camera = show(browser, t)
         want = expected(scene, t, camera)
         assert want.std() > 5

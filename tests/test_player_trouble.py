@@ -1,4 +1,4 @@
-"""The player with files and servers that are not as they should be, and with servers of others."""
+"""The player with damaged files, faulty servers, and servers of other origins."""
 
 import http.server
 import time
@@ -39,7 +39,7 @@ def test_a_file_from_another_server(browser, server, gsv, other):
 
 
 def test_the_element_on_another_page(browser, gsv, other, tmp_path):
-    """Page, player and file on three origins; the element is taken out and put back."""
+    """Page, player and file on three origins; the element is removed and inserted again."""
     make = lambda *a, **k: Static(*a, directory=str(PAGE), **k)  # noqa: E731
     host = serving(http.server.ThreadingHTTPServer(("127.0.0.1", 0), make))
     file, _ = other(gsv.read_bytes())
@@ -58,8 +58,8 @@ def test_the_element_on_another_page(browser, gsv, other, tmp_path):
 
 @pytest.mark.parametrize(("rate", "told", "quality"), [(20_000, 1, 1), (None, 0.05, 2)])
 def test_the_representation_follows_the_rate_of_the_link(browser, server, gsv, other, rate, told, quality):
-    """Two qualities of one capture; `rate` in bytes a second, None: unlimited. The manifest tells `told` of the true
-    bandwidths: a link without a limit is more than enough on a busy machine, too."""
+    """Two qualities of one capture; `rate` in bytes a second, None: unlimited. The manifest gives the bandwidths times
+    `told`: an unlimited link suffices also on a busy machine."""
     s = sequence()
     small = gsv.with_name("small.gsv")
     if not small.exists():
@@ -92,7 +92,7 @@ def test_layers_are_left_out_where_the_link_is_slow(browser, server, other, tmp_
     browser.wait(f"{PLAYER}.paused")
     assert browser.eval(f"{PLAYER}.frame") == GROUPS * LENGTH - 1
     asked = [tuple(map(int, value[6:].split("-"))) for value in handler.log]
-    asked = set().union(*(range(a, b + 1) for a, b in asked))  # some are asked for twice: the first request is a guess
+    asked = set().union(*(range(a, b + 1) for a, b in asked))  # some bytes twice: the first request is a guess
     assert len(asked) < 0.8 * path.stat().st_size
     group = open_stream(path).groups[-1]
     assert group["offset"] + group["size"] - 1 not in asked, "the last layer of the last group was left where it is"
@@ -105,7 +105,7 @@ def test_a_manifest_of_nothing(browser, server, other):
 
 
 def test_a_seek_fetches_what_it_needs(browser, server, other, tmp_path):
-    """A file whose groups are larger than the first request: the one that is looked at, and no other but the next."""
+    """Groups are larger than the first request: a seek fetches the shown group and, of the others, only the next."""
     s = sequence(8000)
     path = tmp_path / "large.gsv"
     config = stream_config(fps=1, sh_degree=0, gaussians=8000, frames=LENGTH)
@@ -202,7 +202,7 @@ def test_a_truncated_file(browser, server, gsv, other, indexed):
 
 
 def test_a_growing_file(browser, tmp_path, gsv):
-    """Bytes as an encoder adds them, without index and cut anywhere."""
+    """A file that grows as by an encoder, without index and cut anywhere."""
     data = gsv.read_bytes()
     at = data.index(b"sidx") - 4
     data = data[:at] + data[at + int.from_bytes(data[at : at + 4], "big") :]

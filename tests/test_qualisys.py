@@ -46,7 +46,7 @@ def test_qualisys_units_and_axes(qualisys):
     assert (capture.fps, capture.frame_count, capture.has_alpha) == (50, 60, False)
     assert camera.K.tolist() == [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
     np.testing.assert_allclose(camera.center, (1, 0, 0))
-    x, y, z, _ = camera.viewmat @ (1, 2, -10, 1)  # y up and z back in the calibration
+    x, y, z, _ = camera.viewmat @ (1, 2, -10, 1)  # calibration axes: y up, z backwards
     assert (x, y, z) == (0, -2, 10)
 
 

@@ -32,7 +32,7 @@ def recorded(value, read):
 
 
 def test_every_field_of_the_integers_is_coded():
-    """The native mirror of QuantizedGroup leaves no field out, on the way in or on the way back."""
+    """The native mirror of QuantizedGroup includes every field, in both directions."""
     first = layered_group()
     known = _native.DecodedGroup(_native.encode_group(first)[0], 1)
     group, read = predicted_group(first), set()
@@ -67,7 +67,7 @@ def test_reconstruction_of_a_predicted_group_is_what_decoding_gives():
 
 
 def assert_reconstructs(decoded, made):
-    """Bit by bit, in all frames."""
+    """Compares all frames bit by bit."""
     assert_same(decoded.quantized(), made.quantized())
     for t in range(decoded.frames):
         frame, want = made.frame(t), decoded.frame(t)

@@ -1,4 +1,4 @@
-"""The CPU backend against its references: plain torch, its own scalar instance, finite differences, poison."""
+"""The CPU backend against its references (plain torch, its scalar instance, finite differences), and with poison."""
 
 from dataclasses import replace
 
@@ -59,7 +59,7 @@ def reference_gradients(params, cam):
 
 
 def backend_gradients(backend, params, cam):
-    """The same of a backend, with its own image and alpha."""
+    """`reference_gradients` by a backend, with its own image and alpha."""
     gi, ga = weights(cam)
     named = {n: p.detach().float() for n, p in zip(PARAMETERS, params, strict=True)}
     image, alpha = backend.render(named, cam, BACKGROUND)
@@ -80,7 +80,7 @@ def test_picture_and_gradients_match_the_torch_reference(simd, k):
 
 
 def test_gaussians_beyond_the_field_of_view_match_the_reference():
-    # Wide ones whose centres are past the clamp of the Jacobian, and some nearer than the near plane.
+    # Wide Gaussians with centres beyond the clamp of the Jacobian, some nearer than the near plane.
     cam, exact = camera(), scene(n=60, k=3, log_scale=-0.8)
     with torch.no_grad():
         exact[0][:, :2].mul_(6)
@@ -124,7 +124,7 @@ def dense(n=3000, seed=5, k=3) -> Gaussians:
 
 @pytest.mark.parametrize("simd", simd_levels())
 def test_every_level_draws_what_scalar_draws(simd):
-    cam = camera(203, 150)  # no multiple of the tile
+    cam = camera(203, 150)  # not a multiple of the tile size
     for seed in range(3):
         g = dense(seed=seed)
         want = render_rgba(g, cam, workspace=Workspace(simd="scalar"))
@@ -173,7 +173,7 @@ def test_poison_is_skipped_or_harmless(simd, values):
     assert alpha.min() >= 0
     assert alpha.max() <= 1
     backend.photometric_loss(params, [TargetView(cam, target, None, BACKGROUND)])
-    if not np.isfinite(values).all():  # such Gaussians are dropped whole
+    if not np.isfinite(values).all():  # non-finite Gaussians are dropped whole
         bad = ~np.all([np.isfinite(p.reshape(len(p), -1)).all(1) for p in params.values()], axis=0)
         want, _ = backend.render({n: p[~bad] for n, p in params.items()}, cam, BACKGROUND)
         np.testing.assert_array_equal(image, want)
@@ -258,7 +258,7 @@ def test_8_bit_image_is_the_float_image_rounded():
 
 
 def test_turned_harmonics_are_seen_as_if_their_coefficients_were_turned():
-    """Picture and gradients; those of the coefficients as they were before they were turned."""
+    """Picture and gradients; gradients are by the coefficients before the rotation."""
     cam, params = camera(), {n: p.detach().float().numpy() for n, p in zip(PARAMETERS, scene(), strict=True)}
     turns = np.random.default_rng(0).normal(size=(len(params["means"]), 4)).astype(np.float32)
     turns /= np.linalg.norm(turns, axis=1, keepdims=True)

@@ -20,7 +20,7 @@ def result(name):
 
 
 def rows(heading):
-    """Cells of the table whose first cell starts with `heading`, without its head."""
+    """Cells of the table whose first cell starts with `heading`, without the header rows."""
     lines = README.split("\n")
     first = next(i for i, line in enumerate(lines) if line.startswith(f"| {heading}"))
     table = []
@@ -32,7 +32,7 @@ def rows(heading):
 
 
 def agrees(cell, value):
-    """Whether `value`, rounded as `cell` is, is what it says."""
+    """Whether `value`, rounded to the digits of `cell`, equals it."""
     return cell == "-" if value is None else float(cell) == pytest.approx(value, abs=0.51 * 10 ** -decimals(cell))
 
 

@@ -1,4 +1,4 @@
-"""Refinement: the picture comes nearer to the source for about the same bytes."""
+"""Refinement: pictures come nearer to the source at about the same bytes."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ from gscodec.train.refinement import PictureRefinement
 
 
 def small_cameras(frames):
-    """Training cameras around the frames, of 64 x 64 pixels."""
+    """Training cameras of 64 x 64 pixels around the frames."""
     small = {"width": 64, "height": 64, "split": "train"}
     return [replace(c, K=c.K / 8 + np.diag([0, 0, 7 / 8]), **small) for c in codec_cameras(frames)]
 
@@ -46,7 +46,7 @@ def test_a_refined_frame_is_nearer():
 
 
 def test_what_no_view_shows_does_not_move():
-    """Squares of such derivatives are 0 in single precision, where Adam would divide by nothing."""
+    """Squares of tiny derivatives are 0 in single precision: Adam would divide by 0."""
     zero, settings = np.zeros((1, 1)), RoundingSettings()
     latents = Latents(np.full((1, 1), 0.4), zero, (zero, zero), settings)
     adam = Adam(CpuBackend(), settings.adam)
@@ -66,7 +66,7 @@ def test_positions_and_order_stay():
 
 @pytest.mark.parametrize("curves_from", [1000, 10_000])
 def test_refined_groups_are_nearer(curves_from):
-    """An independent group and one predicted from it, in which colours change and some Gaussians are not shown."""
+    """An independent group and one predicted from it; colours change and some Gaussians are not shown."""
     groups, still, life = [], blob(1500), np.tile(np.array([0, 5], np.int32), (1500, 1))
     life[:300, 1] = 3
     for start in (0, 5):
@@ -95,7 +95,7 @@ def test_refined_groups_are_nearer(curves_from):
 
 
 def pictures_of(truth, cameras, gains):
-    """A capture of `truth`, frame by frame, by cameras that show it brighter by `gains`."""
+    """A capture of `truth`, frame by frame, by cameras with the given gains."""
 
     def read(i, t):
         image, alpha = Workspace().forward(arrays_of(truth[t]), cameras[i], (0, 0, 0))
@@ -108,7 +108,7 @@ def pictures_of(truth, cameras, gains):
 @pytest.mark.parametrize(("attribute", "gain"), [("sh0", 0.5), ("log_scales", 0.3)])
 @pytest.mark.parametrize("frames", [1, 4])
 def test_a_trained_group_comes_nearer_to_its_pictures(frames, attribute, gain):
-    """What training has left wrong, too, here colours or sizes; each picture in the brightness of its camera."""
+    """Refinement also lowers errors of training, here in colours or sizes; each picture has its camera's brightness."""
     truth = [moved(blob(600), [0, 0.05 * t, 0], [0, 0, 0]) for t in range(frames)]
     cameras = small_cameras(truth)
     gains = np.geomspace(0.7, 1 / 0.7, len(cameras), dtype=np.float32)[:, None].repeat(3, 1)
@@ -148,7 +148,7 @@ def test_rotations_fit_the_sizes_after_few_pictures(views):
 
 
 def test_a_cleaner_capture_gets_a_finer_quality():
-    """Without a quality, coding costs the decibels that the settings allow, against the pictures of the capture."""
+    """Without a given quality, coding loses the dB that the settings allow, measured on the pictures of the capture."""
     truth = [blob(400)]
     cameras = small_cameras(truth)
     calibration, chosen = Calibration.plain(16, 1), []
@@ -184,7 +184,7 @@ def test_masks_that_are_wrong_do_not_lower_the_quality():
 
 
 def test_what_refinement_has_chosen_is_not_undone_by_a_predicted_group():
-    """What has not changed costs nothing, but for places, which trajectories set right where that shows."""
+    """Unchanged attributes cost no bits, except positions: trajectories correct them where the error is visible."""
     truth = [blob(400, sh_count=3)]
     cameras = small_cameras(truth)
     calibration = Calibration.plain(16, 1)
@@ -204,7 +204,7 @@ def test_what_refinement_has_chosen_is_not_undone_by_a_predicted_group():
 
 
 def test_a_group_whose_harmonics_turn_comes_nearer_to_its_pictures():
-    """The quantizer shows what a decoder does, and moves harmonics where they are coded: at rest."""
+    """The quantizer renders the same as a decoder, and moves harmonics in their coded form: at rest."""
     still, wrong = blob(400, sh_count=8), np.random.default_rng(1).normal(0, 0.2, (400, 8, 3)).astype(np.float32)
     group = next(fit_groups([DenseGroup([moved(still, [0, 0.5 * t, 0], [0, 0, 0]) for t in range(4)])]))
     truth = replace(group, canonical=replace(group.canonical, shN=still.shN), trajectories={}, turned_harmonics=True)

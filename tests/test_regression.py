@@ -1,7 +1,7 @@
-"""Size against quality, kept from slipping: each figure that was reached is recorded, with a tolerance.
+"""Size against quality must not regress: each figure is recorded, with a tolerance.
 
-Two small trained groups are coded in several ways (trained.py); the bundled capture is encoded as users do. A figure of
-the codec that is better than its tolerance fails, too: record it anew (make_trained.py), or the gain may be lost again.
+Two small trained groups are coded in several ways (trained.py); the bundled capture is encoded as users do. A codec
+figure that improves beyond its tolerance also fails: record it again (make_trained.py), or the gain may be lost later.
 """
 
 import json
@@ -14,11 +14,11 @@ from trained import CASES, DATA, EXAMPLE, TOLERANCES, load_groups, measure
 from gscodec.decode import open_stream
 
 RECORDED = json.loads((DATA / "recorded.json").read_text())
-# A run on another machine differs from those recorded as one with another seed does: it is one more draw, which lies
-# with 99 % within STUDENT * deviation * sqrt(1 + 1 / seeds) of the mean (Student's t, 19 degrees of freedom).
-# Bytes lie farther apart than decibels, since each run chooses its own quality, within a tolerance.
+# A run on another machine differs from the recorded runs as a run with another seed does: it is one more sample, which
+# lies with 99 % within STUDENT * deviation * sqrt(1 + 1 / seeds) of the mean (Student's t, 19 degrees of freedom).
+# Bytes vary more than decibels, since each run chooses its own quality, within a tolerance.
 SEEDS, STUDENT = 20, 2.86
-LEAST = {"kb_per_frame": 0.02, "ssim": 0.001, "vmaf": 0.5, "flicker": 0.02, "haze": 0.02}  # of an interval; dB: 0.05
+LEAST = {"kb_per_frame": 0.02, "ssim": 0.001, "vmaf": 0.5, "flicker": 0.02, "haze": 0.02}  # least interval; dB: 0.05
 
 
 def test_the_groups_are_what_training_makes():
@@ -35,7 +35,7 @@ def test_the_groups_are_what_training_makes():
 
 @pytest.mark.parametrize("name", CASES)
 def test_codec_alone(name, tmp_path):
-    """Tight: the coder is deterministic, the renderer nearly so."""
+    """Tight tolerances: the coder is deterministic, the renderer nearly so."""
     found, recorded = measure(CASES[name], tmp_path / "a.gsv"), RECORDED["codec"][name]
     assert set(found) == set(recorded)
     for key, value in recorded.items():
@@ -56,7 +56,7 @@ def test_the_cases_are_what_their_names_say(tmp_path):
 
 
 def test_bundled_capture_from_end_to_end(tmp_path):
-    """As good as over seeds; see above."""
+    """Each figure lies within the 99 % interval over seeds; see SEEDS."""
     recorded = RECORDED["capture"]
     assert recorded["seeds"] == SEEDS
     done = run("encode", EXAMPLE, tmp_path / "a.gsv", "--preset", "fast", "--frames", "0:8")

@@ -1,4 +1,4 @@
-"""Runs that are stopped at any moment: what is there plays, and what comes out in the end is what would have come."""
+"""Runs stopped at any moment: the partial file plays, and the resumed run gives the result of an undisturbed run."""
 
 import shutil
 import signal
@@ -27,7 +27,7 @@ MOMENTS = [
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
-    """The capture's folder, with the stream and the .ply folder of undisturbed runs."""
+    """Folder of the capture, with the stream and the .ply folder of undisturbed runs."""
     folder = tmp_path_factory.mktemp("walking")
     write_capture(folder)
     assert gscodec("encode", folder, folder / "whole.gsv", *ENCODE) == 0
@@ -41,7 +41,7 @@ def same(folder, stream):
 
 
 def test_groups_are_predicted(capture):
-    """What the other tests here are worth: there is state to be kept from group to group."""
+    """Precondition of the other tests here: a run keeps state from group to group."""
     assert [g["sync"] for g in open_stream(capture / "whole.gsv").groups][:3] == [True, False, False]
 
 
@@ -117,7 +117,7 @@ def test_train_goes_on(capture, tmp_path):
 
 
 def test_train_and_then_encode_is_encode(tmp_path):
-    """On the bundled capture, to the byte; and where the capture is gone, a sentence says what that costs."""
+    """On the bundled capture, with equal bytes; without the capture, the streams differ."""
     example = tmp_path / "lumberjack"
     shutil.copytree(Path(__file__).parent.parent / "examples" / "lumberjack", example)
     options = ("--preset", "fast", "--gop", "2", "--frames", "0:3")

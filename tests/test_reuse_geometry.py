@@ -1,4 +1,4 @@
-"""Colours anew over the geometry of a stream: bytes of geometry and motion stay, and what does not fit is said."""
+"""New colours over the geometry of a stream: bytes of geometry and motion stay, inputs that do not fit are named."""
 
 import dataclasses
 import subprocess
@@ -31,7 +31,7 @@ def run(*arguments):
 
 
 def small(grade=None):
-    """The bundled capture at a quarter of its size, in other colours."""
+    """The bundled capture at a quarter of its size, with its colours multiplied by the matrix `grade`."""
     plain = capture().scaled(0.25)
 
     def read(i, t):
@@ -58,7 +58,7 @@ def old(request, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def plys(old, tmp_path_factory):
-    """Its frames in other colours."""
+    """Folder with the frames of the stream in other colours."""
     folder = tmp_path_factory.mktemp("plys")
     write_sequence(open_stream(old).sequence(), folder)
     for path in folder.glob("*.ply"):
@@ -72,7 +72,7 @@ def graded(g):
 
 
 def geometry(path) -> list[dict]:
-    """Of each group the bytes of every unit and stream that holds no colours."""
+    """For each group: the bytes of every unit and stream without colours."""
     stream, found = open_stream(path), []
     for i in range(len(stream.groups)):
         payload, own = stream.payload(i), {}
@@ -110,7 +110,7 @@ def test_recoloured_splats_share_the_bytes_of_geometry(old, plys, tmp_path):
 
 
 class Stopped(Bar):
-    """Ctrl-C when the first group is done."""
+    """A progress bar that raises Ctrl-C after the first group."""
 
     def update(self, stage, done, total):
         raise KeyboardInterrupt
@@ -133,7 +133,7 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(old, plys, tmp_path):
 
 
 def test_a_capture_in_other_light_gives_its_colours(old, tmp_path):
-    """The colours come from its pictures, and are much nearer to them than those of the stream."""
+    """The new colours come from the pictures, and are much nearer to them than those of the stream."""
     folder, new = tmp_path / "capture", tmp_path / "new.gsv"
     folder.mkdir()
     light = small(GRADE)

@@ -1,4 +1,4 @@
-"""Rigs: files, skin weights, prediction, and streams that have one: smaller, exact, posed anew."""
+"""Rigs: files, skin weights, prediction, and streams with a rig: smaller, exact, posed anew."""
 
 import subprocess
 import sys
@@ -36,7 +36,7 @@ LEVEL, FRAMES, GOP = 1, 12, 6
 
 
 def run(*args):
-    """`gscodec ARGS`, as its own process."""
+    """Runs `gscodec ARGS` in its own process."""
     code = "import sys; from gscodec.cli import main; main()"
     return subprocess.run([sys.executable, "-c", code, *map(str, args)], capture_output=True, text=True)
 
@@ -47,7 +47,7 @@ def walker():
 
 
 def encode(walker, path, rig, quality=45.0):
-    """The figure as a stream; returns its bytes."""
+    """Encodes the figure as a stream; returns its bytes."""
     config = stream_config(fps=8, sh_degree=0, gaussians=900, frames=GOP)
     settings = EncodeSettings(quality, refine=0, random_access=FRAMES)
 
@@ -58,14 +58,14 @@ def encode(walker, path, rig, quality=45.0):
 
 
 def error(stream, walker):
-    """Mean distance of the Gaussians that are coded from the nearest ones that were given."""
+    """Mean distance of each coded Gaussian to the nearest input Gaussian."""
     near = [cKDTree(walker.sequence.frame(t).means).query(stream.frame(t).means)[0] for t in range(FRAMES)]
     return np.concatenate(near).mean()
 
 
 @pytest.fixture(scope="module")
 def streams(walker, tmp_path_factory):
-    """Folder with the figure as splats, its rig, and the streams with it and without."""
+    """Folder with the figure as splats, its rig, and the streams with and without the rig."""
     folder = tmp_path_factory.mktemp("rig")
     write_sequence(walker.sequence, folder / "plys")
     write_rig(walker.rig, folder / "rig.npz")
@@ -76,7 +76,7 @@ def streams(walker, tmp_path_factory):
 
 
 def motion_bytes(path):
-    """Of all units that tell how the nodes move."""
+    """Bytes of all units of node motion."""
     stream = open_stream(path)
     units = [u for i in range(len(stream.groups)) for u in _native.units(stream.payload(i))]
     return sum(u["bytes"] for u in units if u["type"] in ("node_trajectories", "rig", "joint_poses"))
@@ -229,7 +229,7 @@ def test_the_command_encodes_and_poses_anew(streams, walker, tmp_path):
 
 
 def _gap(stream, given, t):
-    """Distance that hardly any given Gaussian is away from one that is shown."""
+    """99th percentile of the distance from a given Gaussian to the nearest one of the stream."""
     return np.quantile(cKDTree(stream.frame(t).means).query(given.sequence.frame(t).means)[0], 0.99)
 
 
@@ -319,7 +319,7 @@ TINY = replace(training.TINY, motion_steps=40, gaussians_max=700, initial_points
 
 @pytest.fixture(scope="module")
 def trained():
-    """The groups of a fast walk, without its rig and with it, and the figure."""
+    """Trained groups of a fast walk, without and with its rig, the figure, and its capture."""
     walker = figure(1500, 5, 5, fps=6.0)
     capture = capture_of(walker)
     return [list(train_groups(capture, TINY, rig=rig)) for rig in (None, walker.rig)], walker, capture

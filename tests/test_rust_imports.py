@@ -1,6 +1,6 @@
-"""The modules of each Rust crate depend on each other in one direction: none reaches itself through `use` or paths.
+"""The modules of each Rust crate depend on each other in one direction: no cycle through `use` or paths.
 
-Source text -> graph of modules -> a cycle, if there is one. Test code is left out: it may use everything.
+Source text -> graph of modules -> a cycle or None. Test code is left out: it may use everything.
 """
 
 import re
@@ -30,7 +30,7 @@ def source_without_tests(text):
 
 
 def expand_tree(text, start):
-    """The paths of a use tree or an inline path from `start` on, as lists of names: `a::{b, c::d}` -> a b, a c d."""
+    """Paths of a use tree or an inline path from `start` on, as lists of names: `a::{b, c::d}` -> a b, a c d."""
     name = re.compile(r"\s*([A-Za-z_]\w*|\*)").match(text, start)
     if name:
         if text.startswith("::", name.end()):

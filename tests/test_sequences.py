@@ -1,4 +1,4 @@
-"""Sequences of splats: what is tracked is found out, what is stored comes back, what is damaged is named."""
+"""Sequences of splats: tracked frames are recognised, stored sequences read back the same, damage is named."""
 
 import json
 import threading
@@ -21,7 +21,7 @@ FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
 
 def moved(g, t):
-    """Turned about z by 0.02 rad a frame, as a body moves."""
+    """Rigid motion: turned about z by 0.02 rad a frame."""
     c, s = np.cos(0.02 * t), np.sin(0.02 * t)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     return Gaussians(g.means @ turn.T, *(getattr(g, f) for f in FIELDS[1:]))
@@ -54,7 +54,7 @@ def test_shuffled_folder_is_matched(tmp_path):
 
 
 def test_locally_swapped_indices_are_not_called_tracked():
-    """Each frame sorted along a curve: index i stays near, but a third of the Gaussians swap with neighbours."""
+    """Like frames sorted along a curve: index i stays near, but a third of the Gaussians swap with neighbours."""
     a = gaussians(2000).means
     b = a + np.float32(0.001)
     swap = np.arange(2000)
@@ -88,7 +88,7 @@ def test_a_cut_starts_a_group(tmp_path):
 def test_match_leaves_the_rest_to_an_assignment():
     a = np.random.default_rng(0).uniform(size=(300, 3))
     b = a.copy()
-    b[7], b[9] = a[9] + 0.3, a[9] + 0.4  # neither is anybody's nearest
+    b[7], b[9] = a[9] + 0.3, a[9] + 0.4  # no point has either as its nearest
     order = match(a, b)
     assert sorted(order) == list(range(300))
     assert match(a, b + 5) is None
@@ -113,7 +113,7 @@ def stored_sequence():
 
 
 def parametric_group():
-    """Everything that a trained group has."""
+    """A group with all parts of a trained group."""
     random = np.random.default_rng(0)
 
     def values(*shape):

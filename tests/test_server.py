@@ -1,4 +1,4 @@
-"""The server of `gscodec play` and its ranges; the files that `make player` builds."""
+"""The server of `gscodec play` and its byte ranges; the files that `make player` builds."""
 
 import contextlib
 import gzip
@@ -116,7 +116,7 @@ def test_only_the_stream_and_the_page(server):
     for path in outside:
         assert ask(server, path)[0] == 404, path
     assert ask(server, "/", method="POST")[0] == 501
-    modules = {f.name for f in player_build().page_modules()}  # which are in page.js
+    modules = {f.name for f in player_build().page_modules()}  # modules bundled in page.js
     assert {f.name for f in PAGE.iterdir() if f.suffix in (".html", ".js", ".css", ".gz")} == set(FILES) | modules
     for name in modules - set(FILES):
         assert ask(server, f"/{name}")[0] == 404, name
@@ -171,7 +171,7 @@ def test_a_viewer_that_leaves_does_no_harm(server, gsv):
 
 @contextlib.contextmanager
 def started(command):
-    """A process that takes Ctrl-C also where the tests run in the background, and that never outlives them."""
+    """A process that takes Ctrl-C also if the tests run in the background, and always ends with them."""
     listen = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731
     p = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=listen)
     try:
@@ -231,7 +231,7 @@ def test_an_exported_folder_is_for_any_static_host(tmp_path, gsv):
 
 
 def player_build():
-    """The module player/build.py, which the package does not have."""
+    """The module player/build.py, which is not in the package."""
     spec = importlib.util.spec_from_file_location("build", ROOT / "player" / "build.py")
     build = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(build)
@@ -246,10 +246,10 @@ def test_the_built_files_are_those_of_the_sources():
 
 
 def test_the_player_is_small():
-    files = [(PAGE / name).read_bytes() for name in FILES if name != "spark.js"]  # which only the GPU path loads
+    files = [(PAGE / name).read_bytes() for name in FILES if name != "spark.js"]  # spark.js: GPU path only
     plain = [gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data for data in files]
     assert sum(map(len, plain)) <= 500_000
-    assert sum(len(gzip.compress(data)) for data in plain) <= 200_000  # as they are sent
+    assert sum(len(gzip.compress(data)) for data in plain) <= 200_000  # bytes sent
 
 
 def test_nothing_of_the_builders_machine_is_in_the_module():

@@ -1,4 +1,4 @@
-"""Moving scenes: Spacetime Gaussians from and to streams, by the library and by the command line."""
+"""Moving scenes: Spacetime Gaussians from and to streams, by the library and the command line."""
 
 import json
 from pathlib import Path
@@ -22,12 +22,12 @@ from gscodec.splats.spacetime import SpacetimeGaussians, spacetime_groups
 from gscodec.splats.spacetime_fit import fit_spacetime
 from gscodec.splats.splatv import ROW, read_splatv, splatv_header, write_splatv
 
-GOLDEN = Path(__file__).parent / "data" / "splats" / "spacetime.splatv"  # test_splat_formats.py says whose
+GOLDEN = Path(__file__).parent / "data" / "splats" / "spacetime.splatv"  # made by: see test_splat_formats.py
 FRAMES = 12
 
 
 def scene(n=80, seed=3):
-    """Gaussians of which half stay and half come and go."""
+    """Gaussians; half of them stay, half appear and disappear."""
     r, g = np.random.default_rng(seed), blob(n)
     centers, widths = r.uniform(0.1, 0.9, n), np.where(np.arange(n) % 2, r.uniform(0.1, 0.4, n), np.inf)
     motion, turn = 0.3 * r.standard_normal((3, n, 3)), 0.5 * r.standard_normal((n, 4))
@@ -40,7 +40,7 @@ def sequence(frames=FRAMES, gop=FRAMES):
 
 
 def same_frames(a, b, t, limit):
-    """Both show the same Gaussians in the same order, with opacities, positions and rotations within `limit`."""
+    """Checks for the same Gaussians in the same order, with opacities, positions and rotations within `limit`."""
     assert len(a) == len(b), t
     np.testing.assert_allclose(a.means, b.means, atol=limit)
     alpha = lambda g: 1 / (1 + np.exp(-g.logit_opacities))  # noqa: E731
@@ -53,7 +53,7 @@ def test_a_splatv_comes_back(tmp_path):
     write_splatv(tmp_path / "a.splatv", given, FRAMES, 10.0)
     back = open_sequence(tmp_path / "a.splatv")
     assert (back.fps, back.frame_count) == (10.0, FRAMES)
-    assert len(read_splatv(tmp_path / "a.splatv")) == 80  # what fills the texture is left out
+    assert len(read_splatv(tmp_path / "a.splatv")) == 80  # padding of the texture is left out
     for t in (0, 5, 11):
         same_frames(back.frame(t), given.at(t / FRAMES).take(given.shown(t / FRAMES)), t, 0.01)
 
@@ -65,7 +65,7 @@ def test_a_splatv_is_what_others_write(tmp_path):
     drawn = theirs[theirs["quats"].any(1)]
     for name in ROW.names:
         np.testing.assert_array_equal(ours[: len(drawn)][name], drawn[name], name)
-    assert not ours[len(drawn) :]["quats"].any()  # what fills the line of the texture is not drawn
+    assert not ours[len(drawn) :]["quats"].any()  # padding of the texture row is not drawn
 
 
 def test_the_fit_finds_the_scene():
@@ -126,7 +126,7 @@ def test_identities_follow_predicted_groups(tmp_path):
 def test_gaussians_between_three_frames_are_measured():
     g = blob(100)
     life = np.tile(np.array([0, 30], np.int32), (100, 1))
-    life[:10] = [3, 9]  # neither in the first nor in the middle nor in the last frame
+    life[:10] = [3, 9]  # not in the first, the middle or the last frame
     group = ParametricGroup(30, g, lifetimes=life)
     found = measure_group(group, [], PlanSettings())
     whole = measure_group(ParametricGroup(30, g), [], PlanSettings())

@@ -1,6 +1,6 @@
-"""Splats of other tools, read from bytes that those tools wrote, and written for them.
+"""Splat formats of other tools: files written by those tools are read, and files are written for them.
 
-tests/data/splats was made from source.ply and spacetime.ply: niantic_v*.spz by Niantic's C++ library (21715c3),
+tests/data/splats, made from source.ply and spacetime.ply: niantic_v*.spz by Niantic's C++ library (21715c3),
 splat_transform.* by @playcanvas/splat-transform 2.7.1, antimatter15.splat by antimatter15/splat's convert.py,
 spacetime.splatv by macaburguera/splaTV's ply_to_splatv.py, videogs_*.zip by VideoGS' scripts in compress/.
 """
@@ -50,7 +50,7 @@ def test_spz_of_others(source, name):
 def test_spz_is_what_niantic_writes(source, tmp_path):
     write_splat(tmp_path / "a.spz", source)
     ours, theirs = (gzip.decompress(p.read_bytes()) for p in (tmp_path / "a.spz", GOLDEN / "niantic_v3.spz"))
-    assert ours[: 16 + 20 * 5] == theirs[: 16 + 20 * 5]  # all but harmonics, of which they write fewer bits
+    assert ours[: 16 + 20 * 5] == theirs[: 16 + 20 * 5]  # all but harmonics: Niantic writes fewer bits
     assert len(ours) == len(theirs)
     assert_close(read_splat(tmp_path / "a.spz"), source, angle=3e-3, shN=0.004, **SPZ_LIMITS)
 
@@ -131,7 +131,7 @@ def test_spz_in_other_axes_is_refused(tmp_path):
 
 def test_splat_of_others(source):
     g = read_splat(GOLDEN / "antimatter15.splat")
-    order = np.linalg.norm(source.means[:, None] - g.means, axis=2).argmin(1)  # theirs are sorted by size
+    order = np.linalg.norm(source.means[:, None] - g.means, axis=2).argmin(1)  # antimatter15/splat sorts by size
     plain = Gaussians(*(getattr(source, n) for n in ("means", *REST[:4])), np.zeros((5, 0, 3)))
     assert_close(g.take(order), plain, angle=0.03, opacity=0.05, sh0=0.014)
     assert splat_size(GOLDEN / "antimatter15.splat") == (5, 0)
@@ -153,7 +153,7 @@ def test_bad_splat(tmp_path):
 
 
 def read_glb(path):
-    """Document and semantic -> [N, C], by the letter of glTF 2.0."""
+    """JSON document, and attribute semantic -> [N, C], read exactly as glTF 2.0 specifies."""
     data = path.read_bytes()
     magic, version, size, length, kind = struct.unpack_from("<4sIII4s", data)
     assert (magic, version, size, kind) == (b"glTF", 2, len(data), b"JSON")
@@ -182,7 +182,7 @@ def test_glb_beside_that_of_others(source, tmp_path):
     assert ours["extensionsUsed"] == ["KHR_gaussian_splatting"]
     accessor = ours["accessors"][0]
     assert (accessor["min"], accessor["max"]) == (source.means.min(0).tolist(), source.means.max(0).tolist())
-    x, y, z, w = ours["nodes"][0]["rotation"]  # theirs turned the values, ours turns the node
+    x, y, z, w = ours["nodes"][0]["rotation"]  # splat-transform rotates the values, ours the node
     turn = np.array([w, x, y, z])
     np.testing.assert_allclose(a["POSITION"] @ quat_to_matrix(turn).T, b["POSITION"], atol=1e-5)
     for name in ("SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"):
@@ -233,7 +233,7 @@ def test_splatv_of_others(t):
     assert [len(g) for g in sequence.groups] == [30, 20]
     g = sequence.frame(t)
     means, quats, alpha, color, shown = spacetime(t)
-    order = [int(np.linalg.norm(means - m, axis=1).argmin()) for m in g.means]  # theirs are sorted
+    order = [int(np.linalg.norm(means - m, axis=1).argmin()) for m in g.means]  # the file's order is sorted
     assert sorted(order) == np.flatnonzero(shown).tolist()
     np.testing.assert_allclose(g.means, means[order], atol=1e-3)
     np.testing.assert_allclose(1 / (1 + np.exp(-g.logit_opacities)), alpha[order], atol=0.006)
@@ -443,11 +443,11 @@ def test_round_trip_through_splat_transform(source, tmp_path):
     write_splat(tmp_path / "a.spz", source)
     said = subprocess.run([tool, "--version"], capture_output=True, text=True)
     version = int(re.search(r"v(\d+)", said.stdout + said.stderr)[1])
-    turned = ["-r", "180,0,0"] if version >= 3 else []  # 3 keeps the axes of a .ply
+    turned = ["-r", "180,0,0"] if version >= 3 else []  # version 3 keeps the axes of a .ply
     for given, made in (("a.spz", "b.ply"), ("b.ply", "c.spz"), ("a.spz", "d.glb")):
         subprocess.run([tool, "-q", tmp_path / given, *turned, tmp_path / made], check=True, capture_output=True)
     ours = read_splat(tmp_path / "a.spz")
-    limits = {"angle": 1, "opacity": 1e-4, "sh0": 1e-4}  # turned by halves about own axes, which changes nothing
+    limits = {"angle": 1, "opacity": 1e-4, "sh0": 1e-4}  # half turns about own axes change nothing
     for name, means, shN, rtol in (("b.ply", 1e-6, 1e-5, 1e-3), ("c.spz", 2e-4, 0.07, 0.02)):
         back = read_splat(tmp_path / name)
         assert_close(back, ours, means=means, shN=shN, log_scales=1e-5, **limits)
@@ -462,7 +462,7 @@ def test_round_trip_through_splat_transform(source, tmp_path):
 
 @pytest.mark.parametrize("name", [*SPZ, "antimatter15.splat", "spacetime.splatv"])
 def test_damaged_bytes_are_named_or_read(tmp_path, name):
-    """Whatever bytes are changed or cut: a sentence, or Gaussians, and never another error."""
+    """Changed or cut bytes give Gaussians or a CaptureError that names the file, and never another error."""
     data, r, path = (GOLDEN / name).read_bytes(), np.random.default_rng(1), tmp_path / name
     for _ in range(150):
         harmed = bytearray(data[: r.integers(1, len(data) + 1)] if r.random() < 0.3 else data)

@@ -1,4 +1,4 @@
-"""Splat formats: what is written comes back, what is damaged is named."""
+"""Splat formats: written files read back the same, damage is named."""
 
 import json
 import struct
@@ -128,14 +128,14 @@ def test_compressed_ply_round_trip(tmp_path, k):
     write_splat(path, g)
     assert splat_size(path) == (700, k)
     back = read_splat(path)
-    step = 1 / 1023  # of a chunk's range, which is below 8 here
+    step = 1 / 1023  # share of a chunk's range; the range is below 8 here
     assert_close(g, back, 8 * step, 8 * step, 2e-5, 0.5 / 255 + 1e-6, 8 / 255 / 2 + 1e-3, 8 / 256)
     write_splat(tmp_path / "b.compressed.ply", back)
     assert_close(back, read_splat(tmp_path / "b.compressed.ply"), 1e-5, 1e-5, 1e-6, 1e-6, 1e-5, 1e-5)
 
 
 def compressed(path, chunks=1, rows=1, sh=None, drop=""):
-    """A .compressed.ply of one Gaussian built word by word from the format's description."""
+    """Writes a .compressed.ply of one Gaussian word by word, from the format's description."""
     names = [f"{m}_{a}" for m in ("min", "max") for a in ("x", "y", "z")]
     names += [f"{m}_scale_{a}" for m in ("min", "max") for a in "xyz"]
     header = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
@@ -152,7 +152,7 @@ def compressed(path, chunks=1, rows=1, sh=None, drop=""):
 
 
 def test_compressed_ply_bits(tmp_path):
-    g = read_splat(compressed(tmp_path / "a.ply", sh=1))  # found by content, whatever the name
+    g = read_splat(compressed(tmp_path / "a.ply", sh=1))  # recognised by content, not by name
     assert g.means.tolist() == [[1, 0, 4]]
     np.testing.assert_allclose(g.log_scales, [[-8 + 8 * 1024 / 2047, -8, -8]], rtol=1e-6)
     np.testing.assert_allclose(g.quats, [[0.7071, 0, 0.7071, 0]], atol=2e-3)  # index 2 is y, wxyz
@@ -275,7 +275,7 @@ def test_palette_cuts_where_there_are_too_many():
 
 
 def test_ply_needs_numpy_alone(tmp_path):
-    """The player's side has none of the libraries of the `encode` extra."""
+    """A playback installation has none of the libraries of the `encode` extra."""
     write_splat(tmp_path / "a.ply", gaussians(4))
     missing = ("cv2", "OpenImageIO", "skimage", "scipy", "torch", "imageio_ffmpeg", "plyfile")
     code = f"import sys; sys.modules.update(dict.fromkeys({missing})); from gscodec.splats import *; "

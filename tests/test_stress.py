@@ -1,4 +1,4 @@
-"""The shortest of the stress cases, at a fraction of their size: nothing crashes, diverges or explodes in count."""
+"""The shortest stress cases, at a fraction of their size: no crash, no divergence, no explosion of the count."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ SMALL = {"train": 5, "test": 1, "size": 48, "frames": 3}
 
 
 def late(t: int) -> list:
-    """Nothing in the first frame."""
+    """A walking figure that is absent in the first frame."""
     return [] if t == 0 else walking(t)
 
 
@@ -83,7 +83,7 @@ def test_the_worst_frame_decides_as_well_as_the_mean():
 
 
 def test_conditions_of_a_scene_are_seen():
-    """Exposure that rolls, a shutter that is open, a rig that moves: in pictures and poses."""
+    """Rolling exposure, an open shutter and a moving rig change pictures and poses."""
     small = {"train": 3, "test": 1, "size": 48, "frames": 30}
     blurred, moving, away = (
         replace(SCENES[name], **small).capture(name)

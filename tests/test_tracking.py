@@ -1,4 +1,4 @@
-"""Tracking of tiny captures with known truth: nodes, newcomers, what jumps and what is gone."""
+"""Tracking of tiny captures with known ground truth: nodes, new Gaussians, jumping and disappearing parts."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ from gscodec.train.views import Views
 
 
 def started(model, capture, settings=TINY, frames=2):
-    """A tracker of Gaussians that are the keyframe of the capture."""
+    """A tracker with the given Gaussians as keyframe of the capture."""
     return Tracker.start(from_gaussians(model), Views(capture, settings, CpuBackend()), settings, 0.01, range(frames))
 
 
@@ -63,7 +63,7 @@ def test_tracking_finds_the_turn(capture):
 
 
 def test_a_far_background_does_not_make_what_moves_larger():
-    """Rates of the nodes are in radii of what moves: with the sky in it, a subject flies off."""
+    """Learning rates of the nodes are in radii of the moving subject: if the sky counted, the subject would fly off."""
     capture, subject = capture_of(turning(300, frames=2), masks=False), blob(300)
     sky = dataclasses.replace(subject, means=20 * subject.means, log_scales=subject.log_scales + 3)
     alone = started(subject, capture).radius
@@ -77,7 +77,7 @@ def test_a_motion_out_of_reach_of_the_gradient_is_searched_for():
     rough = dataclasses.replace(first, sh0=first.sh0 + 0.5 * np.random.default_rng(0).standard_normal((300, 3)))
     sky = dataclasses.replace(first, means=20 * first.means).take(np.arange(100))
 
-    def tracker_of(capture, model=rough):  # of a keyframe that has errors, as any has
+    def tracker_of(capture, model=rough):  # of a keyframe with errors, as in practice
         tracker = started(model, capture)
         tracker.moving[:] = True
         return tracker
@@ -120,7 +120,8 @@ def test_a_limb_that_swings_is_found_where_parts_do_not():
 
 
 def test_a_motion_that_explains_little_of_an_error_is_none():
-    """Few views fit any frame far better than the next one, and some small motion always fits a little better."""
+    """With few views a keyframe fits its own frame far better than the next, and some small motion always fits the next
+    a little better."""
     first, turn, shift = blob(300), np.array([0.0, 0.012, 0.0015]), np.array([0.0135, -0.0045, 0.003])
     noise = lambda seed, by: first.sh0 + by * np.random.default_rng(seed).standard_normal((300, 3))  # noqa: E731
     key, other = (dataclasses.replace(first, sh0=noise(*of)) for of in ((0, 0.2), (1, 1.0)))
@@ -158,7 +159,7 @@ def test_nodes_carry_a_rigid_motion_exactly_and_hold_against_others():
 
 
 def test_nodes_that_carry_what_is_far_do_not_move():
-    """Else they take it along with what is near, and the sky comes up to the cameras."""
+    """If nodes that carry far Gaussians moved, the sky would follow near objects up to the cameras."""
     x = torch.from_numpy(blob(200).means)
     x[:40] *= 12
     everything, far = torch.ones(200, dtype=torch.bool), torch.arange(200) < 40
@@ -171,7 +172,7 @@ def test_nodes_that_carry_what_is_far_do_not_move():
 
 def test_newcomers_have_nodes_of_their_own_that_change_nothing_for_others():
     x = torch.from_numpy(blob(200).means)
-    spawned = 0.2 * torch.from_numpy(blob(60, seed=1).means) + torch.tensor([0.9, 0, 0])  # amid the others
+    spawned = 0.2 * torch.from_numpy(blob(60, seed=1).means) + torch.tensor([0.9, 0, 0])  # amid the other Gaussians
     graph = NodeGraph.of(
         x, torch.ones(200), 1.0, torch.ones(200, dtype=torch.bool), dataclasses.replace(TINY.graph, nodes=32)
     )
@@ -190,7 +191,7 @@ def test_newcomers_have_nodes_of_their_own_that_change_nothing_for_others():
 
 
 def test_what_jumps_is_found_and_what_is_gone_is_not():
-    """A patch in front of a wall, farther away in the next frame than any gradient reaches, then nowhere."""
+    """A patch in front of a wall: in the next frame beyond the reach of gradients, then gone."""
     wall, patch = splat_wall(), splat_wall(800, 2, 0.9, 0.9)
     at = lambda x: dataclasses.replace(patch, means=patch.means + np.float32([x, -0.6, 0]))  # noqa: E731
     frames, cameras = [concatenate([wall, at(-0.5)]), concatenate([wall, at(0.5)]), wall], arc()
@@ -204,7 +205,7 @@ def test_what_jumps_is_found_and_what_is_gone_is_not():
 
 
 def test_masks_say_where_nothing_is():
-    """A part of the subject is gone in frame 1, everything in frame 2: what is dead ends its lifetime."""
+    """A part of the subject is gone in frame 1, all of it in frame 2: lifetimes of the missing Gaussians end."""
     left, right = (
         dataclasses.replace(g, means=0.35 * g.means + np.float32([x, 0, 0]), log_scales=g.log_scales - 1)
         for g, x in ((blob(100), -0.8), (blob(100, seed=1), 0.8))

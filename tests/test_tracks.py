@@ -1,4 +1,4 @@
-"""Scenes of several tracks: mux, edit, placement, and damage to one track that leaves the others alone."""
+"""Scenes of several tracks: mux, edit, placement; damage to one track leaves the others unchanged."""
 
 import json
 import re
@@ -55,7 +55,7 @@ def write_stream(path, seed, groups=3, sh_count=0, fps=30.0, **settings):
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory):
-    """A folder with man.gsv, whose groups are predicted, and ball.gsv with SH of degree 3, whose groups are not."""
+    """Folder with man.gsv (predicted groups) and ball.gsv (SH of degree 3, independent groups)."""
     folder = tmp_path_factory.mktemp("parts")
     write_stream(folder / "man.gsv", 1)
     write_stream(folder / "ball.gsv", 2, sh_count=15, random_access=0)
@@ -64,7 +64,7 @@ def parts(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scene(parts):
-    """Both, the ball beside the man, turned and half as large."""
+    """A file with both tracks; the ball is beside the man, turned and half as large."""
     path = parts / "scene.gsv"
     placed = "ball:move=4,0,0:turn=0,90,0:scale=0.5"
     run("mux", parts / "man.gsv", parts / "ball.gsv", "-o", path, "--track", placed)
@@ -101,9 +101,9 @@ def test_a_scene_is_its_parts(parts, scene):
         np.testing.assert_allclose(back.means, 0.5 * turned.means + [4, 0, 0], atol=1e-5)
         np.testing.assert_allclose(back.log_scales, other.log_scales + np.log(0.5), atol=1e-5)
         assert np.abs((back.quats * turned.quats).sum(1)).min() > 0.99999
-        # where they do not overlap a picture of the scene is that of the part
+        # where the tracks do not overlap, a picture of the scene is that of the part
         assert psnr(picture(own, 0.0), picture(whole, 0.0)) > 45
-        # a view that turns with the ball sees the same, so its harmonics have turned, too
+        # a view that turns with the ball sees the same picture, so the harmonics have turned, too
         assert psnr(picture(back, 4.0), picture(whole, 4.0)) > 45
 
 
@@ -116,7 +116,7 @@ def test_harmonics_turn_with_the_track(parts):
     camera = look_at(np.array([0.5, 1.0, -5]), np.zeros(3), np.array([0, 1.0, 0]))
     K = np.array([[90.0, 0, 32], [0, 90, 32], [0, 0, 1]])
     view = np.eye(4)
-    view[:3, :3] = quat_to_matrix(np.array(rotation)).T  # sees the turned track as `camera` sees it unturned
+    view[:3, :3] = quat_to_matrix(np.array(rotation)).T  # sees the turned track as `camera` the unturned one
     straight = render_image(ball.frame(3), Camera("a", K, camera, 64, 64))
     turned = render_image(placed, Camera("b", K, camera @ view, 64, 64))
     assert psnr(straight, turned) > 45
@@ -227,7 +227,7 @@ def test_wrong_words_are_told(scene, parts, tmp_path):
 
 
 def test_damage_in_one_track_leaves_the_others(scene, parts):
-    """Whatever byte is wrong in the boxes and groups of the ball, the man plays on; and the other way round."""
+    """Any wrong byte in the boxes and groups of one track: the other track plays on."""
     data = scene.read_bytes()
     opened = open_scene(scene)
     spans = [[(g["offset"], g["size"]) for g in t.stream.groups] for t in opened.tracks]
@@ -246,7 +246,7 @@ def test_damage_in_one_track_leaves_the_others(scene, parts):
 
 
 def test_a_late_track_does_not_stop_the_others(scene):
-    """A file that ends anywhere in the second track shows the first one, and what is there of the second."""
+    """A file that ends anywhere in the second track shows the first track, and the complete groups of the second."""
     data, opened = scene.read_bytes(), open_scene(scene)
     second = opened.tracks[1].stream.groups
     for end, groups in ((second[0]["offset"] - 20, 0), (second[1]["offset"] + 5, 1)):
@@ -257,7 +257,7 @@ def test_a_late_track_does_not_stop_the_others(scene):
 
 
 def test_hostile_placements_are_named():
-    """Any byte of gsvT: no crash, and an error that tells where."""
+    """Any wrong byte of gsvT: no crash, and an error names its place."""
     data = (VECTORS / "tracks.gsv").read_bytes()
     at = data.rindex(b"gsvT")
     (size,) = np.frombuffer(data[at - 4 : at], ">u4")
@@ -274,7 +274,7 @@ def test_hostile_placements_are_named():
 
 
 def test_sound_of_a_scene(parts, tmp_path):
-    """It is that of the first track, and goes where its groups go."""
+    """The sound is that of the first track, and stays with its groups."""
     write_tone(tmp_path / "tone.wav", 1.0)
     tone_stream(tmp_path / "loud.gsv", tmp_path / "tone.wav", groups=2)
     run("mux", tmp_path / "loud.gsv", parts / "man.gsv", "-o", tmp_path / "a.gsv")

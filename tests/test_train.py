@@ -1,4 +1,4 @@
-"""Training of whole sequences: groups, segments, checkpoints, settings, what cannot be trained."""
+"""Training of whole sequences: groups, segments, checkpoints, settings, refused inputs."""
 
 import dataclasses
 import json
@@ -39,7 +39,7 @@ def test_light_that_comes_on_starts_a_group():
 
 
 def test_a_jump_starts_a_group():
-    """Low temporal frequencies would show it in all frames of the group."""
+    """In one group, low temporal frequencies would spread the jump over all frames."""
     whole = blob(300)
     at = lambda x: DenseGroup([dataclasses.replace(whole, means=whole.means + np.float32([x, 0, 0]))])  # noqa: E731
     frames = [at(0.03 * t) for t in range(6)] + [at(-0.6 + 0.03 * t) for t in range(2)]
@@ -51,8 +51,8 @@ def test_a_jump_starts_a_group():
 
 
 def test_the_first_frame_that_is_fitted_may_lose_more_than_the_next(capture, monkeypatch):
-    """No tracked frame comes near a keyframe's own fit, so that the bound of a cut is none for the first."""
-    advance, losses = Tracker.advance, iter((1.8, 2.9))  # times that of the keyframe; a cut is at 1.5 times the last
+    """No tracked frame fits as well as the keyframe: the bound of a cut does not apply to the first tracked frame."""
+    advance, losses = Tracker.advance, iter((1.8, 2.9))  # times the keyframe's loss; cut: 1.5 times the last
 
     def scripted(self, frame, on_step=None):
         key = self.loss if frame == 1 else self.loss / 1.8
@@ -67,11 +67,11 @@ def test_the_first_frame_that_is_fitted_may_lose_more_than_the_next(capture, mon
 
 
 def test_what_comes_into_the_pictures_has_a_keyframe():
-    """A figure that walks in: what the first frame shows of it is too little to grow from."""
+    """A figure walks in: its part in the first frame is too small to grow the rest from."""
     whole = blob(300)
     part = whole.take(whole.means[:, 0] > 0.7)
     frames = [DenseGroup([g]) for g in (part, part, whole, whole)]
-    group = dataclasses.replace(TINY.group, cut_loss_floor=10.0)  # whatever is lost, nothing is cut for it
+    group = dataclasses.replace(TINY.group, cut_loss_floor=10.0)  # no cut, at any loss
     settings = dataclasses.replace(TINY, gop=8, group=group)
     first, second = train_groups(capture_of(GaussianSequence(25.0, frames)), settings)
     assert (len(first), first.ended, len(second), second.parents) == (2, "more", 2, None)
@@ -79,7 +79,7 @@ def test_what_comes_into_the_pictures_has_a_keyframe():
 
 @pytest.mark.parametrize(("last", "lengths"), [(6, [3, 3]), (7, [3, 2, 2])])
 def test_few_frames_that_drift_pay_for_no_keyframe(last, lengths, monkeypatch):
-    """From frame 5 on. Of six frames one is left, less than a quarter of the five that the keyframe has lasted."""
+    """Drift starts at frame 5. Of six frames one is left: less than a quarter of the five frames of the keyframe."""
     advance = Tracker.advance
 
     def scripted(self, frame, on_step=None):
@@ -96,7 +96,7 @@ def test_few_frames_that_drift_pay_for_no_keyframe(last, lengths, monkeypatch):
 
 
 def test_larger_pictures_have_longer_keyframes_whose_fit_frames_need_not_reach():
-    """The same for a keyframe that a preset trains longer; small pictures change neither its fit nor the bound."""
+    """The same for presets with longer keyframes; small pictures change neither the fit nor the bound."""
 
     def bound_and_steps(side, preset="medium"):
         views, settings = SimpleNamespace(covered=lambda _: [side * side]), train_settings(preset)
@@ -113,8 +113,8 @@ def test_larger_pictures_have_longer_keyframes_whose_fit_frames_need_not_reach()
 
 
 def test_a_frame_is_as_sharp_where_the_others_are_empty():
-    """Empty frames say nothing about what a Gaussian is worth, how fine its steps are, or that tracking went well. What
-    three frames show is 0.9 to 1.1 dB sharper than what one shows, over three seeds."""
+    """Empty frames carry no information on a Gaussian's value, its quantization steps, or the success of tracking. A
+    subject in three frames is 0.9 to 1.1 dB sharper than in one, over three seeds."""
     whole = blob(200)
     none = whole.take(np.zeros(0, int))
     settings = dataclasses.replace(TINY, keyframe_steps=200, finetune_steps=30)
@@ -147,7 +147,7 @@ def test_groups_come_out_whole_and_a_stopped_run_goes_on(capture, tmp_path):
     np.testing.assert_array_equal(groups[1].parents, np.arange(len(groups[0].frame(0))))
     assert done[-1][0] == done[-1][1], "progress ends at its total"
     assert psnr_of(groups[1].frame(1), capture, 4) > 21
-    # The first group again from nothing, the second from the checkpoint of the first.
+    # The first group is trained again from scratch, the second from the checkpoint of the first.
     first = next(iter(train_groups(capture, TINY, checkpoints=tmp_path / "again")))
     np.testing.assert_array_equal(first.frame(2).means, groups[0].frame(2).means)
     (rest,) = train_groups(capture, TINY, first_frame=3, checkpoints=tmp_path / "again")
@@ -167,7 +167,7 @@ def test_segments_are_trained_without_a_look_at_others(capture):
 
 
 def test_settings_are_the_same_from_json():
-    """The fingerprint of a run, by which it is resumed, is JSON."""
+    """A run is resumed by its fingerprint, which is JSON."""
     stored = dataclasses.asdict(TINY)
     assert json.loads(json.dumps(stored)) == stored
 

@@ -1,4 +1,4 @@
-"""Trained groups from tests/data, the streams that are made of them, and their figures.
+"""Trained groups from tests/data, the streams coded from them, and their figures.
 
 `groups.npz` holds two groups of 3 frames of the bundled capture, the second one continuing the first: nodes,
 trajectories, lifetimes and harmonics as training makes them, with few Gaussians. test_regression.py compares the
@@ -27,8 +27,8 @@ from gscodec.train.refinement import PictureRefinement
 DATA = Path(__file__).parent / "data"
 EXAMPLE = Path(__file__).parent.parent / "examples" / "lumberjack"
 FRAMES, GOP = 6, 3
-EXACT = ("canonical.means", "nodes.positions")  # of which half precision is too little
-TOLERANCES = {  # of a recorded figure: up to where it counts as the same, as a share or in its unit
+EXACT = ("canonical.means", "nodes.positions")  # arrays that need more than half precision
+TOLERANCES = {  # largest difference from a recorded figure, as a share or in its unit
     "kb_per_frame": 0.02,
     "codec_psnr": 0.1,
     "codec_psnr_fg": 0.1,
@@ -53,7 +53,7 @@ def save_groups(groups: list[ParametricGroup]) -> None:
 
 @functools.cache
 def load_groups() -> tuple[ParametricGroup, ...]:
-    """The mirror of `save_groups`: an independent group, and one that continues it."""
+    """Inverse of `save_groups`: an independent group, and one that continues it."""
     found: dict[str, dict] = {}
     with np.load(DATA / "groups.npz") as z:
         for name, a in z.items():
@@ -64,7 +64,7 @@ def load_groups() -> tuple[ParametricGroup, ...]:
 
 
 def _unit(group: ParametricGroup) -> ParametricGroup:
-    """Quaternions and weights, which half precision has rounded."""
+    """Normalizes quaternions and weights, which half precision has rounded."""
     q, w = group.canonical.quats, group.nodes.weights
     canonical = replace(group.canonical, quats=q / np.linalg.norm(q, axis=1, keepdims=True))
     return replace(group, canonical=canonical, nodes=replace(group.nodes, weights=w / w.sum(1, keepdims=True)))
@@ -72,30 +72,30 @@ def _unit(group: ParametricGroup) -> ParametricGroup:
 
 @functools.cache
 def capture():
-    """The frames of the bundled capture that the groups show, with the low-pass that they were trained with."""
+    """Frames of the bundled capture that the groups show, with the low-pass of their training."""
     return open_capture(EXAMPLE).frames(0, FRAMES).with_low_pass(LOW_PASS)
 
 
 def plain(group: ParametricGroup) -> ParametricGroup:
-    """Without harmonics."""
+    """The group without harmonics."""
     g = group.canonical
     rest = {n: c for n, c in group.trajectories.items() if n != "shN"}
     return replace(group, canonical=replace(g, shN=g.shN[:, :0]), trajectories=rest)
 
 
 def splats(groups) -> list[DenseGroup]:
-    """The first group as splats of another tool, which know no motion."""
+    """The first group as splats of another tool, without motion."""
     return [DenseGroup([groups[0].frame(t) for t in range(GOP)], groups[0].lifetimes)]
 
 
 def still(groups) -> list[DenseGroup]:
-    """Its first frame."""
+    """The first frame of the first group."""
     return [DenseGroup([groups[0].visible(0)])]
 
 
 @dataclass(frozen=True)
 class Case:
-    """What is coded how; `layers`: of which the figures are, None: all."""
+    """Input and settings of a coded stream; `layers`: number of decoded layers for the figures, None: all."""
 
     settings: dict
     make: Callable[[tuple[ParametricGroup, ...]], list] = list
@@ -104,7 +104,7 @@ class Case:
     base: dict = field(default_factory=lambda: {"quality": 50.0, "refine": 0})
 
     def stream(self, path: Path) -> list:
-        """Writes the stream; returns what it was made of."""
+        """Writes the stream; returns its input groups."""
         groups = self.make(load_groups())
         first = groups[0].frame(0)
         config = stream_config(fps=30, sh_degree=first.sh_degree, gaussians=len(first), frames=GOP)
@@ -131,7 +131,7 @@ CASES = {
 
 
 def measure(case: Case, path: Path) -> dict:
-    """Figures of the stream of a case, which is written to `path`."""
+    """Figures of the stream of a case; it is written to `path`."""
     groups = case.stream(path)
     sequence, stream = GaussianSequence(30.0, groups), open_stream(path, layers=case.layers)
     size, count = path.stat().st_size, sequence.frame_count

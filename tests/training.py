@@ -1,4 +1,4 @@
-"""Tiny captures with known truth for tests of training, and settings that train them in seconds."""
+"""Tiny captures with known ground truth for tests of training, and settings that train them in seconds."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ from gscodec.render.image import render_image, render_rgba
 from gscodec.train.settings import BudgetSettings, TrainSettings
 
 SIZE = 64
-AS_SET = BudgetSettings(steps_most=1.0)  # as many steps as are set, however small the pictures
+AS_SET = BudgetSettings(steps_most=1.0)  # number of steps as set, also for small pictures
 TINY = TrainSettings(
     gop=3,
     keyframe_steps=150,
@@ -40,7 +40,7 @@ def rig(count=10):
 
 
 def capture_of(sequence: GaussianSequence, masks=True) -> Capture:
-    """What the rig sees of a sequence."""
+    """A capture of the sequence by the rig."""
     cameras = rig()
 
     def read(camera, frame):
@@ -78,7 +78,7 @@ def splat_wall(n=3000, seed=1, width=4.0, height=3.0):
 
 
 def arc():
-    """Six cameras in front of it."""
+    """Six cameras in front of the wall."""
     K = np.array([[150.0, 0, 64], [0, 150.0, 48], [0, 0, 1]])
     eyes = [(x, -3.0, z) for z in (-0.3, 0.3) for x in (-0.8, 0, 0.8)]
     return [Camera(f"cam{i}", K, look_at(eye, np.zeros(3), [0, 0, 1]), 128, 96) for i, eye in enumerate(eyes)]

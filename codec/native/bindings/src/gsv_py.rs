@@ -89,8 +89,9 @@ fn node_weights<'py>(
     Ok((index, blend.weight.into_pyarray(py).reshape(shape)?.into_any()))
 }
 
-/// [N, 4] i64, for each of the positions [N, 3] u32 (in Morton order) the nearest of those just before it, nearest first (spec
-/// 7.3): the contexts of the entropy coder. Its own index where there is none. `cells`: most Gaussians of a tile.
+/// Contexts of the entropy coder (spec 7.3): [N, 4] i64, for each of the positions [N, 3] u32 (in Morton order) the
+/// nearest of those just before it, nearest first; its own index where there is none. `cells`: most Gaussians of a
+/// tile.
 #[pyfunction]
 #[pyo3(signature = (positions, cells = TILE_CELLS))]
 fn context_neighbors<'py>(
@@ -111,11 +112,12 @@ fn context_neighbors<'py>(
         .into_any())
 }
 
-/// Quaternions [N, 4] f32 of what a layer codes itself -> integers [N, 3] i32 of quats, and the form [N] u8 of each: 1, i, j or
-/// k, by whose inverse it was multiplied from the right.
+/// Quaternions [N, 4] f32 of the births of a layer -> integers [N, 3] i32 of quats, and the form [N] u8 of each: the
+/// quaternion was multiplied from the right by the inverse of 1, i, j or k (form 0 to 3).
 ///
-/// `steps` [N, 3] f32 of each; `positions` [N, 3] u32 in Morton order; `worth` [N, 3] f32, bits that an error of one step costs,
-/// squared; `lengths` [3, 31, 31] f32, bits of an integer (last) in a context, from -15 to 15 each, or nothing: all cost the same. `cells`: most Gaussians of a tile.
+/// `steps` [N, 3] f32; `positions` [N, 3] u32 in Morton order; `worth` [N, 3] f32: cost in bits of an error of one
+/// step, x^2 times as much for x steps; `lengths` [3, 31, 31] f32, flat: bits of an integer (last) in a context, from
+/// -15 to 15 each; empty: all integers cost the same. `cells`: most Gaussians of a tile.
 #[pyfunction]
 #[pyo3(signature = (quats, steps, positions, worth, lengths, cells = TILE_CELLS))]
 fn quantize_rotations<'py>(

@@ -1,8 +1,8 @@
 //! `_native.Rasterizer`: numpy arrays in, numpy arrays out.
 //!
-//! Parameters are the tuple (means, quats, log_scales, logit_opacities, sh0, shN), f32 and contiguous; the rotations by which
-//! harmonics are turned may follow. Gradients are a tuple of the shapes of the six and (grad2d, max_weight), written
-//! in place.
+//! Parameters are the tuple (means, quats, log_scales, logit_opacities, sh0, shN), f32 and contiguous, optionally
+//! followed by the rotations of the harmonics. Gradients are a tuple of the shapes of the six and (grad2d, max_weight),
+//! written in place.
 
 mod arrays;
 mod kernels;
@@ -16,7 +16,7 @@ use raster::{
 };
 
 type Bytes<'py> = PyReadonlyArrayDyn<'py, u8>;
-/// The six arrays of the parameters; and, or not, rotations [N, 4] by which harmonics are turned.
+/// The six arrays of the parameters, and optionally rotations [N, 4] of the harmonics.
 struct Params<'py> {
     own: (In<'py>, In<'py>, In<'py>, In<'py>, In<'py>, In<'py>),
     turns: Option<In<'py>>,

@@ -1,9 +1,9 @@
 //! The decoder and rasterizer for the web player: plain exports over numbers, without a glue generator.
 //!
 //! Each worker has one instance: a demuxer, a few decoded groups, a rasterizer, and the buffers `input`, `splats` and
-//! `output`. The host writes to the address that `input` or `splats` returns, calls an export, and reads `output`, `pixels`
-//! or a band. Any call may move the memory, so an address is valid until the next call. Exports that can fail return false
-//! and leave a message in `output`. Nothing here is unsafe: only the host accesses the memory.
+//! `output`. The host writes to the address that `input` or `splats` returns, calls an export, and reads `output`,
+//! `pixels` or a band. Any call may move the memory, so an address is valid until the next call. Exports that can fail
+//! return false and leave a message in `output`. Nothing here is unsafe: only the host accesses the memory.
 
 mod pack;
 mod player;
@@ -32,7 +32,8 @@ pub extern "C" fn input(length: usize) -> *mut u8 {
     })
 }
 
-/// Allocates room for flags of `count` tiles: which of them the next `decode` decodes, layer by layer. Without flags it is all.
+/// Allocates room for flags of `count` tiles, layer by layer: whether the next `decode` decodes the tile. Without
+/// flags: all.
 #[unsafe(no_mangle)]
 pub extern "C" fn wanted(count: usize) -> *mut u8 {
     with(|p| {
@@ -63,7 +64,8 @@ pub extern "C" fn track(number: usize) {
     with(|p| p.demuxer = Demuxer::of_track(number));
 }
 
-/// Output: the transform of the track at time `u` of the scene, in units of its timescale: rotation (wxyz), translation, scale, f32.
+/// Output: the transform of the track at time `u` of the scene, in units of its timescale: rotation (wxyz),
+/// translation, scale, f32.
 #[unsafe(no_mangle)]
 pub extern "C" fn pose(u: f64) {
     with(|p| p.pose(u));
@@ -97,16 +99,17 @@ pub extern "C" fn describe(first: usize) {
     with(|p| p.describe(first));
 }
 
-/// Input: the payload of a group, or its start up to the end of the first `layers` layers. The group goes to `slot`; the
-/// reference of a predicted group is in the slot `reference`. `keep_leading`: tiles that were not wanted, but decoded for their
-/// models, stay. `packed`: the bytes of tiles that are not decoded are not there. Output: its header as JSON.
+/// Input: the payload of a group, or its start up to the end of the first `layers` layers. The group goes to `slot`;
+/// the reference of a predicted group is in the slot `reference`. `keep_leading`: leading tiles that were decoded only
+/// for their models stay. `packed`: the payload omits the bytes of tiles that are not decoded. Output: its header as
+/// JSON.
 #[unsafe(no_mangle)]
 pub extern "C" fn decode(slot: usize, level: u8, reference: u8, layers: u8, keep_leading: bool, packed: bool) -> bool {
     with(|p| p.decode(slot, [level, reference, layers], keep_leading, packed))
 }
 
-/// Input: the header of a group with the eight bytes before it; that of its reference in the first `first` bytes, if it is
-/// predicted. Output: its tiles and the places of its units as JSON.
+/// Input: the header of its reference in the first `first` bytes, if the group is predicted, then the header of a group
+/// with the eight bytes before it. Output: its tiles and the positions of its units as JSON.
 #[unsafe(no_mangle)]
 pub extern "C" fn index(first: usize) -> bool {
     with(|p| p.index(first))
@@ -123,8 +126,8 @@ pub extern "C" fn release(slot: usize) {
     with(|p| p.release(slot));
 }
 
-/// Evaluates frame `t` of the group in `slot`, unless it is the last one that was evaluated of it. Input: a transform as of `pose`
-/// that places it, with a scale of 0 nothing is shown; or nothing.
+/// Evaluates frame `t` of the group in `slot`, unless it is the last evaluated frame of the group. Input: a transform
+/// that places it, as in `pose`, or nothing; with a scale of 0 nothing is shown.
 #[unsafe(no_mangle)]
 pub extern "C" fn frame(slot: usize, t: u16) -> bool {
     with(|p| p.frame(slot, t))
@@ -136,22 +139,22 @@ pub extern "C" fn bounds() {
     with(Player::bounds);
 }
 
-/// Output: an attribute of the evaluated frame as f32, in the order of `codec.gaussians.Gaussians`.
+/// Output: an attribute of the evaluated frame as f32, in the order of `codec.model.gaussians.Gaussians`.
 #[unsafe(no_mangle)]
 pub extern "C" fn attribute(which: usize) {
     with(|p| p.attribute(which));
 }
 
-/// Projects the evaluated frame. Input: 20 f32: width, height, fx, fy, cx, cy, 12 of world-to-camera, near plane, low-pass; then the ends of
-/// the bands as `divide` gives them, or nothing. Returns the number of bands, at most `bands`, or 0. Output: the load of each row of
-/// tiles.
+/// Projects the evaluated frame. Input: 20 f32: width, height, fx, fy, cx, cy, 12 of world-to-camera, near plane,
+/// low-pass; then the ends of the bands as `divide` gives them, or nothing. Returns the number of bands, at most
+/// `bands`, or 0. Output: the load of each row of tiles.
 #[unsafe(no_mangle)]
 pub extern "C" fn project(bands: usize) -> usize {
     with(|p| p.project(bands))
 }
 
-/// Input: the load of each row of tiles, f32, added up over all who project parts of an image. Output: the ends of at most
-/// `bands` bands of about the same load, f32.
+/// Input: the load of each row of tiles, f32, summed over all instances that project parts of an image. Output: the
+/// ends of at most `bands` bands of about the same load, f32.
 #[unsafe(no_mangle)]
 pub extern "C" fn divide(bands: usize) {
     with(|p| p.divide(bands));
@@ -177,8 +180,8 @@ pub extern "C" fn band_rows(i: usize) -> usize {
     with(|p| p.band(i).map_or(0, |b| b.rows))
 }
 
-/// Input: as for `project`. Output: the visible Gaussians of the evaluated frame, or all that are not transparent, in the
-/// format of Spark, relative to an origin; their colours are those of the view.
+/// Input: as for `project`. Output: the visible Gaussians of the evaluated frame, or all that are not transparent, in
+/// the format of Spark, relative to an origin; their colours are those of the view.
 #[unsafe(no_mangle)]
 pub extern "C" fn pack(x: f32, y: f32, z: f32, all: bool) -> bool {
     with(|p| p.pack([x, y, z], all))

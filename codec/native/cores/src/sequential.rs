@@ -1,4 +1,4 @@
-//! What the codec uses of rayon, as plain loops.
+//! The part of rayon that the codec uses, as plain loops.
 
 pub fn join<A, B>(a: impl FnOnce() -> A, b: impl FnOnce() -> B) -> (A, B) {
     (a(), b())
@@ -8,7 +8,7 @@ pub fn current_num_threads() -> usize {
     1
 }
 
-/// Runs what it is given at once.
+/// Runs a closure at once, on the calling thread.
 pub struct ThreadPool;
 
 impl ThreadPool {

@@ -1,4 +1,5 @@
-//! The demuxer, for any of the tracks: no panic, a placement that is a transform at any time, and the same result whole, in pieces and with media data skipped; and what is saved of a damaged file.
+//! The demuxer, for any of the tracks: no panic; a placement that is a valid transform at any time; the same result
+//! whole, in pieces and with media data skipped; and recovery of a damaged file.
 #![no_main]
 
 use gsv::container::demux::Demuxer;

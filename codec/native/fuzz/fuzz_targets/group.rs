@@ -1,5 +1,6 @@
-//! The header and unit parsers: any bytes as a group payload, alone or with a group to refer to, all of its tiles or some.
-//! Every other input is a header that gets its checksum, and what follows it. Damaged or not, what is decoded is a group.
+//! The header and unit parsers: any bytes as a group payload, alone or with a reference, all of its tiles or some.
+//! Every other input is a header that gets its checksum, and the bytes behind it. Damaged or not, a decoded group is
+//! valid.
 #![no_main]
 
 use gsv::decode::{Decoding, decode_damaged, decode_group, reference_of};

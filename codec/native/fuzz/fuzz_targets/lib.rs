@@ -1,4 +1,4 @@
-//! What the targets share.
+//! Code that the targets share.
 
 /// Decodes on the thread of the fuzzer: waking another one takes longer than a small input.
 pub fn one_thread() {

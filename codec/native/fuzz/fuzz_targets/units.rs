@@ -1,6 +1,7 @@
-//! The entropy decoders below the checksum: a sound group with other bytes in the payload of one unit, then a frame of it.
-//! The groups: an independent one, one with layers, and one that is predicted from that. The payload is any bytes, or
-//! its own ones with a piece replaced. The level is low: a changed header announces little, so that inputs stay fast.
+//! The entropy decoders below the checksum: a valid group with other bytes in the payload of one unit, then a frame of
+//! it. The groups: an independent one, one with layers, and one predicted from the layered one. The payload is any
+//! bytes, or its own bytes with a piece replaced. The level is low: a changed header announces little, so that inputs
+//! stay fast.
 #![no_main]
 
 use gsv::decode::{Decoding, decode_units};

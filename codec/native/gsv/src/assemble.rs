@@ -7,7 +7,7 @@ use crate::trajectories::Trajectories;
 /// A decoded tile; empty if it is damaged or was not asked for.
 #[derive(Default)]
 pub struct Tile {
-    /// Indices in the reference; of a tile of births none.
+    /// Indices in the reference; None in a tile of births.
     pub survivors: Option<Vec<u32>>,
     pub positions: Vec<[u32; 3]>,
     pub channels: Vec<Vec<i32>>, // of births
@@ -16,7 +16,7 @@ pub struct Tile {
     pub lifetimes: Vec<[u16; 2]>,
 }
 
-/// Concatenates the tiles of each layer; `corrections` of each layer.
+/// Concatenates the tiles of each layer. `corrections`: those of each layer (spec 10.2).
 pub fn assemble(layers: Vec<Vec<Tile>>, corrections: Vec<[f32; 2]>, reference: Option<&Group>, h: &Header) -> Group {
     let mut group = Group {
         channels: vec![Vec::new(); h.scales.len()],
@@ -80,7 +80,7 @@ fn append_tile(group: &mut Group, mut tile: Tile, reference: Option<&Group>) {
     }
 }
 
-/// Appends `b` to `a` without a copy where `a` is empty.
+/// Appends `more` to `to`, without a copy where `to` is empty.
 fn append<T>(to: &mut Vec<T>, more: Vec<T>) {
     if to.is_empty() { *to = more } else { to.extend(more) }
 }

@@ -14,8 +14,8 @@ pub struct Blend {
 }
 
 impl Blend {
-    /// `positions` and `nodes` are in Morton order, which makes runs compact and the search fast; the result does not depend
-    /// on it.
+    /// `positions` and `nodes` are in Morton order: runs are compact and the search is fast. The result does not depend
+    /// on the order.
     pub fn new(positions: &[[u32; 3]], nodes: &[[u32; 3]], neighbors: usize) -> Blend {
         let per = neighbors.min(nodes.len()).min(NEIGHBORS_MAX);
         if per == 0 {

@@ -1,7 +1,7 @@
-//! Tables of model state in blocks, of which only those that were used take memory.
+//! Tables of model state in blocks; only used blocks take memory.
 //!
-//! A table may start from another one, whose blocks it copies when they are first used. So a model costs what the contexts of
-//! its stream cost, not what all contexts would: streams of few Gaussians are cheap, and a hostile one cannot make them dear.
+//! A table may start from another one: it copies a block at its first use. So the memory of a model grows with the
+//! contexts that its stream uses, not with all contexts: streams of few Gaussians are cheap, hostile ones included.
 
 use std::sync::Arc;
 
@@ -9,9 +9,9 @@ use std::sync::Arc;
 #[derive(Clone)]
 pub struct Blocks<B: 'static> {
     new: &'static B,
-    places: Vec<u16>, // of each block: 1 + its place in `used`, or 0
+    places: Vec<u16>, // 1 + index in `used` of each block, or 0
     used: Vec<B>,
-    base: Option<Arc<Blocks<B>>>, // where the others start from; None: from `new`
+    base: Option<Arc<Blocks<B>>>, // initial state of the unused blocks; None: `new`
 }
 
 impl<B: Clone + 'static> Blocks<B> {
@@ -24,7 +24,7 @@ impl<B: Clone + 'static> Blocks<B> {
         }
     }
 
-    /// Block `i`, to be changed.
+    /// Block `i`, mutable.
     ///
     /// `i` is computed from decoded values, never from raw input, so it is in range by construction.
     #[inline]
@@ -52,7 +52,8 @@ impl<B: Clone + 'static> Blocks<B> {
         }
     }
 
-    /// Changes the blocks that were used by `f`; from now on copies of this table share them, and copy what they use.
+    /// Applies `f` to the used blocks. After that, copies of this table share these blocks and copy a block at its
+    /// first use.
     pub fn settle(&mut self, f: impl FnMut(&mut B)) {
         self.used.iter_mut().for_each(f);
         let blank = Blocks::new(self.places.len(), self.new);
@@ -75,7 +76,7 @@ mod tests {
     }
 
     proptest! {
-        /// Tables and copies of them, settled in between, against plain ones.
+        /// Tables and their copies, with `settle` in between, equal plain arrays.
         #[test]
         fn as_a_plain_table(steps in proptest::collection::vec((0..4usize, 0..40usize, 1..9u32), 0..60)) {
             let mut tables = vec![(Blocks::new(40, &7u32), [7u32; 40])];

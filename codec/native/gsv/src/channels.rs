@@ -1,7 +1,9 @@
-//! Channels (spec 9): the canonical integers of one attribute <-> symbols, in contexts made of the neighbours' integers.
+//! Channels (spec 9): the canonical integers of one attribute <-> symbols, in contexts made of the neighbours'
+//! integers.
 //!
-//! A value is coded relative to 0 while the mean of the neighbours is small, so that the contexts learn how reliable the
-//! mean is (most channels are noise around a mean of their own); where the mean is large, relative to the mean.
+//! Where the mean of the neighbours is small, a value is coded relative to 0, so that the contexts learn how reliable
+//! the mean is (most channels are noise around a mean of their own). Where the mean is large, the value is coded
+//! relative to it.
 
 use crate::attributes::Attribute;
 use crate::neighbors::{NEAR, Near};
@@ -14,7 +16,7 @@ use crate::values::{Expected, MAX_VALUE};
 pub struct ChannelModel {
     symbols: SymbolModel,
     class: Vec<usize>, // of each channel
-    second: usize,     // how many channels back the second value of the same Gaussian is
+    second: usize,     // distance in channels to the second context value of the same Gaussian
 }
 
 impl ChannelModel {
@@ -28,7 +30,7 @@ impl ChannelModel {
         }
     }
 
-    /// As of `SymbolModel`.
+    /// See `SymbolModel::settle`.
     pub fn settle(&mut self) {
         self.symbols.settle();
     }
@@ -126,8 +128,8 @@ fn fold(v: i32) -> usize {
     usize::from(RANGES[(v.clamp(-FAR, FAR) + FAR) as usize])
 }
 
-/// Of each symbol: the value of least magnitude, and the number of bits that follow. Symbol 0 is 0, then each range of
-/// magnitudes with both signs; the last range is open, the last symbol is forbidden.
+/// Per symbol: its value of least magnitude, and the number of bits that follow. Symbol 0 is the value 0; then each
+/// range of magnitudes has one symbol per sign. The last range is open, the last symbol is forbidden.
 const VALUES: [(i32, u32); SYMBOLS] = {
     const RANGES: [(i32, u32); 15] = [
         (1, 0),

@@ -1,7 +1,9 @@
-//! Companding (spec 13.1): dequantized value of a channel -> its expanded value, by a piecewise linear function that rises.
+//! Companding (spec 13.1): dequantized value of a channel -> expanded value, by an increasing piecewise linear
+//! function.
 //!
-//! In: `offset + step * integer` of log_scales and logit_opacities; out: the value that is shown. A steep piece makes the
-//! quantization coarser where errors are seen less, for instance in the scales of Gaussians smaller than a pixel.
+//! In: `offset + step * integer` of log_scales and logit_opacities; out: the value that is rendered. A steep piece
+//! makes the quantization coarser where errors are less visible, for instance in the scales of Gaussians smaller than a
+//! pixel.
 
 use crate::error::Result;
 use crate::fields::Fields;
@@ -24,7 +26,7 @@ pub struct Companding {
 pub struct CompandingTable {
     low: f32,
     width: f32,
-    /// Of each piece: start before expansion, start after it, slope.
+    /// Per piece: start before expansion, start after it, slope.
     pieces: [[f32; 3]; PIECES],
 }
 

@@ -1,12 +1,12 @@
-//! Conformance of a group to its header (spec 3.1): every announced unit is present, and no other unit is; and which units
-//! are lost with a damaged one.
+//! Conformance of a group to its header (spec 3.1): every announced unit is present, and no other unit. Also finds the
+//! units that are lost with a damaged one.
 
 use crate::attributes::Attribute;
 use crate::error::{Error, Result};
 use crate::header::Header;
 use crate::unit::{Unit, UnitKey, UnitType, unit_name};
 
-/// A unit that is damaged, or needs one that is, and so is not decoded.
+/// A unit that is not decoded, because it is damaged or needs a damaged unit.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Damage {
     /// Index of the unit in the group.
@@ -14,7 +14,7 @@ pub struct Damage {
     /// None: a type that this version skips.
     pub kind: Option<UnitType>,
     pub layer: u8,
-    /// Of a tile in its layer.
+    /// Index of a tile in its layer.
     pub index: u16,
     pub message: String,
 }
@@ -27,7 +27,7 @@ fn number((kind, layer, index): UnitKey) -> u32 {
 /// The undamaged units of a group that may be decoded.
 pub struct Sound<'a> {
     announced: Vec<(UnitKey, bool)>,
-    units: Vec<Option<&'a Unit<'a>>>, // of each that is announced
+    units: Vec<Option<&'a Unit<'a>>>, // one per announced unit
 }
 
 impl<'a> Sound<'a> {
@@ -36,18 +36,19 @@ impl<'a> Sound<'a> {
     }
 }
 
-/// Place of a unit among those that the header announces.
+/// Index of a unit among the announced ones.
 fn find(announced: &[(UnitKey, bool)], key: UnitKey) -> Option<usize> {
     announced
         .binary_search_by_key(&number(key), |(key, _)| number(*key))
         .ok()
 }
 
-/// Compares the units with the header; returns those that can be decoded, and the others. `layers`: number of layers to
-/// decode; `wanted(layer, tile)`: which tiles.
+/// Compares the units with the header; returns the units that can be decoded, and the damaged and lost ones. `layers`:
+/// number of layers to decode; `wanted(layer, tile)`: whether to decode a tile.
 ///
 /// # Errors
-/// A unit that the header does not announce, or twice; a missing unit; a damaged first tile of an independent group.
+/// A unit that the header does not announce, or a second one with the same key; a missing unit; a damaged first tile of
+/// an independent group.
 pub fn check<'a>(
     units: &'a [Unit<'a>],
     header: &Header,
@@ -111,7 +112,7 @@ pub fn check<'a>(
     Ok((Sound { announced, units }, damage))
 }
 
-/// The other units without which a unit cannot be decoded.
+/// The units that a unit needs to be decoded.
 fn needs(header: &Header, key: UnitKey) -> [Option<UnitKey>; 2] {
     let (kind, layer, index) = key;
     let k = usize::from(layer);
@@ -128,7 +129,7 @@ fn needs(header: &Header, key: UnitKey) -> [Option<UnitKey>; 2] {
     needed.map(|need| need.filter(|need| *need != key))
 }
 
-/// The units that a header announces, in the order of `number`; of each whether it is required.
+/// The units that a header announces, in the order of `number`, each with a flag: required.
 fn announced(h: &Header, layers: usize) -> Vec<(UnitKey, bool)> {
     let mut out = vec![((UnitType::GroupHeader, 0, 0), true)];
     for (k, tiles) in h.tiles.iter().enumerate().take(layers) {

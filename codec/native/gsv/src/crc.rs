@@ -2,7 +2,8 @@
 
 use std::sync::LazyLock;
 
-/// Table k advances a byte by k more; made when first used, since they would be a twentieth of the page's decoder.
+/// Table k advances a byte by k more bytes. Made at first use: stored tables would be a twentieth of the page's
+/// decoder.
 static TABLES: LazyLock<[[u32; 256]; 8]> = LazyLock::new(|| {
     let mut t = [[0; 256]; 8];
     for (i, c) in t[0].iter_mut().enumerate() {

@@ -1,5 +1,5 @@
-//! Deaths (spec 10.1): which Gaussians of the reference are not in a predicted group <-> bins, in the context of the
-//! neighbours.
+//! Deaths (spec 10.1): flags of the Gaussians of the reference that are missing in a predicted group <-> bins, in
+//! contexts made of the neighbours' flags.
 
 use crate::model::Model;
 use crate::neighbors::Near;

@@ -1,9 +1,9 @@
 //! Payload -> group of integers (spec 3 to 12). The mirror of encode.rs.
 //!
-//! Of each layer the tiles from whose models the others start, then all others in parallel (tiles.rs); the nodes beside them
-//! (nodes.rs); both read streams (streams.rs). Memory is taken only for what the header announces and the level allows;
-//! trajectories grow against the symbols that the level has left. Damage (spec 3) is an error (strict), or the undamaged units
-//! are decoded.
+//! Per layer: first the leading tiles, from whose models the others start, then all others in parallel (tiles.rs); the
+//! nodes in parallel to the layers (nodes.rs). Both read streams (streams.rs). Memory is taken only for content that
+//! the header announces and the level allows; trajectories count against the symbols that the level has left. Damage
+//! (spec 3) is an error (strict), or the undamaged units are decoded.
 
 mod nodes;
 mod streams;
@@ -30,18 +30,19 @@ pub struct Decoding<'a> {
     pub reference: Option<&'a Group>,
     /// Number of layers to decode; the payload may end behind them.
     pub layers: usize,
-    /// Of each layer, which tiles are wanted; the bytes of others may be anything, but those from which others start are
-    /// decoded anyway. None: all.
+    /// Wanted tiles, [layer][tile]; None: all. The bytes of other tiles may be anything, except those of leading tiles,
+    /// which are decoded anyway.
     pub tiles: Option<&'a [Vec<bool>]>,
-    /// Whether tiles that were decoded for their models only are part of the group (spec 3.4). Where they are not, as in a share
-    /// of a group whose other tiles somebody else holds, they are not decoded either in layers of which nothing is wanted.
+    /// Whether tiles that were decoded only for their models are part of the group (spec 3.4). If not, as for one
+    /// worker's share of a group whose other tiles are decoded by other workers, leading tiles are not decoded in
+    /// layers without a wanted tile.
     pub keep_leading: bool,
-    /// Whether the payload has no bytes of the tiles that are not decoded: what is behind them follows at once.
+    /// Whether the payload omits the bytes of tiles that are not decoded: the next unit follows at once.
     pub packed: bool,
 }
 
 impl<'a> Decoding<'a> {
-    /// All of an independent group.
+    /// Decodes all of an independent group.
     pub fn at(level: &'a Level) -> Self {
         Decoding {
             level,
@@ -80,8 +81,8 @@ pub fn decode_group(payload: &[u8], how: &Decoding) -> Result<Group> {
     }
 }
 
-/// Decodes the undamaged units. Damaged tiles are missing, and those that start from their models; without nodes, or without
-/// their motion, Gaussians stay where they are.
+/// Decodes the undamaged units. Damaged tiles are missing, and so are tiles that start from their models. Without node
+/// positions no nodes move Gaussians; without node trajectories nodes move only as the rig predicts.
 ///
 /// # Errors
 /// As `decode_group`; damage only of the header, or of the first tile of an independent group.
@@ -176,13 +177,13 @@ fn decode(header: Header, units: &[Unit], how: &Decoding) -> Result<(Group, Vec<
     Ok((group, damage))
 }
 
-/// What the stages share.
+/// State that the stages share.
 struct GroupDecoder<'a> {
     header: &'a Header,
     reference: Option<&'a Group>,
     sound: Sound<'a>,
     how: &'a Decoding<'a>,
-    symbols: AtomicU64, // taken so far
+    symbols: AtomicU64, // counted so far
 }
 
 impl GroupDecoder<'_> {

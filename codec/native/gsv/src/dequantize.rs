@@ -1,8 +1,8 @@
 //! Dequantization (spec 13.1): integers of channels -> values, and integers of quats -> quaternions.
 //!
 //! A rotation is coded as a residual relative to the rotation of the nearest neighbour before it, since neighbours on a
-//! smooth surface have similar axes. The steps of the residual depend on the scales: a rotation displaces a long Gaussian
-//! more than a short one.
+//! smooth surface have similar axes. The steps of the residual depend on the scales: a rotation displaces a long
+//! Gaussian more than a short one.
 
 use crate::attributes::Attribute;
 use crate::companding::{Companding, CompandingTable};
@@ -15,8 +15,8 @@ pub const IDENTITY: Quat = [1.0, 0.0, 0.0, 0.0];
 const RUN: usize = 2048; // Gaussians of one task
 const BLOCK: usize = 512; // residuals refer to neighbours of the same block, so that f32 is precise enough
 
-/// offset + step * integer, expanded where the channel is companded, + shift: C per Gaussian. Empty if the header lacks the
-/// attribute.
+/// offset + step * integer, expanded where the channel is companded, + shift: C per Gaussian. Empty if the header lacks
+/// the attribute.
 ///
 /// `shift`: the correction for the layers that are not decoded (spec 10.2).
 pub fn values(h: &Header, a: Attribute, integers: &[i32], shift: f32) -> Vec<f32> {
@@ -77,8 +77,8 @@ pub fn rotations(h: &Header, integers: &[i32], log_scales: &[i32], near: &[Near]
     out
 }
 
-/// The prediction of Gaussian `i`: the quaternion of its nearest neighbour, if that is in the same block, else the identity.
-/// `done`: the quaternions before `i`.
+/// The prediction of Gaussian `i`: the quaternion of its nearest neighbour, if that is in the same block, else the
+/// identity. `done`: the quaternions before `i`.
 #[inline]
 pub fn before(done: &[Quat], i: usize, near: &Near) -> Quat {
     let j = near[0] as usize;
@@ -86,7 +86,8 @@ pub fn before(done: &[Quat], i: usize, near: &Near) -> Quat {
     known.copied().unwrap_or(IDENTITY)
 }
 
-/// Product of rotations about the third, then the second, then the first axis; `halves`: the sines of half their angles.
+/// Product of rotations about the third, then the second, then the first axis; `halves`: the sines of half their
+/// angles.
 #[inline]
 pub fn rotation_residual(halves: [f32; 3]) -> Quat {
     let [x, y, z] = halves.map(|v| v.clamp(-1.0, 1.0));

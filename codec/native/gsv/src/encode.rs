@@ -1,5 +1,5 @@
-//! Group of integers -> payload (spec 3 to 12): makes the units of all layers, entropy-codes them in parallel, writes them
-//! in order.
+//! Group of integers -> payload (spec 3 to 12): makes the units of all layers, entropy-codes them in parallel, writes
+//! them in order.
 //!
 //! The mirror of decode.rs.
 
@@ -106,7 +106,7 @@ impl GroupEncoder<'_> {
         coded.into_iter().map(|(t, payload)| (key(t), payload)).collect()
     }
 
-    /// The payload of tile `t` of layer `k`, and what its models have learned.
+    /// The payload of tile `t` of layer `k`, and the models of its streams after encoding.
     fn tile(&self, k: usize, t: usize, models: &Models) -> (Vec<u8>, Vec<(Stream, StreamModel)>) {
         let h = &self.group.header;
         let range = self.group.tile_range(k, t);
@@ -164,7 +164,7 @@ impl GroupEncoder<'_> {
         e.finish()
     }
 
-    /// Which Gaussians of a tile of the reference have no survivor at `range`.
+    /// Codes the deaths: the Gaussians of a tile of the reference that have no survivor at `range`.
     fn deaths(&self, e: &mut Encoder, k: usize, t: usize, range: Range<usize>) {
         let (Some(r), Some(parents)) = (self.reference, &self.group.parents) else {
             return;

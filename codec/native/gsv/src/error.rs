@@ -1,4 +1,4 @@
-//! Errors by blame: `Bitstream` and `Limit` blame the bytes, `Input` what was to be written.
+//! Errors by cause: `Bitstream` and `Limit` are faults of the bytes, `Input` is a fault of the data to be written.
 //!
 //! The need for more data is never an error here; it is a result of the demuxer.
 

@@ -1,6 +1,7 @@
 //! Integers of a decoded group -> f32 attributes of frame t (spec 13).
 //!
-//! Canonical values and the weights of the nodes are worked out once; a frame is then evaluated from them (parametric.rs).
+//! Canonical values and the weights of the nodes are computed once; a frame is then evaluated from them
+//! (parametric.rs).
 
 use crate::attributes::Attribute;
 use crate::blend::Blend;
@@ -19,17 +20,17 @@ use rayon::prelude::*;
 /// A group made ready to be evaluated at any frame.
 pub struct Evaluator {
     group: Group,
-    canonical: Frame, // means: from the origin of the grid; its quaternions are those of the group
+    canonical: Frame, // means: relative to the origin of the grid; quaternions: those of the group
     motions: Vec<AttributeMotion<i32>>,
     blend: Blend,
-    nodes: Vec<[f32; 3]>, // from the origin of the grid
+    nodes: Vec<[f32; 3]>, // relative to the origin of the grid
     skinning: Option<Skinning>,
 }
 
 impl Evaluator {
     pub fn new(mut group: Group) -> Evaluator {
         let h = &group.header;
-        let place = |p: &[u32; 3]| p.map(|v| h.grid_step * v as i32 as f32); // below 2^21, and signed ones convert faster
+        let place = |p: &[u32; 3]| p.map(|v| h.grid_step * v as i32 as f32); // below 2^21, signed ones convert faster
         let nodes = group.node_positions.iter().map(place).collect();
         let [scales_shift, opacities_shift] = group.correction();
         let channels = |a, shift| values(h, a, group.channels_of(a).unwrap_or(&[]), shift);
@@ -61,7 +62,7 @@ impl Evaluator {
         }
     }
 
-    /// A group that has not been coded: its quaternions are worked out as a decoder does, without bytes.
+    /// For a group that has not been coded: computes its quaternions as a decoder does, without bytes.
     ///
     /// # Errors
     /// `Error::Input`: the group breaks an invariant.
@@ -137,7 +138,7 @@ impl Evaluator {
         self.frame_into(t, &mut frame.as_mut());
     }
 
-    /// The same, but for harmonics (`Parametric::frame_at_rest`).
+    /// As `frame`, but spherical harmonics are not rotated (`Parametric::frame_at_rest`).
     pub fn frame_at_rest(&self, t: u16, frame: &mut Frame) -> Vec<Quat> {
         frame.resize_as(&self.canonical);
         self.parametric().frame_at_rest(t, &mut frame.as_mut())
@@ -182,7 +183,7 @@ fn rotations_of(group: &Group, reference: Option<&Group>) -> Vec<Quat> {
     out
 }
 
-/// The rig of a group in floats, from the origin of the grid.
+/// The rig of a group in floats, relative to the origin of the grid.
 fn skinning(rig: &Rig, h: &Header) -> Skinning {
     let place = |p: &[i32; 3]| p.map(|v| h.grid_step * v as f32);
     let steps = [h.rig.rotation_step, h.rig.translation_step];

@@ -1,8 +1,8 @@
 //! Fields of headers. A header is declared once, as a function over `Fields`: with `Reader` it reads and checks, with
 //! `Writer` it writes.
 //!
-//! The writer takes each value from the variable that the reader stores it to. Readers are never inlined: headers take no
-//! time, and each copy would cost bytes of the page.
+//! The writer takes each value from the variable that the reader stores it to. Readers are never inlined: headers take
+//! no time, and each copy would cost bytes of the page.
 
 use crate::error::{Error, Result};
 

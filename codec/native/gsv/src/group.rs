@@ -1,7 +1,7 @@
 //! A group of integers and its invariants: the input of `encode`, the output of `decode`.
 //!
-//! Gaussians are stored layer after layer, in each layer the survivors of the reference before the births. A predicted group
-//! holds all of its integers, also those that its payload takes from the reference.
+//! Gaussians are stored layer after layer, in each layer the survivors of the reference before the births. A predicted
+//! group holds all of its integers, also those that its payload takes from the reference.
 
 use crate::attributes::Attribute;
 use crate::error::{Error, Result};
@@ -22,7 +22,8 @@ pub struct Group {
     pub header: Header,
     /// Gaussians of each decoded layer: those of the header, unless units are damaged.
     pub layers: Vec<LayerHeader>,
-    /// Gaussians of each decoded tile of each layer: those of the header, or 0 where the tile is damaged or was not asked for.
+    /// Gaussians of each decoded tile of each layer: those of the header, or 0 where the tile is damaged or was not
+    /// asked for.
     pub tiles: Vec<Vec<u32>>,
     /// In a predicted group: index in the reference of each Gaussian, or `BIRTH`.
     pub parents: Option<Vec<u32>>,
@@ -34,11 +35,11 @@ pub struct Group {
     pub lifetimes: Option<Vec<[u16; 2]>>,
     pub node_positions: Vec<[u32; 3]>,
     pub node_trajectories: Trajectories,
-    /// What predicts the motion of the nodes.
+    /// Predicts the motion of the nodes.
     pub rig: Option<Rig>,
     /// In the order of `header.trajectories`.
     pub trajectories: Vec<Trajectories>,
-    /// Of each layer: what is added to log_scales and logit_opacities while it is the last decoded layer.
+    /// Per layer: offsets that are added to log_scales and logit_opacities while it is the last decoded layer.
     pub corrections: Vec<[f32; 2]>,
 }
 
@@ -47,8 +48,8 @@ fn must(holds: bool, message: impl FnOnce() -> String) -> Result<()> {
 }
 
 impl Group {
-    /// Checks everything that the bitstream cannot express; the message tells what was expected. `reference`: the group that
-    /// a predicted one refers to.
+    /// Checks all rules that the bitstream cannot express; the message names the expected value. `reference`: the group
+    /// that a predicted one refers to.
     pub fn validate(&self, reference: Option<&Group>) -> Result<()> {
         let h = &self.header;
         let before = reference.map(|r| &r.header);
@@ -91,7 +92,7 @@ impl Group {
         self.validate_time()
     }
 
-    /// Checks that a predicted group, and no other, tells where its Gaussians come from.
+    /// Checks that a predicted group, and no other, has `parents`, one per Gaussian.
     fn validate_parents(&self) -> Result<()> {
         let h = &self.header;
         must(self.parents.is_some() == (h.reference > 0), || {
@@ -176,8 +177,8 @@ impl Group {
         first..first + tiles.get(t).map_or(0, |n| *n as usize)
     }
 
-    /// Divides the Gaussians of each layer into tiles: survivors as those of the reference are, births in order. Bounds are left
-    /// as they are.
+    /// Divides the Gaussians of each layer into tiles: survivors as the reference is divided, births in order. Keeps
+    /// the bounds.
     pub fn divide(&mut self, reference: Option<&Group>) {
         let cells = self.header.tile_cells() as usize;
         self.tiles = (0..self.layers.len())

@@ -1,9 +1,10 @@
 //! Rotation of real spherical harmonics of bands 1 to 3, in the signs of clause 14.
 //!
-//! A function of band l is a sum of 2 l + 1 zonal lobes about fixed axes; turned, it is the sum of the same lobes about the
-//! turned axes. The lobe about an axis has as coefficients the values of the harmonics there. (So Lessig et al., "Efficient and
-//! accurate rotation of finite spherical harmonics expansions", 2012; Nowrouzezahrai et al., "Sparse zonal harmonic
-//! factorization", 2012.) One Gaussian takes some 400 operations, most of them on its three colours at once.
+//! A function of band l is a sum of 2 l + 1 zonal lobes about fixed axes; the rotated function is the same sum of lobes
+//! about the rotated axes. The coefficients of the lobe about an axis are the values of the harmonics there. (Lessig et
+//! al., "Efficient and accurate rotation of finite spherical harmonics expansions", 2012; Nowrouzezahrai et al.,
+//! "Sparse zonal harmonic factorization", 2012.) One Gaussian takes some 400 operations, most of them on its three
+//! colours at once.
 
 use crate::dequantize::Quat;
 use crate::rigid_blend::matrix;
@@ -20,7 +21,7 @@ const AXES: [[f32; 3]; 7] = [
     [-2.0, 2.0, -3.0],
     [-2.0, -2.0, -2.0],
 ];
-/// Squared sine of half the angle below which a turn leaves harmonics as they are: 0.01 degrees.
+/// Below this squared sine of half the angle (0.01 degrees) a rotation leaves the harmonics unchanged.
 const STILL: f32 = 1e-8;
 /// Gaussians of one task.
 const RUN: usize = 1024;
@@ -28,7 +29,7 @@ const RUN: usize = 1024;
 /// Red, green, blue, and a lane that is not used.
 type Colour = [f32; 4];
 
-/// The axes, of unit length, and of each band what makes weights of the lobes from coefficients.
+/// The axes, of unit length, and for each band the matrix from coefficients to weights of the lobes.
 struct Factors {
     axes: [[f32; 3]; 7],
     one: [[f32; 3]; 3],
@@ -47,9 +48,9 @@ static FACTORS: LazyLock<Factors> = LazyLock::new(|| {
     }
 });
 
-/// The turn of a unit quaternion.
+/// The rotation by a unit quaternion.
 pub struct Turn {
-    /// Coefficients of the turned lobes, of all bands.
+    /// Coefficients of the rotated lobes, of all bands.
     lobes: [[f32; 15]; 7],
 }
 
@@ -61,7 +62,7 @@ impl Turn {
         }
     }
 
-    /// Turns `own`, K x 3 coefficients of one Gaussian.
+    /// Rotates `own`, K x 3 coefficients of one Gaussian.
     pub fn apply(&self, own: &mut [f32]) {
         let factors = &*FACTORS;
         self.band(&factors.one, own, 0);
@@ -90,7 +91,7 @@ impl Turn {
     }
 }
 
-/// Turns the harmonics [N, K, 3] of each Gaussian by its unit quaternion (wxyz).
+/// Rotates the harmonics [N, K, 3] of each Gaussian by its unit quaternion (wxyz).
 pub fn turn(sh: &mut [f32], rotations: &[Quat]) {
     let per = sh.len().checked_div(rotations.len()).unwrap_or(0);
     if per == 0 {
@@ -139,7 +140,7 @@ fn basis([x, y, z]: [f32; 3]) -> [f32; 15] {
     ]
 }
 
-/// The inverse of a matrix, by Gauss and Jordan with pivots, in f64.
+/// Inverse of a matrix by Gauss-Jordan elimination with pivots, in f64.
 fn inverse<const C: usize>(matrix: [[f32; C]; C]) -> [[f32; C]; C] {
     let mut left = matrix.map(|row| row.map(f64::from));
     let mut right: [[f64; C]; C] = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))));
@@ -177,7 +178,7 @@ mod tests {
         for k in [3, 8, 15] {
             let mut sh = [&coefficients[..3 * k], &coefficients[..3 * k]].concat();
             turn(&mut sh, &[q, [1.0, 0.0, 0.0, 0.0]]);
-            assert_eq!(sh[3 * k..], coefficients[..3 * k]); // that one stands still
+            assert_eq!(sh[3 * k..], coefficients[..3 * k]); // the identity changes nothing
             for d in [[0.48, -0.6, 0.64], [0.0, 0.0, 1.0], [-0.8, 0.6, 0.0]] {
                 let value = |sh: &[f32], d| -> f32 { basis(d).iter().zip(sh.chunks(3)).map(|(y, c)| y * c[1]).sum() };
                 let (turned, expected) = (value(&sh[..3 * k], d), value(&coefficients[..3 * k], rotate(back, d)));

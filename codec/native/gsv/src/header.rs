@@ -1,4 +1,4 @@
-//! Group header (spec 4): what a group holds and how to dequantize it, and the caps that it must keep (spec 5).
+//! Group header (spec 4): the content of a group, its dequantization, and the caps that it must keep (spec 5).
 //!
 //! A predicted group shares grid, attributes and layers with its reference, so its header is read and written with the
 //! header of the reference.
@@ -54,10 +54,10 @@ pub struct RigHeader {
     pub translation_step: f32,
 }
 
-/// What the index tells of one tile (spec 4).
+/// Entry of one tile in the index of tiles (spec 4).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct TileHeader {
-    /// Gaussians: survivors of the tile of the same index of the reference, or births.
+    /// Number of Gaussians: survivors of the tile with the same index in the reference, or births.
     pub count: u32,
     /// Lower corner and upper corner, both included, in parts of the grid (tile_bounds.rs).
     pub bounds: [u16; 6],
@@ -86,21 +86,21 @@ pub struct Header {
     pub grid_step: f32,
     pub grid_bits: u8,
     pub sh_degree: u8,
-    /// Harmonics turn with the nodes (spec 13.4); otherwise they stay in the world.
+    /// Spherical harmonics rotate with the nodes (spec 13.4); otherwise they stay fixed in the world.
     pub turned: bool,
     pub layers: Vec<LayerHeader>,
     /// A tile has up to 2^tile_side_log2 x 2^tile_side_log2 cells of the map.
     pub tile_side_log2: u8,
     /// Of each layer: first a tile of survivors for each tile of the reference, then the tiles of births.
     pub tiles: Vec<Vec<TileHeader>>,
-    /// Every tile tells in which frames its Gaussians are shown; otherwise they are in all.
+    /// Every tile codes the lifetimes of its Gaussians; otherwise they are shown in all frames.
     pub lifetimes: bool,
     /// In the order of `Attribute::canonical(sh_degree)`.
     pub scales: Vec<Scale>,
     /// [channel of quats][channel of log_scales]: the step of the channel is divided by 2^(scale_exponent /
     /// SCALE_EXPONENT_UNIT * log_scale).
     pub scale_exponents: [[i8; 3]; 3],
-    /// Of each layer: number of low bits of positions, then of the integers of each attribute, that are 0 and not coded.
+    /// Per layer: number of low bits that are 0 and not coded, of positions, then of the integers of each attribute.
     /// Empty: 0.
     pub shifts: Vec<[u8; 6]>,
     /// Of the channels of log_scales, then of logit_opacities. None: no companding.
@@ -133,8 +133,8 @@ impl Header {
         self.tiles.get(k).map_or(0, |t| t.len().saturating_sub(births as usize))
     }
 
-    /// The tiles of layer `k` from whose models the others start: the first one, unless it is empty, and the first one of
-    /// births.
+    /// The leading tiles of layer `k`, from whose models the others start: the first tile, unless it is empty, and the
+    /// first tile of births.
     pub fn leading_tiles(&self, k: usize) -> [Option<usize>; 2] {
         let tiles = self.tiles.get(k).map_or(&[][..], Vec::as_slice);
         let born = self.survivor_tiles(k);
@@ -142,7 +142,7 @@ impl Header {
         [first.map(|_| 0), (born < tiles.len()).then_some(born)]
     }
 
-    /// Gaussians of the reference among which a tile of survivors tells the dead; 0: none has died, or a tile of births.
+    /// Number of Gaussians in the stream of deaths of a tile of survivors; 0: none has died, or a tile of births.
     pub fn candidates(&self, k: usize, t: usize, reference: Option<&Header>) -> u32 {
         let before = reference.filter(|_| t < self.survivor_tiles(k));
         let all = before.and_then(|r| r.tiles.get(k)?.get(t)).map_or(0, |r| r.count);
@@ -154,7 +154,7 @@ impl Header {
         if own > 0 && own < all { all } else { 0 }
     }
 
-    /// Low bits that layer `k` leaves out of the integers of an attribute; `Means`: of positions.
+    /// Number of low bits that layer `k` omits from the integers of an attribute; `Means`: from positions.
     pub fn shift(&self, k: usize, attribute: Attribute) -> u32 {
         let own = self.shifts.get(k).and_then(|s| s.get(attribute as usize - 1));
         own.map_or(0, |s| u32::from(*s))

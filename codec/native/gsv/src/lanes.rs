@@ -1,5 +1,5 @@
-//! Eight 16-bit lanes of a distribution (spec 6.6) at once. Compilers make vectors of the plain form on every processor but
-//! wasm, where the upper half of a product has no instruction of its own; there it is written with intrinsics, which decode a
+//! Eight 16-bit lanes of a distribution (spec 6.6) at once. Compilers vectorize the plain form on every processor but
+//! wasm, which has no instruction for the upper half of a product; there it is written with intrinsics, which decode a
 //! group in the page in two thirds of the time.
 
 /// Eight cumulative probabilities times 65536.
@@ -25,12 +25,13 @@ mod plain {
     pub fn learned(ends: Lanes, symbol: i16, rate: u16) -> Lanes {
         std::array::from_fn(|i| {
             let target = if i as i16 >= symbol { u16::MAX } else { 0 };
-            let off = ends[i] ^ target; // from the target
+            let off = ends[i] ^ target; // distance from the target
             (off - high(off, rate)) ^ target
         })
     }
 
-    /// The mean of three distributions, less a 512th, and `least` for each symbol; lane 0 ends symbol `number` (from 1 on).
+    /// Weighted mean of three distributions, less a 512th, plus `least` per symbol; lane 0 ends symbol `number` (from 1
+    /// on).
     #[inline]
     pub fn mean(ends: [Lanes; 3], weights: [u16; 3], least: u16, number: u16) -> Lanes {
         std::array::from_fn(|i| {

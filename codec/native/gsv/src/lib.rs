@@ -1,5 +1,5 @@
-//! The bitstream core: bytes <-> integers of a group (container, units, entropy coding), and integers -> attributes of a
-//! frame.
+//! The bitstream core: bytes <-> integers of a group (container, units, entropy coding), and integers -> attributes of
+//! a frame.
 //!
 //! No I/O, no unsafe, no panic on input. Clause numbers in comments are those of spec/gsv.md.
 #![forbid(unsafe_code)]

@@ -5,7 +5,7 @@ use crate::model::Model;
 use crate::neighbors::Near;
 use crate::range_coder::Bins;
 
-const POINT: usize = 16; // first context of the end points; the flag has those before
+const POINT: usize = 16; // first context of the end points; the contexts before it are for the flag
 const NODES: usize = 256;
 const BITS: usize = 8;
 
@@ -37,7 +37,7 @@ pub fn code<C: Bins>(c: &mut C, model: &mut Model, frames: u16, near: &[Near], l
     true
 }
 
-/// Codes one end point, most significant bit first; `near`: that of the nearest neighbour.
+/// Codes one end point, most significant bit first; `near`: the end point of the nearest neighbour.
 fn point<C: Bins>(c: &mut C, model: &mut Model, end: usize, bits: u32, want: u16, near: u16) -> u16 {
     let (mut v, mut node) = (0u16, 1);
     for j in 0..bits {

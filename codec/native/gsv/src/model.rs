@@ -1,7 +1,8 @@
 //! Adaptive binary models (spec 6.2 to 6.4): a bin in two contexts -> its probability, in integers only.
 //!
-//! Two counters, each chosen by its own context, are mixed in the logistic domain with weights that adapt too (as in PAQ by
-//! Mahoney). Two separate contexts learn faster than one joint context, which would spread the same bins over more counters.
+//! Two counters, each chosen by its own context, are mixed in the logistic domain with weights that adapt too (as in
+//! PAQ by Mahoney). Two separate contexts learn faster than one joint context, which would spread the same bins over
+//! more counters.
 
 use crate::range_coder::Bins;
 use std::sync::LazyLock;
@@ -18,7 +19,7 @@ const STRETCH_MAX: i32 = 12 * 256 - 1;
 const P_MIN: i32 = 16;
 /// Bins after which a counter stops slowing down.
 const AGE_MAX: u32 = 255;
-/// The same in a model that another tile starts from.
+/// Cap on the number of bins seen in a counter that another tile starts from.
 const AGE_SETTLED: u32 = 20;
 /// Initial weight of each counter, 0.4, and the range of weights, in 1/65536.
 const WEIGHT_NEW: i32 = 26214;
@@ -32,7 +33,8 @@ fn curve(x: i32) -> i32 {
     if x < 0 { 65536 - p } else { p }
 }
 
-/// The logistic curve from -`STRETCH_MAX` on, clamped: the probability that a mixed bin is coded with (squash of spec 6.3).
+/// The logistic curve from -`STRETCH_MAX` on, clamped: the probability that a mixed bin is coded with (squash of spec
+/// 6.3).
 static SQUASH: LazyLock<[u16; 2 * STRETCH_MAX as usize + 1]> =
     LazyLock::new(|| std::array::from_fn(|i| curve(i as i32 - STRETCH_MAX).clamp(P_MIN, 65536 - P_MIN) as u16));
 
@@ -47,7 +49,7 @@ static STRETCH: LazyLock<[i16; 4096]> = LazyLock::new(|| {
     })
 });
 
-/// Of a counter that has seen n bins: its step 1 / (n + 1.5) in 1/65536, and its low bits after one more bin.
+/// For a counter that has seen n bins: its step 1 / (n + 1.5) in 1/65536, and its low bits after one more bin.
 type Steps = [(u32, u32); 256];
 static STEPS: LazyLock<Steps> = LazyLock::new(|| {
     std::array::from_fn(|n| {
@@ -87,7 +89,7 @@ impl Counter {
         (self.0 >> 8 & 3) as usize
     }
 
-    /// Prepares a counter for the other tiles of a layer: what it has learned from the first one counts less.
+    /// Prepares a counter for the other tiles of a layer: the statistics of the first tile count less.
     pub fn settle(&mut self) {
         let n = (self.0 & 255).min(AGE_SETTLED);
         self.0 = self.0 >> 10 << 10 | age(n) << 8 | n;
@@ -154,7 +156,7 @@ impl Model {
         }
     }
 
-    /// As of `Counter`.
+    /// See `Counter::settle`.
     pub fn settle(&mut self) {
         self.a.iter_mut().chain(&mut self.b).for_each(Counter::settle);
     }

@@ -1,4 +1,5 @@
-//! Context neighbours (spec 7.3): grid points in Morton order -> for each point the nearest among the points just before it.
+//! Context neighbours (spec 7.3): grid points in Morton order -> for each point the nearest among the points just
+//! before it.
 //!
 //! They give the contexts of all units of a layer. The search is brute force over a window: exact, cheap and easy to
 //! reproduce.
@@ -24,7 +25,7 @@ pub fn nearest(points: &[[u32; 3]]) -> Vec<Near> {
     (0..points.len()).map(|i| nearest_before(points, i, 0)).collect()
 }
 
-/// The same of points in tiles of `cells` points: neighbours are of the same tile.
+/// As `nearest`, for points in tiles of `cells` points: neighbours are in the same tile.
 pub fn nearest_in_tiles(points: &[[u32; 3]], cells: usize) -> Vec<Near> {
     let start = |i: usize| i - i % cells.max(1);
     let all = (0..points.len()).into_par_iter().with_min_len(4096);

@@ -1,12 +1,12 @@
 //! Nearest nodes of points (spec 13.2), exact: a run of points shares the few nodes that can be nearest to any of them.
 //!
-//! Gaussians come in Morton order, so runs are compact. A node is a candidate of a run if its distance to the bounding box
-//! is at most the distance within which every point of the box has enough nodes; the same test is repeated for short runs.
-//! In the worst case (a hostile file with all nodes on a sphere and all Gaussians around its centre) every node stays a
-//! candidate of every point; the level caps that cost (spec 5). Coordinates are below 2^21, so sums of squared differences
-//! are exact in f64, which vectorizes.
+//! Gaussians come in Morton order, so runs are compact. A node is a candidate of a run if its distance to the bounding
+//! box is at most the distance within which every point of the box has enough nodes; the same test is repeated for
+//! short runs. In the worst case (a hostile file with all nodes on a sphere and all Gaussians around its centre) every
+//! node stays a candidate of every point; the level caps that cost (spec 5). Coordinates are below 2^21, so sums of
+//! squared differences are exact in f64, which vectorizes.
 
-/// Nodes that may move a Gaussian (spec 4).
+/// Most nodes that move a Gaussian (spec 4).
 pub const NEIGHBORS_MAX: usize = 8;
 
 pub type Neighbor = (u64, u32); // (squared distance, index of the node)
@@ -43,7 +43,7 @@ impl NodeTable {
         }
     }
 
-    /// `few`: the candidates, among which are the `count` nearest nodes of each of `points`. `d`: scratch space.
+    /// Writes to `few` the candidates, which include the `count` nearest nodes of each of `points`. `d`: scratch space.
     fn near(&self, points: &[[u32; 3]], count: usize, d: &mut Vec<f64>, few: &mut NodeTable) {
         let bounds = |a: usize| {
             points
@@ -84,8 +84,8 @@ impl NodeSearch {
         }
     }
 
-    /// Calls `found` for each point with its nearest nodes, sorted by (squared distance, index); places beyond the number of
-    /// nodes hold `FAR`.
+    /// Calls `found` for each point with its nearest nodes, sorted by (squared distance, index); places beyond the
+    /// number of nodes hold `FAR`.
     pub fn run(&self, points: &[[u32; 3]], mut found: impl FnMut(&[Neighbor])) {
         let (mut d, mut some, mut few) = (Vec::new(), NodeTable::default(), NodeTable::default());
         self.nodes.near(points, self.count, &mut d, &mut some);

@@ -1,7 +1,7 @@
 //! Canonical Gaussians, nodes and trajectories -> f32 attributes of frame t (spec 13).
 //!
-//! The one evaluation of the product: of a decoded group, whose coefficients are integers times a step, and of a group that was
-//! trained or fitted, whose coefficients are floats. Nothing is predicted from its result, so f32 will do.
+//! The only evaluation in the product: for decoded groups (coefficients are integers times a step) and for trained or
+//! fitted groups (coefficients are floats). Decoding of integers does not depend on its result, so f32 is enough.
 
 use crate::attributes::Attribute;
 use crate::blend::Blend;
@@ -104,13 +104,13 @@ impl<V: Coefficient> AttributeMotion<V> {
         }
     }
 
-    /// Adds frame `t` to `values`, `channels` per Gaussian.
+    /// Adds the trajectories at one frame to `values`, `channels` per Gaussian. `basis`: DCT basis at the frame.
     fn add(&self, basis: &[f32], values: &mut [f32], channels: usize) {
         for &i in &self.moving {
             let mut d: [f32; CHANNELS_MAX] = transform(self.coefficients.get(i as usize), channels, basis);
             if self.decorrelated {
                 let colours = d.as_chunks_mut().0.iter_mut().take(channels / 3);
-                colours.for_each(|c| *c = rgb(*c)); // linear, so that it may be done to the difference
+                colours.for_each(|c| *c = rgb(*c)); // linear, so it can be applied to the difference
             }
             let from = i as usize * channels;
             let own = values.get_mut(from..from + channels).unwrap_or_default();
@@ -145,7 +145,7 @@ fn scaled([a, b, c, x, y, z]: [f32; 6], [rotation, translation]: [f32; 2]) -> [f
 }
 
 impl RigMotion<'_> {
-    /// Where `nodes` are carried, and by which rotations.
+    /// Positions of `nodes` as the rig carries them, and their rotations.
     fn carry(&self, basis: &[f32], nodes: &[[f32; 3]]) -> (Vec<[f32; 3]>, Vec<Quat>) {
         let at = |j| scaled(transform(self.poses.get(j), CHANNELS, basis), self.steps);
         let poses: Vec<[f32; CHANNELS]> = (0..self.poses.len()).map(at).collect();
@@ -153,24 +153,24 @@ impl RigMotion<'_> {
     }
 }
 
-/// Everything that a frame is evaluated from.
+/// All inputs of the evaluation of a frame.
 pub struct Parametric<'a, V> {
     pub frames: u16,
     /// Added to all means.
     pub origin: [f32; 3],
-    /// Means from the origin; its quats are not read.
+    /// Canonical attributes; means relative to the origin; its quats are not read.
     pub rest: &'a Frame,
     pub rotations: &'a [Quat],
     pub blend: &'a Blend,
-    /// [M] at rest, from the origin.
+    /// [M] rest positions, relative to the origin.
     pub nodes: &'a [[f32; 3]],
-    /// [M] of 6 channels: rotation vector, translation; behind what the rig predicts.
+    /// [M] of 6 channels: rotation vector, translation; the residual of the motion that the rig predicts.
     pub node_motion: &'a Trajectories<V>,
     /// Radians and world units.
     pub node_steps: [f32; 2],
     pub rig: Option<RigMotion<'a>>,
     pub motions: &'a [AttributeMotion<V>],
-    /// Harmonics turn with the nodes.
+    /// Spherical harmonics rotate with the nodes.
     pub turned: bool,
 }
 
@@ -181,7 +181,7 @@ impl<V: Coefficient> Parametric<'_, V> {
         harmonics::turn(out.sh_n, &turns);
     }
 
-    /// The same, but for harmonics, which are as at rest: returns the rotations by which they are turned; empty: by none.
+    /// As `frame_into`, but spherical harmonics are not rotated: returns the rotations to apply to them; empty: none.
     pub fn frame_at_rest(&self, t: u16, out: &mut FrameMut) -> Vec<Quat> {
         let basis = &basis(self.frames, t.min(self.frames.saturating_sub(1)))[..];
         let rest = self.rest;
@@ -242,13 +242,14 @@ impl<V: Coefficient> Parametric<'_, V> {
         );
     }
 
-    /// What the nodes alone do at frame `t`: where each Gaussian is carried, and by which rotation.
+    /// Motion by the nodes alone at frame `t`: carried position and rotation of each Gaussian.
     pub fn carried_into(&self, t: u16, means: &mut [[f32; 3]], rotations: &mut [Quat]) {
         let basis = &basis(self.frames, t.min(self.frames.saturating_sub(1)))[..];
         self.carry(basis, (means, rotations), |_, q| q);
     }
 
-    /// Spec 13.3. `turned`: index of a Gaussian and the rotation by which it is carried -> the quaternion to be written.
+    /// Spec 13.3. `turned`: index of a Gaussian and the rotation by which it is carried -> the quaternion to be
+    /// written.
     fn carry(&self, basis: &[f32], out: (&mut [[f32; 3]], &mut [Quat]), turned: impl Fn(usize, Quat) -> Quat + Sync) {
         let (origin, rest) = (self.origin, &self.rest.means[..]);
         if self.blend.per == 0 {

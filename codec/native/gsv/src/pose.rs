@@ -1,5 +1,5 @@
-//! The transform of a track (spec 2.8): rotation, translation and uniform scale, applied to the Gaussians of a frame, with the
-//! rotation of their spherical harmonics.
+//! The transform of a track (spec 2.8): rotation, translation and uniform scale, applied to the Gaussians of a frame,
+//! with the rotation of their spherical harmonics.
 
 use crate::dequantize::{Quat, multiply};
 use crate::harmonics::Turn;
@@ -29,7 +29,7 @@ impl Default for Pose {
 }
 
 impl Pose {
-    /// The pose at the share `f` of the way from `a` to `b`.
+    /// The pose at the fraction `f` of the way from `a` to `b`.
     pub fn between(a: &Pose, b: &Pose, f: f32) -> Pose {
         let mix = |p: f32, q: f32| p + f * (q - p);
         let (p, q) = (normalized(a.rotation), normalized(b.rotation));
@@ -90,6 +90,6 @@ mod tests {
             ..Pose::default()
         };
         let half = Pose::between(&turn(3.0), &turn(-3.0), 0.5).rotation;
-        assert!(half[0].abs() < 1e-5, "{half:?}"); // by pi, not by 0
+        assert!(half[0].abs() < 1e-5, "{half:?}"); // halfway is a rotation by pi, not by 0
     }
 }

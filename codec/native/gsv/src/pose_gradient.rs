@@ -1,7 +1,8 @@
-//! Training: from the gradient by the poses of nodes (`RigidBlend::backward`) to that by the variables that move them, and the
-//! gradient of the as-rigid-as-possible term of their graph (Sorkine and Alexa 2007).
+//! Training: gradient by the poses of nodes (`RigidBlend::backward`) -> gradient by the turns and shifts that move the
+//! nodes, and the gradient of the as-rigid-as-possible term of their graph (Sorkine and Alexa 2007).
 //!
-//! A node turns by a rotation vector behind a base rotation, and is shifted: q = unit(quaternion(turn) base), p = base + shift.
+//! A node is rotated by a base rotation and then by a rotation vector (turn), and is shifted: q = unit(quaternion(turn)
+//! base), p = base + shift.
 
 use crate::dequantize::{Quat, multiply};
 use crate::rigid_blend::{Pose, matrix};
@@ -10,10 +11,10 @@ use crate::rigid_blend::{Pose, matrix};
 const LEAST_SQUARE: f32 = 1e-16;
 /// Half an angle below which its series is exact to f32.
 const SMALL: f32 = 1e-2;
-/// Keeps the length of an edge that is rigid differentiable.
+/// Keeps the length of the deviation of an edge from rigid motion differentiable at 0.
 const LEAST_EDGE: f32 = 1e-12;
 
-/// M nodes, and where they are.
+/// M nodes and their motion.
 pub struct Moved<'a> {
     /// [M] positions at rest.
     pub rest: &'a [[f32; 3]],
@@ -25,16 +26,17 @@ pub struct Moved<'a> {
     pub positions: &'a [[f32; 3]],
 }
 
-/// Edges of the graph, `per` of each node, and what the term weighs in the loss.
+/// Edges of the graph, `per` of each node, and the weight of the term in the loss (`strength`).
 pub struct Edges<'a> {
     pub per: usize,
-    /// [M, per] nodes; [M, per] weights of the difference between an edge as it is and as its node rotates it.
+    /// [M, per] nodes at the other ends; [M, per] weights of the difference between an edge and its rest edge rotated
+    /// by the node.
     pub index: &'a [u32],
     pub weights: &'a [f32],
     pub strength: f32,
 }
 
-/// Gradients by the turns and by the shifts; `by_poses`: [M], by the poses that `rigid_blend::pose` makes of the nodes.
+/// Gradients by the turns and by the shifts; `by_poses`: [M], by the poses that `rigid_blend::pose` returns.
 pub fn backward(nodes: &Moved, by_poses: &[Pose], edges: &Edges) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
     let turned: Vec<Turn> = nodes
         .turns

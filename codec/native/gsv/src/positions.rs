@@ -1,8 +1,9 @@
 //! Positions (spec 8): a sorted multiset of grid points <-> bins.
 //!
-//! An octree, breadth first, whose nodes know how many points they hold. One question, how many points are in the lower
-//! half, codes emptiness, single points and duplicates; its contexts are the points of the face neighbours. A point with few
-//! neighbours leaves the tree and its remaining bits are coded plainly, since they can hardly be predicted.
+//! An octree, breadth first, whose nodes know how many points they hold. One syntax element, the number of points in
+//! the lower half, codes emptiness, single points and duplicates; its contexts are the points of the face neighbours. A
+//! point with few neighbours leaves the tree and its remaining bits are bypass bins, since they can hardly be
+//! predicted.
 
 mod octree;
 mod split;
@@ -21,7 +22,7 @@ pub fn encode(model: &mut SplitModel, points: &[u64], bits: u32) -> Vec<u8> {
     c.finish()
 }
 
-/// Decodes `count` points; returns their sorted Morton codes, or what was expected of the payload.
+/// Decodes `count` points; returns their sorted Morton codes, or an error message.
 pub fn decode(model: &mut SplitModel, payload: &[u8], count: u32, bits: u32) -> Result<Vec<u64>, &'static str> {
     let mut c = Decoder::new(payload);
     let points = code(&mut c, model, &[], count, bits);

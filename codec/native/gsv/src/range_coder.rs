@@ -1,8 +1,9 @@
 //! Range coder (spec 6.1): bins, bits and symbols with their probabilities <-> bytes.
 //!
-//! The models use the trait `Bins`, which encoder and decoder implement, so that every syntax element is described once: the
-//! encoder's methods write their argument and return it, the decoder's ignore their argument and return what they read.
-//! Carries are resolved with a pending byte and a run length, as in LZMA; the first byte, always 0, is left out.
+//! The models use the trait `Bins`, which encoder and decoder implement, so that every syntax element is described
+//! once: the encoder's methods write their argument and return it, the decoder's ignore their argument and return the
+//! value read. Carries are resolved with a pending byte and a run length, as in LZMA; the first byte, always 0, is left
+//! out.
 
 use crate::lanes::count;
 
@@ -12,10 +13,10 @@ pub trait Bins {
     const DECODES: bool;
     /// One bin; `p` is the probability of 1 times 65536, in 1..=65535.
     fn bin(&mut self, bin: bool, p: u32) -> bool;
-    /// False once the decoder has read further beyond the end than an encoder may leave off: the caller may stop.
+    /// False once the decoder has read more bytes beyond the end than an encoder may omit: the caller may stop.
     fn alive(&self) -> bool;
 
-    /// One of `SYMBOLS`; `ends` are the ends of their intervals within 65536, that of the last one modulo 65536.
+    /// One of `SYMBOLS`; `ends` are the ends of their intervals within 65536, the last end modulo 65536.
     fn symbol(&mut self, symbol: usize, ends: &Ends) -> usize;
     /// `n` bits of probability one half, at most `BITS_MAX`.
     fn few_bits(&mut self, value: u32, n: u32) -> u32;
@@ -51,7 +52,7 @@ const TOP: u32 = 1 << 24;
 
 /// The encoder.
 pub struct Encoder {
-    low: u64, // 33 bits: bit 32 is a carry into what is pending
+    low: u64, // 33 bits: bit 32 is a carry into the pending bytes
     range: u32,
     pending: u8,
     run: u64, // bytes 0xFF that follow `pending`
@@ -100,8 +101,8 @@ impl Encoder {
         }
     }
 
-    /// Ends the payload with the value in the final interval that has the most trailing zero bits; at most four zero bytes
-    /// are left off.
+    /// Ends the payload with the value in the final interval that has the most trailing zero bits; at most four zero
+    /// bytes are left off.
     pub fn finish(mut self) -> Vec<u8> {
         for bits in (0..=31u32).rev() {
             let mask = (1u64 << bits) - 1;
@@ -187,8 +188,7 @@ impl<'a> Decoder<'a> {
         u32::from_be_bytes(std::array::from_fn(byte))
     }
 
-    /// Narrows the range to `length` from `start` on. Without branches: prediction would fail on how many bytes are
-    /// consumed.
+    /// Narrows the range to `length` from `start` on. Without branches: the number of consumed bytes is unpredictable.
     #[inline]
     fn take(&mut self, start: u32, length: u32) {
         let shift = length.leading_zeros() & 24;
@@ -198,7 +198,7 @@ impl<'a> Decoder<'a> {
         self.position += shift as usize / 8;
     }
 
-    /// Checks that the payload was used up exactly (spec 6.1); otherwise what is wrong with it.
+    /// Checks that the payload was used up exactly (spec 6.1); otherwise returns the message.
     pub fn finish(self) -> Result<(), &'static str> {
         if self.position < self.payload.len() {
             return Err("the payload to end with its last bin, found more bytes");

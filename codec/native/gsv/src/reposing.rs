@@ -1,5 +1,5 @@
-//! A coded group with a rig, posed anew: other bytes in the unit of the joints' poses, other bounds of tiles in the header; all
-//! other units stay as they are, to the byte.
+//! Reposing of a coded group with a rig: new bytes in the unit of the joint poses, new bounds of tiles in the header;
+//! all other units keep their bytes.
 
 use crate::decode::{Decoding, decode_group};
 use crate::encode::joint_poses;

@@ -1,8 +1,8 @@
-//! The rig of a group (spec 11.1, 11.2): joints, the pose in which the group rests, which joints move each node, and the
-//! poses of the joints over the frames <-> bins.
+//! The rig of a group (spec 11.1, 11.2) <-> bins: joints, the bind pose, in which the group rests, the weights by which
+//! joints move each node, and the poses of the joints over the frames.
 //!
-//! The rig predicts the motion of the nodes (skinning.rs); the trajectories of the nodes are what is left. Poses are a unit
-//! of their own, so that a stream is posed anew by other bytes of that unit alone.
+//! The rig predicts the motion of the nodes (skinning.rs); the trajectories of the nodes are the residual. Poses are a
+//! unit of their own, so a stream is reposed by new bytes of that unit alone.
 
 use crate::neighbors::{NEAR, Near};
 use crate::range_coder::Bins;
@@ -23,11 +23,11 @@ const CLASSES: usize = 3;
 /// J joints that move M nodes, in integers.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Rig {
-    /// [J] places in the pose of rest of the skeleton, in grid steps from the origin.
+    /// [J] positions in the rest pose of the skeleton, in grid steps from the origin.
     pub joints: Vec<[i32; 3]>,
     /// [J] parent of each joint, at most its own index; its own index: a root.
     pub parents: Vec<u8>,
-    /// [J] pose in which the group rests, in steps.
+    /// [J] bind pose, in which the group rests, in steps.
     pub bind: Vec<[i32; CHANNELS]>,
     /// [M, J] weights of 0 to `WEIGHT_MAX`.
     pub weights: Vec<u8>,
@@ -35,8 +35,8 @@ pub struct Rig {
     pub poses: Trajectories,
 }
 
-/// Codes all of a rig of `joints` joints but the poses. `near`: neighbours of each node among the nodes; `source`: the rig to
-/// encode, in the decoder empty. None: a forbidden value was read, or the payload is over.
+/// Codes a rig of `joints` joints without its poses. `near`: neighbours of each node among the nodes; `source`: the rig
+/// to encode, in the decoder empty. None: a forbidden value was read, or the payload is over.
 pub fn code<C: Bins>(c: &mut C, joints: usize, near: &[Near], source: &Rig) -> Option<Rig> {
     let (mut model, mut out) = (ValueModel::new(CLASSES), Rig::default());
     for j in 0..joints {
@@ -103,7 +103,7 @@ fn weights<C: Bins>(
     Some(())
 }
 
-/// Codes poses of at most `frames` coefficients of joints with these parents. `source`: as of `code`.
+/// Codes poses of at most `frames` coefficients of joints with these parents. `source`: as in `code`.
 pub fn code_poses<C: Bins>(
     c: &mut C,
     parents: &[u8],
@@ -115,7 +115,7 @@ pub fn code_poses<C: Bins>(
     code_trajectories(c, &mut model, usize::from(frames), &ancestors(parents), source, budget)
 }
 
-/// For each joint its parent, the parent of that, and so on.
+/// Ancestors of each joint, the parent first, at most `NEAR`.
 fn ancestors(parents: &[u8]) -> Vec<Near> {
     let mut out: Vec<Near> = Vec::with_capacity(parents.len());
     for (j, parent) in parents.iter().enumerate() {

@@ -1,14 +1,14 @@
 //! Rigid motions of nodes, blended over the Gaussians that they carry (spec 13.3), and the gradient of the blend.
 //!
-//! Poses of the nodes at one frame + neighbours and weights -> where each Gaussian is carried, and by which rotation. The player,
-//! the encoder's reconstruction and training all use this one; only training needs the gradient.
+//! In: poses of the nodes at one frame, neighbours and weights. Out: carried position and rotation of each Gaussian.
+//! The player, the encoder's reconstruction and training share this code; only training needs the gradient.
 
 use crate::blend::Blend;
 use crate::dequantize::{Quat, plus};
 use rayon::prelude::*;
 
-/// Motion of one node: x -> R x + s as the columns of R and s, then the quaternion of R. All of four numbers, so that a blend is
-/// a weighted sum of registers.
+/// Motion of one node: x -> R x + s as the columns of R and s, then the quaternion of R. Each row has four numbers, so
+/// that a blend is a weighted sum of registers.
 pub type Pose = [[f32; 4]; 5];
 pub const REST: Pose = [
     [1.0, 0.0, 0.0, 0.0],
@@ -47,10 +47,10 @@ impl RigidBlend {
         RigidBlend { poses, aligned }
     }
 
-    /// Carries Gaussians: writes what `finish` makes of the index of each, its carried position and its rotation.
+    /// Carries Gaussians: writes the results of `finish(index, carried position, rotation)`.
     ///
     /// # Arguments
-    /// * `rest`: positions at rest; `out`: means and rotations; as many of each as `blend` has rows.
+    /// * `rest`: rest positions; `out`: means and rotations; `blend` has one row for each.
     pub fn carry(
         &self,
         blend: &Blend,
@@ -97,7 +97,7 @@ impl RigidBlend {
         sum
     }
 
-    /// Where one point is carried, and its rotation. `index`, `weight`: a row of a blend.
+    /// Carried position of one point, and its rotation. `index`, `weight`: a row of a blend.
     #[inline(never)]
     pub fn carry_one(&self, x: [f32; 3], index: &[u32], weight: &[f32]) -> ([f32; 3], Quat) {
         self.blended(x, index, weight)

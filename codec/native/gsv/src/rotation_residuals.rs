@@ -1,8 +1,8 @@
-//! Quantization of rotation residuals (spec 13.1): quaternions -> the integers of quats, by rate-distortion cost. The mirror
-//! of `dequantize::rotations`.
+//! Quantization of rotation residuals (spec 13.1): quaternions -> the integers of quats, by rate-distortion cost. The
+//! mirror of `dequantize::rotations`.
 //!
-//! Each residual refers to the decoded quaternion of the neighbour, so errors do not accumulate. A Gaussian with sorted axes
-//! has four equivalent quaternions (forms); the one with the smallest residual is coded.
+//! Each residual refers to the decoded quaternion of the neighbour, so errors do not accumulate. A Gaussian with sorted
+//! axes has four equivalent quaternions (forms); the one with the smallest residual is coded.
 
 use crate::dequantize::{Quat, before, multiply, rotation_residual};
 use crate::neighbors::Near;
@@ -18,7 +18,7 @@ pub struct RotationResiduals<'a> {
     pub quats: &'a [Quat],
     /// Steps of the three integers of each Gaussian.
     pub steps: &'a [[f32; 3]],
-    /// Bits that an error of one step is worth; an error of x steps is worth x^2 times as many.
+    /// Cost in bits of an error of one step; an error of x steps costs x^2 times as much.
     pub error_bits: &'a [[f32; 3]],
     /// Code lengths in bits: [3, SIDE, SIDE] by channel, context, integer. Empty: all integers cost the same.
     pub lengths: &'a [f32],

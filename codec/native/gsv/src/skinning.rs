@@ -1,5 +1,5 @@
-//! Skinning (spec 13.3): poses of joints -> where the rig moves each node, and by which rotation. Linear blend skinning of the
-//! joints' rigid motions; nothing is predicted from its result, so f32 will do.
+//! Skinning (spec 13.3): joint poses -> positions and rotations of the nodes as the rig predicts them. Linear blend
+//! skinning of the joints' rigid motions; decoding of integers does not depend on its result, so f32 is enough.
 
 use crate::blend::Blend;
 use crate::dequantize::{Quat, multiply};
@@ -14,15 +14,15 @@ type Motion = (Quat, [f32; 3]);
 pub struct Skinning {
     joints: Vec<[f32; 3]>,
     parents: Vec<u8>,
-    /// Inverse of the motion of each joint in the pose in which the group rests.
+    /// Inverse of the motion of each joint in the bind pose, in which the group rests.
     unbind: Vec<Motion>,
     blend: Blend,
 }
 
 impl Skinning {
     /// # Arguments
-    /// * `joints`: [J] places; `parents`: [J], at most the own index, which means a root; `bind`: [J] rotation vector and
-    ///   translation of the pose in which the group rests; `weights`: [M, J].
+    /// * `joints`: [J] positions; `parents`: [J], at most the own index, which means a root; `bind`: [J] rotation
+    ///   vector and translation of the bind pose; `weights`: [M, J].
     pub fn new(joints: Vec<[f32; 3]>, parents: Vec<u8>, bind: &[[f32; CHANNELS]], weights: &[u8]) -> Skinning {
         let mut own = Skinning {
             blend: blend_of(weights, joints.len()),
@@ -34,7 +34,7 @@ impl Skinning {
         own
     }
 
-    /// Motion of each joint from the pose of rest of the skeleton to `poses`.
+    /// Motion of each joint from the rest pose of the skeleton to `poses`.
     fn chain(&self, poses: &[[f32; CHANNELS]]) -> Vec<Motion> {
         let mut out: Vec<Motion> = Vec::with_capacity(self.joints.len());
         for (j, (place, parent)) in self.joints.iter().zip(&self.parents).enumerate() {
@@ -50,7 +50,8 @@ impl Skinning {
         out
     }
 
-    /// Where nodes that rest at `nodes` are in `poses` ([J] rotation vector and translation), and their rotations.
+    /// Carried positions and rotations, in `poses` ([J] rotation vector and translation), of nodes that rest at
+    /// `nodes`.
     pub fn carry(&self, poses: &[[f32; CHANNELS]], nodes: &[[f32; 3]]) -> (Vec<[f32; 3]>, Vec<Quat>) {
         let moved = self.chain(poses).into_iter().zip(&self.unbind);
         let mut motions: Vec<Pose> = moved.map(|(to, from)| compose(to, *from)).map(pose_of).collect();
@@ -65,8 +66,8 @@ impl Skinning {
     }
 }
 
-/// Rows of weights [M, J] -> joints of each node, that of the largest weight first, and their shares. A node without weights
-/// has the index J.
+/// Rows of weights [M, J] -> joints of each node, largest weight first, and their shares of the sum. A node without
+/// weights has the index J.
 fn blend_of(weights: &[u8], joints: usize) -> Blend {
     let rows = || weights.chunks(joints.max(1));
     let used = |row: &[u8]| row.iter().filter(|w| **w > 0).count();
@@ -89,7 +90,7 @@ fn blend_of(weights: &[u8], joints: usize) -> Blend {
     blend
 }
 
-/// `v` turned by a unit quaternion.
+/// `v` rotated by a unit quaternion.
 pub fn rotate(q: Quat, v: [f32; 3]) -> [f32; 3] {
     matrix(q).map(|row| row[0] * v[0] + row[1] * v[1] + row[2] * v[2])
 }

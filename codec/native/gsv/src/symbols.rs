@@ -1,7 +1,7 @@
 //! Adaptive symbol models (spec 6.6): one of 32 symbols in three contexts <-> the range coder, in integers only.
 //!
-//! Each context has a distribution that adapts to its symbols; the mean of three, with weights that adapt too, is coded. One
-//! symbol replaces about eight bins; the 16-bit lanes vectorize on every processor (lanes.rs).
+//! Each context has a distribution that adapts to its symbols; the mean of three, with weights that adapt too, is
+//! coded. One symbol replaces about eight bins; the 16-bit lanes vectorize on every processor (lanes.rs).
 
 use crate::blocks::Blocks;
 use crate::lanes::{learned, mean};
@@ -10,7 +10,7 @@ use std::sync::LazyLock;
 
 /// A distribution that has seen this many symbols adapts no slower.
 const SEEN_MAX: u8 = 126;
-/// The same in a model that another tile starts from.
+/// Cap on the number of symbols seen in a distribution that another tile starts from.
 const SEEN_SETTLED: u8 = 30;
 /// Least probability of a symbol, times 65536.
 const LEAST: u16 = 4;
@@ -66,7 +66,7 @@ impl Table {
     }
 }
 
-/// Of a distribution that has seen n symbols: its rate 1 / (n + 1.5) in 1/65536, and its age, 0 to 3.
+/// For a distribution that has seen n symbols: its rate 1 / (n + 1.5) in 1/65536, and its age, 0 to 3.
 static SEEN: LazyLock<[(u16, u8); 256]> = LazyLock::new(|| {
     std::array::from_fn(|n| {
         let age = match n {
@@ -97,7 +97,7 @@ impl SymbolModel {
         }
     }
 
-    /// Prepares the model for the other tiles of a layer: what it has learned from the first one counts less.
+    /// Prepares the model for the other tiles of a layer: the statistics of the first tile count less.
     pub fn settle(&mut self) {
         for t in &mut self.tables {
             t.distributions.settle(|_| ());
@@ -130,7 +130,8 @@ impl SymbolModel {
         }
         ends[SYMBOLS - 1] = 0; // 65536
         let symbol = c.symbol(symbol, &ends);
-        // Each weight follows the share of its distribution in what was expected, and a little of an even one.
+        // Each weight moves towards the share of its distribution in the mixed probability, and a little towards an
+        // equal share.
         let [fa, fb, fd] = [wa * a.half(symbol), wb * b.half(symbol), wd * d.half(symbol)];
         let unit = ((fa + fb + fd) >> 16) + 1;
         for (v, f) in weights.iter_mut().zip([fa, fb]) {

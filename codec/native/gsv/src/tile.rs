@@ -1,7 +1,8 @@
 //! A tile (spec 7): up to 128 x 128 cells of the maps of a layer <-> its streams, one for each kind of content.
 //!
-//! A tile holds survivors of one tile of the reference, or births. Its contexts come from its own Gaussians only. Its models
-//! start from those that the first tile of the layer with such a stream has left, so tiles can be decoded in any order.
+//! A tile holds survivors of one tile of the reference, or births. Its contexts come from its own Gaussians only. Its
+//! models start from the final models of the first tile of the layer with such a stream, so tiles can be decoded in any
+//! order.
 
 use crate::attributes::Attribute;
 use crate::channels::ChannelModel;
@@ -12,7 +13,7 @@ use crate::model::Model;
 use crate::positions::SplitModel;
 use crate::trajectories::{Kind, TrajectoryModel};
 
-/// The content of one stream; trajectories and channels by their place in the header.
+/// The content of one stream; trajectories and channels by their index in the header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stream {
     Deaths,
@@ -82,7 +83,7 @@ pub fn join(streams: &[Vec<u8>]) -> Vec<u8> {
 /// The streams of a tile with their offsets in its payload.
 pub type Parts<'a> = Vec<(usize, &'a [u8])>;
 
-/// Splits the payload of a tile into `count` streams; an error tells where what was expected.
+/// Splits the payload of a tile into `count` streams; an error has the offset and the expected content.
 pub fn split(payload: &[u8], count: usize) -> Result<Parts<'_>, (usize, String)> {
     let mut r = Reader::new(payload);
     let mut sizes = Vec::with_capacity(count);
@@ -154,7 +155,7 @@ impl Models {
         }
     }
 
-    /// Keeps what a stream has learned, if it is the first of its kind.
+    /// Keeps the final model of a stream, if it is the first of its kind.
     pub fn learn(&mut self, stream: Stream, model: StreamModel) {
         match (stream, model) {
             (_, StreamModel::Positions(mut m)) if self.positions.is_none() => {

@@ -1,4 +1,5 @@
-//! Bounds of tiles (spec 4): where the Gaussians of a tile show in any frame of the group, in parts of the grid.
+//! Bounds of tiles (spec 4): box of the visible extent of a tile's Gaussians over all frames of the group, in parts of
+//! the grid.
 
 use crate::evaluate::Evaluator;
 use crate::header::Header;
@@ -8,11 +9,11 @@ use crate::rigid_blend;
 /// Corners of a box, world units.
 pub type Bounds = [[f32; 3]; 2];
 
-/// Parts of the grid along an axis; as many halves lie on both sides of it.
+/// Parts of the grid along an axis; half as many lie on each side of the grid.
 const PARTS: f32 = 32768.0;
 const FIRST: f32 = 16384.0; // the first part of the grid
 const MOST: f32 = 65535.0;
-/// The box holds what a Gaussian shows with this alpha or more.
+/// The box holds the extent of a Gaussian with this alpha or more.
 const ALPHA: f32 = 16.0 / 255.0;
 
 /// Side of a part, world units.
@@ -51,7 +52,8 @@ pub fn set(e: &mut Evaluator) {
 
 const EMPTY: Bounds = [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]];
 
-/// Adds where Gaussian `i` shows: along each axis as far as its standard deviation and its opacity reach.
+/// Extends the box by Gaussian `i`: along each axis by its standard deviation times a factor that follows from its
+/// opacity.
 fn extend([low, high]: &mut Bounds, f: &Frame, i: usize) {
     let opacity = 1.0 / (1.0 + (-f.logit_opacities[i]).exp());
     let reach = (2.0 * (opacity / ALPHA).ln()).max(0.0).sqrt();

@@ -1,6 +1,7 @@
 //! Trajectories (spec 11, 12): DCT-II coefficients of Gaussians or nodes <-> bins.
 //!
-//! Most Gaussians have no coefficients, so storage is sparse: time and memory are proportional to the coefficients present.
+//! Most Gaussians have no coefficients, so storage is sparse: time and memory are proportional to the coefficients
+//! present.
 
 use crate::model::Model;
 use crate::neighbors::{NEAR, Near};
@@ -130,8 +131,8 @@ pub enum Stop {
     Symbols,
 }
 
-/// Codes trajectories of at most `k_max` coefficients. `source`: the trajectories to encode, in the decoder empty; `budget`:
-/// most values to decode.
+/// Codes trajectories of at most `k_max` coefficients. `source`: the trajectories to encode, in the decoder empty;
+/// `budget`: most values to decode.
 pub fn code<C: Bins>(
     c: &mut C,
     model: &mut TrajectoryModel,
@@ -185,7 +186,7 @@ impl TrajectoryModel {
         }
     }
 
-    /// As of `Model`.
+    /// See `Counter::settle`.
     pub fn settle(&mut self) {
         self.lengths.settle();
         self.values.settle();

@@ -1,7 +1,7 @@
 //! Units (spec 3): a group payload <-> the group header and typed, checksummed pieces.
 //!
-//! The header has a directory of the units: type, layer, index, size and checksum of each. So damage never hides where the
-//! next unit begins, and a reader that has the header can fetch the units that it wants.
+//! The header has a directory of the units: type, layer, index, size and checksum of each. So damage never hides where
+//! the next unit begins, and a reader that has the header can fetch the units that it wants.
 
 use crate::crc::crc32;
 use crate::error::{Error, Result};
@@ -52,7 +52,7 @@ impl UnitType {
     }
 }
 
-/// What the directory tells of a unit.
+/// Directory entry of a unit.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Entry {
     pub number: u8,
@@ -83,7 +83,7 @@ impl Entry {
     }
 }
 
-/// What identifies a unit in a group: type, layer, and the index of a tile, or the attribute of a correction.
+/// Key of a unit in a group: type, layer, and the index of a tile, or the attribute of a correction.
 pub type UnitKey = (UnitType, u8, u16);
 
 /// One unit of a group; unit 0 is the group header. `kind` is None for a type that this version skips.
@@ -99,7 +99,7 @@ pub struct Unit<'a> {
     pub size: usize,
     pub payload: &'a [u8],
     crc: u32,
-    /// What was expected, if the unit is damaged.
+    /// The error, if the unit is damaged.
     pub damage: Option<Error>,
 }
 
@@ -145,9 +145,9 @@ pub fn split(payload: &[u8], layers: usize) -> Result<Vec<Unit<'_>>> {
 
 /// Splits a group payload and marks damaged units (spec 3): a wrong CRC, or cut off by the end of the payload.
 ///
-/// Returns the units of the first `layers` layers only; the payload may end anywhere behind them. Of the tiles only those for
-/// which `wanted(layer, index)` holds; the bytes of the others are not looked at, and are not there where the payload is
-/// `packed`.
+/// Returns the units of the first `layers` layers only; the payload may end anywhere behind them. Of the tiles it
+/// returns those with `wanted(layer, index)`; the bytes of other tiles are not read, and a `packed` payload does not
+/// have them.
 ///
 /// # Errors
 /// The header is damaged, or its directory breaks a rule.
@@ -210,7 +210,7 @@ pub fn scan(payload: &[u8], layers: usize, packed: bool, wanted: impl Fn(u8, u16
     Ok(checked(units))
 }
 
-/// Compares the checksums of units, which were cut off or are as the directory says.
+/// Compares the checksums of units that are not cut off with the directory.
 fn checked(mut units: Vec<Unit>) -> Vec<Unit> {
     let computed = parallel::map(&units, |u| crc32(&[u.payload]));
     for (u, computed) in units.iter_mut().zip(computed).skip(1) {

@@ -1,8 +1,9 @@
-//! Values (spec 6.5): an integer of a trajectory <-> bins, in contexts made of the neighbours' integers; and the contexts of
-//! channels.
+//! Values (spec 6.5): an integer of a trajectory <-> bins, in contexts made of the neighbours' integers; and the
+//! contexts of channels.
 //!
-//! A value is coded relative to 0 while the mean of the neighbours is small, so that the contexts learn how reliable the
-//! mean is (most channels are noise around a mean of their own); where the mean is large, relative to the mean.
+//! Where the mean of the neighbours is small, a value is coded relative to 0, so that the contexts learn how reliable
+//! the mean is (most channels are noise around a mean of their own). Where the mean is large, the value is coded
+//! relative to it.
 
 use crate::blocks::Blocks;
 use crate::model::{Counter, Mixer, WEIGHTS_NEW, Weights};
@@ -12,8 +13,8 @@ use crate::range_coder::Bins;
 /// Integers stay within +-MAX_VALUE, which f32 holds exactly.
 pub const MAX_VALUE: i32 = 1 << 24;
 
-/// Contexts of one value: zero, sign, 16 magnitudes of each sign, escape. Their order differs from spec 6.5, so that those
-/// of small values of both signs share a cache line.
+/// Contexts of one value: zero, sign, 16 magnitudes of each sign, escape. Their order differs from spec 6.5, so that
+/// those of small values of both signs share a cache line.
 const SLOTS: usize = 64;
 const UNARY: i32 = 16;
 const NEAR_UNARY: usize = 7; // magnitudes of either sign in the first cache line
@@ -61,7 +62,7 @@ pub struct Expected {
     mean: i32,
     /// The value is coded relative to this.
     pub centre: i32,
-    /// 0 to 9: how far the neighbours' values are apart.
+    /// 0 to 9: the spread of the neighbours' values.
     pub spread: usize,
 }
 
@@ -85,7 +86,7 @@ impl Expected {
         }
     }
 
-    /// 0 to 22: the mean, in wider ranges where it is large.
+    /// 0 to 22: the range of the mean; ranges far from 0 are wider.
     #[inline]
     pub fn level(&self) -> usize {
         const FAR: i32 = 23;
@@ -112,7 +113,7 @@ impl Expected {
 }
 
 impl ValueModel {
-    /// As of `Model`.
+    /// See `Counter::settle`.
     pub fn settle(&mut self) {
         self.a.settle(|block| block.iter_mut().for_each(Counter::settle));
         self.b.settle(|block| block.iter_mut().for_each(Counter::settle));

@@ -1,5 +1,5 @@
-//! The demuxer: the result does not depend on how the input is split, a truncated file keeps its whole groups, and nothing
-//! panics.
+//! The demuxer: the result does not depend on how the input is split, a truncated file keeps its whole groups, and
+//! nothing panics.
 
 mod common;
 
@@ -273,7 +273,7 @@ fn layers_can_be_found() {
 const ENTRY: &[u8] =
     b"\0\0\0\x30Opus\0\0\0\0\0\0\0\x01\0\0\0\0\0\0\0\0\0\x02\0\x10\0\0\0\0\xbb\x80\0\0\0\0\0\x0cdOps\0\x02\x01\x38";
 
-/// Two groups of which the first has sound, and the sound.
+/// Two groups, the first one with sound; and the sound.
 fn sounding() -> (Vec<u8>, AudioRun) {
     let track = AudioTrack {
         timescale: 48_000,
@@ -316,7 +316,7 @@ fn sounding() -> (Vec<u8>, AudioRun) {
     ([init, first, second].concat(), run)
 }
 
-/// Spec 2.7, however the bytes come; and without sound it is the same file but for the samples.
+/// Spec 2.7, for any split of the bytes; `read_audio` returns the same samples.
 #[test]
 fn sound_lies_in_front_of_its_group() {
     let (bytes, run) = sounding();
@@ -392,7 +392,7 @@ fn scene() -> (Vec<u8>, usize) {
     ([head.as_slice(), &fragments].concat(), head.len())
 }
 
-/// Spec 2.2, 2.5 and 2.8: each track has its own groups, index, layers and placement, however the bytes come.
+/// Spec 2.2, 2.5 and 2.8: each track has its own groups, index, layers and placement, for any split of the bytes.
 #[test]
 fn tracks_are_found_apart() {
     let (bytes, head) = scene();
@@ -416,7 +416,7 @@ fn tracks_are_found_apart() {
 }
 
 proptest! {
-    /// Damage behind the index costs no track but that in whose bytes it is.
+    /// Damage behind the index costs only the track whose bytes are damaged.
     #[test]
     fn damage_stays_in_its_track(seed in any::<u64>()) {
         let (bytes, head) = scene();
@@ -440,7 +440,7 @@ proptest! {
         prop_assert_eq!(hurt, 1);
     }
 
-    /// No byte of moov or of an index makes a panic, in whichever track one looks.
+    /// No byte of moov or of an index makes a panic, for any track.
     #[test]
     fn damaged_heads_never_panic(seed in any::<u64>()) {
         let (mut bytes, head) = scene();

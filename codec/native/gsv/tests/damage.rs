@@ -152,7 +152,7 @@ fn later_versions() {
         (3, "reserved flags"),
         (9, "reserved flags"),
         (4, "reserved flags"),
-        (65, "reserved flags"), // a predicted group has what its reference has
+        (65, "reserved flags"), // a predicted group has the setting of its reference
         (128, "reserved flags"),
     ] {
         let mut header = header.clone();

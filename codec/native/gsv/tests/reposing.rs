@@ -1,4 +1,4 @@
-//! A group with a rig, posed anew: only the poses and the bounds of tiles change.
+//! Reposing of a group with a rig: only the poses and the bounds of tiles change.
 
 mod common;
 

@@ -118,8 +118,8 @@ proptest! {
     }
 }
 
-/// Any tiles alone are what they are in the whole group, also where the other bytes are zero or left out; so are those of a
-/// group that is predicted from a part.
+/// Any tiles decoded alone equal those of the whole group, also where the other bytes are zero or left out; so do tiles
+/// of a group that is predicted from a part.
 #[test]
 fn tiles_come_alone() {
     let g = group(&tiled());
@@ -178,7 +178,8 @@ fn tiles_come_alone() {
     }
 }
 
-/// Shares of a group, and of one that is predicted from the same share, make up the whole: each tile is in one of them.
+/// Shares of a group, and of one that is predicted from the same share, make up the whole: each tile is in exactly one
+/// share.
 #[test]
 fn shares_make_up_the_whole() {
     let g = group(&tiled());
@@ -279,7 +280,7 @@ fn tiny() -> Shape {
     }
 }
 
-/// Every input error has a message that names what is wrong.
+/// Every input error has a message that names the error.
 #[test]
 fn impossible_groups_are_refused() {
     let refused = |change: fn(&mut Group), part: &str| {

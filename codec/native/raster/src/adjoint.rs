@@ -1,4 +1,5 @@
-//! A rendered image and its gradient, row by row -> the adjoint state of one tile, block by block, for the backward pass.
+//! A rendered image and its gradient, row by row -> the adjoint state of one tile, block by block, for the backward
+//! pass.
 
 use crate::projected::TILE;
 use crate::scene::Background;
@@ -17,7 +18,7 @@ pub struct Adjoint {
 pub struct Pixels<'a> {
     pub image: &'a [f32],
     pub alpha: &'a [f32],
-    /// Sums of weight times depth, and the gradient by them; empty where there is no loss of depth.
+    /// [H, W] sums of weight times depth, and dL/d(sum); empty without a depth loss.
     pub depth: &'a [f32],
     pub grad_depth: &'a [f32],
     pub grad_image: &'a [f32],
@@ -26,8 +27,8 @@ pub struct Pixels<'a> {
 }
 
 impl Pixels<'_> {
-    /// The tile at (x, y). With image = gain sum(w rgb) + T background and alpha = 1 - T, the remainder of the whole pixel,
-    /// g . sum(w rgb) + T (g . background - g_alpha), is g . image - T g_alpha.
+    /// The tile at (x, y). With image = gain sum(w rgb) + T background and alpha = 1 - T, the remainder of the whole
+    /// pixel, g . sum(w rgb) + T (g . background - g_alpha), is g . image - T g_alpha.
     #[inline(always)] // into the kernel, whose wide instructions it needs
     pub fn adjoint(&self, [x, y]: [usize; 2], background: Background) -> Adjoint {
         let mut a = Adjoint {

@@ -1,10 +1,10 @@
-//! Backward pass of one tile: for every Gaussian-tile pair the sums over its pixels that the gradient of the Gaussian is
-//! made of.
+//! Backward pass of one tile: for every Gaussian-tile pair, sums over its pixels, from which the gradient of the
+//! Gaussian follows.
 //!
-//! Front to back, with the arithmetic of the forward pass, so that transmittances agree to the bit and nothing per pixel has
-//! to be stored. With g the gradient of the pixel and D_i = g . rgb_i, dL/dalpha_i = T_i D_i - R_i / (1 - alpha_i). The
-//! remainder R_i (everything behind Gaussian i, background included) starts as the whole pixel and loses w_i D_i at each
-//! step.
+//! Front to back, with the arithmetic of the forward pass, so that transmittances agree to the bit and nothing per
+//! pixel has to be stored. With g the gradient of the pixel and D_i = g . rgb_i, dL/dalpha_i = T_i D_i - R_i / (1 -
+//! alpha_i). The remainder R_i (everything behind Gaussian i, background included) starts as the whole pixel and loses
+//! w_i D_i at each step.
 
 use std::sync::atomic::AtomicU32;
 
@@ -15,15 +15,15 @@ use crate::scene::Background;
 use crate::simd::{Vector, c, dispatch};
 use crate::tile::{BATCH, BLOCK, BLOCKS, Batch, Hits, Local, PIXEL_X, PIXEL_Y, Plane, opacities};
 
-/// Sums over the pixels of a pair. With a = dL/dalpha * alpha (the gradient with respect to ln alpha) and w the blending
-/// weight: a, a u, a v, a u^2, a u v, a v^2, w g (3), w times the gradient of depth; and the largest w.
+/// Sums over the pixels of a pair. With a = dL/dalpha * alpha (the gradient with respect to ln alpha) and w the
+/// blending weight: a, a u, a v, a u^2, a u v, a v^2, w g (3), w times the gradient of depth; and the largest w.
 ///
 /// One cache line, since they are gathered in random order.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
 pub struct Sums(pub [f32; 12]);
 
-/// Where the largest weight is, behind what is summed; the last value is not used.
+/// Index of the largest weight, behind the sums; the last value is not used.
 pub const LARGEST: usize = 10;
 
 impl Sums {
@@ -36,7 +36,8 @@ const VISITS: usize = 64;
 const TOGETHER: usize = 4;
 const ROOM: usize = VISITS + BLOCKS + TOGETHER;
 
-/// Visits of consecutive Gaussians, front to back, and u, v and alpha on their pixels (0 where the Gaussian is not drawn).
+/// Visits of consecutive Gaussians, front to back, and u, v and alpha on their pixels (0 where the Gaussian is not
+/// drawn).
 struct Visits {
     count: usize,
     splat: [u8; ROOM],
@@ -77,7 +78,7 @@ impl Visits {
         }
     }
 
-    /// Appends the visits of a Gaussian, without branches: branch prediction would fail on the number of blocks.
+    /// Appends the visits of a Gaussian, without branches: the number of blocks is unpredictable.
     #[inline(always)]
     fn push(&mut self, splat: usize, mask: u16) {
         let [low, high] = mask.to_le_bytes();
@@ -133,7 +134,7 @@ fn visit<V: Vector, const C: usize>(
     let next = t - drawn;
     let draw = next.ge(c(TRANSMITTANCE_STOP));
     let weight = drawn.select(draw, zero);
-    // where nothing is drawn, the pixel is finished or was so before
+    // where `draw` is false, the pixel is finished now or was finished before
     next.select(draw, t.negative())
         .store(&mut adjoint.transmittance.0[b][at..]);
     let mut d = g[C - 1] * c(s.channels[C - 1]);
@@ -164,7 +165,7 @@ fn visit<V: Vector, const C: usize>(
     acc.1 = acc.1.max(weight);
 }
 
-/// On which blocks each Gaussian of the batch was drawn: bit b of entry i is Gaussian i on block b.
+/// Blocks on which each Gaussian of the batch was drawn: bit b of entry i is Gaussian i on block b.
 #[inline(always)]
 fn transpose(hits: &Hits) -> [u16; BATCH] {
     let mut masks = [0; BATCH];
@@ -178,7 +179,8 @@ fn transpose(hits: &Hits) -> [u16; BATCH] {
     masks
 }
 
-/// `hits`: the `seen` masks of the forward pass for the batches of the tile; `sums` gets one row per pair. `C` as of `blend`.
+/// `hits`: the `seen` masks of the forward pass for the batches of the tile; `sums` gets one row per pair. `C` as in
+/// `blend`.
 #[inline(always)]
 fn backward_kernel<V: Vector, const C: usize>(
     projected: &[Projected],

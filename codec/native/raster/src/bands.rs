@@ -1,5 +1,6 @@
-//! Splits the projected Gaussians of an image into k bands of rows, for workers that share no memory: each worker draws its
-//! band with `Rasterizer::draw`. Bands start at multiples of TILE rows, so the pixels are the same as without bands.
+//! Splits the projected Gaussians of an image into k bands of rows, for workers that share no memory: each worker draws
+//! its band with `Rasterizer::draw`. Bands start at multiples of TILE rows, so the pixels are the same as without
+//! bands.
 
 use crate::projected::{MANY, Projected, TILE};
 use crate::size::Size;
@@ -31,7 +32,8 @@ impl Bands {
         &self.bands
     }
 
-    /// Bands whose rows of tiles end at `ends`, as `ends()` gives them: those of an image of which others draw other Gaussians.
+    /// Bands that end at the rows of tiles `ends`, as `ends()` gives them: for images whose other Gaussians other
+    /// workers project.
     pub fn split_at(&mut self, projected: &[Projected], size: Size, ends: &[usize]) -> &[Band] {
         self.measure(projected, size);
         let rows = self.load.len();
@@ -102,7 +104,7 @@ impl Band {
             if p.visible() && y0 <= bottom && y1 >= top {
                 let tiles = [x0, x1, y0.max(top) - top, y1.min(bottom) - top];
                 let y = p.y - self.first as f32;
-                // the rows above are gone, and those below
+                // without the rows of tiles above and below the band
                 let met = if p.met == MANY {
                     MANY
                 } else {
@@ -204,7 +206,7 @@ mod tests {
         }
     }
 
-    /// Bands of parts of the Gaussians, cut where the sum of their loads says, hold what those of all hold.
+    /// Bands of parts of the Gaussians, cut by the sum of their loads, hold the same Gaussians as the bands of all.
     #[test]
     fn bands_of_parts() {
         let all = scene(3000);

@@ -1,8 +1,8 @@
 //! EWA splatting: a Gaussian in the world -> its 2-D covariance and view-dependent colour, for any vector of lanes.
 //!
 //! Both the projection and its backward pass evaluate these functions; the backward pass computes them again instead of
-//! storing them. The covariance is M M^T with M = J W R S (2x3): positive semi-definite by construction, and its determinant
-//! follows from the cross product of the rows (Cauchy-Binet) without the cancellation of ac - b^2.
+//! storing them. The covariance is M M^T with M = J W R S (2x3): positive semi-definite by construction, and its
+//! determinant follows from the cross product of the rows (Cauchy-Binet) without the cancellation of ac - b^2.
 
 use crate::constants::FOV_MARGIN;
 use crate::scene::View;
@@ -166,7 +166,7 @@ pub fn direction<V: Vector>(soa: &Soa, lens: &Lens, at: usize) -> ([V; 3], V) {
     ([d[0] * inv, d[1] * inv, d[2] * inv], inv)
 }
 
-/// A direction as the harmonics see it: turned back where they are turned.
+/// A direction in the frame of the spherical harmonics: rotated back where they are rotated.
 #[inline(always)]
 pub fn seen<V: Vector>(soa: &Soa, dir: [V; 3], at: usize) -> [V; 3] {
     if !soa.turned {
@@ -176,7 +176,7 @@ pub fn seen<V: Vector>(soa: &Soa, dir: [V; 3], at: usize) -> [V; 3] {
     turn([w, -x, -y, -z], dir)
 }
 
-/// `v`, turned by a unit quaternion.
+/// `v`, rotated by a unit quaternion.
 #[inline(always)]
 pub fn turn<V: Vector>([w, x, y, z]: [V; 4], v: [V; 3]) -> [V; 3] {
     let u = [x, y, z];

@@ -1,8 +1,8 @@
-//! Alpha blending of one tile, front to back: the Gaussian-tile pairs of the tile -> colour and transmittance per pixel, and
-//! depth where a loss asks for it.
+//! Alpha blending of one tile, front to back: the Gaussian-tile pairs of the tile -> colour and transmittance per
+//! pixel, and depth where a loss asks for it.
 //!
-//! The transmittance of a finished pixel is negated: its magnitude stays the final transmittance, and every later test on it
-//! fails, so no mask of finished pixels is needed.
+//! The transmittance of a finished pixel is negated: its magnitude stays the final transmittance, and every later test
+//! on it fails, so no mask of finished pixels is needed.
 
 use std::sync::atomic::AtomicU32;
 
@@ -44,8 +44,9 @@ impl Canvas {
     }
 }
 
-/// Blends the Gaussians of the batch whose bit in `hits` is set onto one vector of pixels. Returns the bits of those that
-/// were visited before all pixels were finished, and whether any pixel is unfinished. `C` = 3: colours; 4: and depth.
+/// Blends the Gaussians of the batch whose bit in `hits` is set onto one vector of pixels. Returns the bits of those
+/// that were visited before all pixels were finished, and whether any pixel is unfinished. `C` = 3: colours; 4: and
+/// depth.
 #[inline(always)]
 fn blend<V: Vector, const C: usize>(batch: &Batch, hits: u64, b: usize, at: usize, canvas: &mut Canvas) -> (u64, bool) {
     let t_row = &mut canvas.transmittance.0[b & 15][at..];
@@ -79,8 +80,8 @@ fn blend<V: Vector, const C: usize>(batch: &Batch, hits: u64, b: usize, at: usiz
     (hits & !rest, V::any(c::<V>(0.0).lt(t)))
 }
 
-/// Blends the first `count` pairs onto the canvas. `seen` gets, for each batch, which Gaussians were drawn on which blocks,
-/// for the backward pass; it is empty if there is none.
+/// Blends the first `count` pairs onto the canvas. `seen` gets, for each batch, the masks of Gaussians drawn on each
+/// block, for the backward pass; it is empty without one.
 #[inline(always)]
 fn forward_kernel<V: Vector, const C: usize>(
     projected: &[Projected],

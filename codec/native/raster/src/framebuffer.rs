@@ -153,7 +153,8 @@ pub fn finish(canvas: &Canvas, background: Background, x: usize, width: usize, b
     }
 }
 
-/// Fills columns that no Gaussian meets with the background: whole stretches of rows, which is faster than tile after tile.
+/// Fills columns that no Gaussian meets with the background: whole stretches of rows, which is faster than tile after
+/// tile.
 pub fn finish_empty(background: Background, columns: Range<usize>, width: usize, band: &mut Surface) {
     if columns.is_empty() {
         return;

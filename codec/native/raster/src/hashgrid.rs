@@ -1,8 +1,9 @@
-//! Multi-resolution hash grid (Instant-NGP, Mueller et al. 2022): [N, 3] in [0, 1] -> [N, L * F], trilinear at each level.
+//! Multi-resolution hash grid (Instant-NGP, Mueller et al. 2022): [N, 3] in [0, 1] -> [N, L * F], trilinear at each
+//! level.
 //!
-//! A level whose vertices fit the table is dense, the others are hashed. A level is one task that walks all points in order:
-//! its part of the table stays in the cache, gradients need no atomics, and results do not depend on the threads. Few points
-//! are less work than waking a thread.
+//! A level whose vertices fit the table is dense, the others are hashed. A level is one task that walks all points in
+//! order: its part of the table stays in the cache, gradients need no atomics, and results do not depend on the
+//! threads. Few points are less work than waking a thread.
 
 mod cell;
 
@@ -14,7 +15,7 @@ use crate::error::{RasterError, check_length};
 use crate::parallel::parallel_for;
 use cell::GridLevel;
 
-/// Points of one task when the outputs of the levels are interleaved; so few are looked up at all levels by one.
+/// Points of one task when the outputs of the levels are interleaved; up to this number, one task looks up all levels.
 const POINTS: usize = 256;
 
 /// Shape of a grid; the table is [entries, F], level after level.

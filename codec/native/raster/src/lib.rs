@@ -1,9 +1,10 @@
 //! CPU rasterizer and training kernels: Gaussians and a view -> image, and gradients back; image loss; Adam; hash grid.
 //!
-//! Forward: scene -> soa -> project (ewa) -> sort -> tile_binning -> tile_passes (forward) -> framebuffer. Backward: adjoint
-//! -> tile_passes (backward) -> project_backward.
+//! Forward: scene -> soa -> project (ewa) -> sort -> tile_binning -> tile_passes (forward) -> framebuffer. Backward:
+//! adjoint -> tile_passes (backward) -> project_backward.
 //!
-//! `simd` is the only place with `unsafe`. This crate never sees bytes of a stream; its inputs may be floats of any value.
+//! `simd` is the only place with `unsafe`. This crate never sees bytes of a stream; its inputs may be floats of any
+//! value.
 
 // Kernels index several arrays in step; iterators over some of them would hide that.
 #![allow(clippy::needless_range_loop)]

@@ -1,9 +1,9 @@
 //! Image loss (1 - lambda) L1 + lambda (1 - SSIM) and its gradient by the image.
 //!
-//! SSIM as in 3D Gaussian Splatting: 11 x 11 Gaussian window of sigma 1.5, zeros outside of the image, mean over pixels and
-//! channels. Images stay interleaved: a row is 3 W values and horizontal taps are 3 apart. Pass 1 (`ssim.rs`) leaves three
-//! derivative maps of the SSIM, pass 2 blurs them back. Where both images are equal for 15 pixels around (the background),
-//! SSIM is 1 and its gradient 0, so both passes visit only the columns that matter to a band of rows.
+//! SSIM as in 3D Gaussian Splatting: 11 x 11 Gaussian window of sigma 1.5, zeros outside of the image, mean over pixels
+//! and channels. Images stay interleaved: a row is 3 W values and horizontal taps are 3 apart. Pass 1 (`ssim.rs`)
+//! leaves three derivative maps of the SSIM, pass 2 blurs them back. Where both images are equal for 15 pixels around
+//! (the background), SSIM is 1 and its gradient 0, so both passes visit only the columns that matter to a band of rows.
 
 use std::ops::Range;
 
@@ -30,7 +30,7 @@ pub struct LossValue {
 pub struct ImageLoss {
     maps: [Vec<f32>; 3],
     partial: Vec<[f64; 3]>,
-    /// Of each row the range of values from the first to the last that differs.
+    /// Per row: the range of values from the first to the last that differs.
     spans: Vec<Range<usize>>,
 }
 
@@ -114,12 +114,12 @@ impl ImageLoss {
     }
 }
 
-/// The columns that a band of rows needs: those with differences in the rows nearer than `reach`, widened by `margin` values
-/// and to whole vectors.
+/// The columns that a band of rows needs: those with differences in the rows nearer than `reach`, widened by `margin`
+/// values and to whole vectors.
 ///
 /// A gradient is nonzero within 10 pixels of a difference, and reads maps 5 pixels further. Pass 2 takes 10 rows and,
-/// rounded up to vectors, at most 45 values; it reads 60 values and 5 rows further, which pass 1 has computed for any band
-/// of such a row.
+/// rounded up to vectors, at most 45 values; it reads 60 values and 5 rows further, which pass 1 has computed for any
+/// band of such a row.
 fn columns(spans: &[Range<usize>], band: &Range<usize>, reach: usize, margin: usize, values: usize) -> Range<usize> {
     let rows = band.start.saturating_sub(reach)..(band.end + reach).min(spans.len());
     let used = spans[rows].iter().filter(|s| !s.is_empty());

@@ -1,10 +1,11 @@
-//! Parallel loop over pieces that own the memory they write. The range, and the buffers that belong to it, are halved until
-//! a piece has at most `grain` items. Pieces depend on the range only, never on the threads, and nothing is allocated.
+//! Parallel loop over pieces that own the memory they write. The range, and the buffers that belong to it, are halved
+//! until a piece has at most `grain` items. Pieces depend on the range only, never on the threads, and nothing is
+//! allocated.
 
 use std::ops::Range;
 
-/// Calls `run(piece, buffers)` for pieces of `range` of at most `grain` items. `cut(work, range, middle)` splits the buffers
-/// of `range` at item `middle`.
+/// Calls `run(piece, buffers)` for pieces of `range` of at most `grain` items. `cut(work, range, middle)` splits the
+/// buffers of `range` at item `middle`.
 pub fn parallel_for<W: Send>(
     range: Range<usize>,
     grain: usize,

@@ -12,8 +12,8 @@ use crate::scene::Splats;
 use crate::simd::{MAGIC, Vector, c, dispatch};
 use crate::soa::{CHUNK, Row, Soa, load_rows};
 
-/// The fields of `Projected` of 16 Gaussians, as rows. The last five hold integers: MAGIC is added, so that they are in the
-/// low bits.
+/// The fields of `Projected` of 16 Gaussians, as rows. The last five hold integers: MAGIC is added, so that they are in
+/// the low bits.
 struct Out([Row; 17]);
 
 #[inline(always)]
@@ -70,8 +70,8 @@ fn project_lanes<V: Vector>(soa: &Soa, lens: &Lens, k: usize, at: usize, out: &m
     meet(&ellipse, [x, y], tiles.map(|tile| tile - c(MAGIC))).store(&mut out.0[16][at..]);
 }
 
-/// First and last column, first and last row of the tiles that the box around (x, y) meets, + MAGIC: the tile of the first
-/// pixel centre at or after an edge, and of the last one at or before it. A tile too many is found out by `meet`.
+/// First and last column, first and last row of the tiles that the box around (x, y) meets, + MAGIC: the tile of the
+/// first pixel centre at or after an edge, and of the last one at or before it. `meet` rejects excess tiles.
 #[inline(always)]
 fn tile_range<V: Vector>(lens: &Lens, [x, y]: [V; 2], [wide, high]: [V; 2]) -> [V; 4] {
     let half = c::<V>(0.5);

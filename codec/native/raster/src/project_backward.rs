@@ -1,5 +1,5 @@
-//! Backward pass of the projection: sums over the pixels of each Gaussian -> gradients of its parameters, 16 Gaussians at a
-//! time.
+//! Backward pass of the projection: sums over the pixels of each Gaussian -> gradients of its parameters, 16 Gaussians
+//! at a time.
 //!
 //! The mirror of project.rs.
 
@@ -78,7 +78,8 @@ impl GradientRows {
 /// Prefetch distance in Gaussians: sums are fetched this far ahead, their places twice as far.
 const AHEAD: usize = 24;
 
-/// Adds up the pairs of `n` Gaussians, in the order of their tiles. Bit i of the mask is set if Gaussian first + i has any.
+/// Adds up the pairs of `n` Gaussians, in the order of their tiles. Bit i of the mask is set if Gaussian first + i has
+/// any.
 #[inline(always)] // into the kernel, whose wide instructions it needs
 fn gather(bins: &TileBins, sums: &[Sums], first: usize, n: usize, rows: &mut [Row; 12]) -> u16 {
     let mut seen = 0;
@@ -102,13 +103,14 @@ fn gather(bins: &TileBins, sums: &[Sums], first: usize, n: usize, rows: &mut [Ro
     seen
 }
 
-/// Gradient by the camera-space mean and by M = J W R S, from those by the projected mean and the covariance.
+/// Gradients by the projected mean and by the 2-D covariance.
 struct Screen<V> {
     mean2d: [V; 2],
     cov: [V; 3], // xx, xy (both halves together), yy
 }
 
-/// dL/dmean2d = C sum(a d), dL/dcov = C sum(a d d^T) C / 2, with C = 2 ln2 L L^T the inverse covariance and (u, v) = L^T d.
+/// dL/dmean2d = C sum(a d), dL/dcov = C sum(a d d^T) C / 2, with C = 2 ln2 L L^T the inverse covariance and (u, v) =
+/// L^T d.
 #[inline(always)]
 fn screen<V: Vector>(e: &Ewa<V>, sums: &[Row; 12], at: usize) -> Screen<V> {
     let r = (c::<V>(WHITEN) / (e.cov[2] * e.det)).sqrt();
@@ -154,7 +156,7 @@ fn quat_backward<V: Vector>(e: &Ewa<V>, d: &[[V; 3]; 3]) -> [V; 4] {
     ]
 }
 
-/// Writes means, quats and log_scales except the part of means that comes from colour. `depth`: gradient by it.
+/// Writes means, quats and log_scales except the part of means that comes from colour. `depth`: gradient by depth.
 #[inline(always)]
 fn geometry<V: Vector>(e: &Ewa<V>, lens: &Lens, s: &Screen<V>, depth: V, at: usize, out: &mut GradientRows) {
     let (two, w) = (c::<V>(2.0), &lens.rotation);

@@ -4,7 +4,8 @@ use crate::constants::LOG2_ALPHA_MIN;
 
 /// Side of a tile in pixels.
 pub const TILE: usize = 16;
-/// Relative and absolute margin of the box and the ellipse, so that rounding never loses a pixel that blending would draw.
+/// Relative and absolute margin of the box and the ellipse, so that rounding never loses a pixel that blending would
+/// draw.
 pub const SLACK: f32 = 1e-3;
 
 /// A Gaussian on the image; x and y in pixels.
@@ -26,8 +27,8 @@ pub struct Projected {
     pub ry: f32,
     /// Tiles that the box meets: first and last column, first and last row.
     pub tiles: [u16; 4],
-    /// Which of these tiles the ellipse meets, if they are at most 2 x 2: bit 2 row + column, from the first ones. Else
-    /// `MANY`.
+    /// Mask of the tiles that the ellipse meets, if the box meets at most 2 x 2: bit 2 row + column, relative to the
+    /// first tile. Else `MANY`.
     pub met: u16,
 }
 
@@ -39,7 +40,7 @@ impl Projected {
         self.rx >= 0.0
     }
 
-    /// Whether it can be seen from somewhere.
+    /// Whether the opacity reaches ALPHA_MIN, so that some view can show it.
     pub fn opaque(&self) -> bool {
         self.log2_opacity >= LOG2_ALPHA_MIN
     }

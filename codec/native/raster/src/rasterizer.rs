@@ -1,8 +1,8 @@
 //! The rasterizer: its buffers and the order of the passes. Forward: project, sort, bin, blend; backward: tiles, then
 //! Gaussians.
 //!
-//! All buffers are kept from image to image. Work is divided by the input only (16 pixel rows, 256 Gaussians), every task
-//! owns the memory it writes, and sums over pairs have a fixed order: results do not depend on the threads.
+//! All buffers are kept from image to image. Work is divided by the input only (16 pixel rows, 256 Gaussians), every
+//! task owns the memory it writes, and sums over pairs have a fixed order: results do not depend on the threads.
 
 mod backward_pass;
 
@@ -29,8 +29,8 @@ use crate::tile_rect::TileRect;
 /// Gaussians of one task.
 const SHARE: usize = 256;
 
-/// Gaussian-tile pairs that rendering may hold at a time, per Gaussian or in all; 8 bytes each. One tile needs at most two
-/// entries per Gaussian, so halving the tiles always ends.
+/// Gaussian-tile pairs that rendering may hold at a time, per Gaussian or in all; 8 bytes each. One tile needs at most
+/// two entries per Gaussian, so halving the tiles always ends.
 const PAIRS_EACH: usize = 8;
 const PAIRS_FREE: usize = 1 << 20;
 
@@ -177,7 +177,7 @@ impl Rasterizer {
         }
     }
 
-    /// Renders the view. `training` keeps what `backward` needs; `depth`: renders depth besides.
+    /// Renders the view. `training` keeps the inputs of `backward`; `depth`: renders depth, too.
     ///
     /// # Errors
     /// Wrong lengths, an empty or too large view, too many Gaussian-tile pairs.
@@ -245,8 +245,8 @@ impl Rasterizer {
         self.draw_tiles(&mut surface, TileRect::of(size), size, background, training)
     }
 
-    /// Bins and blends a rectangle of tiles. If its pairs exceed the memory limit, both halves one after the other; not in
-    /// training, where the backward pass needs all pairs.
+    /// Bins and blends a rectangle of tiles. If its pairs exceed the memory limit, both halves one after the other; not
+    /// in training, where the backward pass needs all pairs.
     fn draw_tiles(
         &mut self,
         surface: &mut Surface,

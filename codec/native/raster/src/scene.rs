@@ -14,7 +14,7 @@ pub struct Splats<'a> {
     pub sh0: &'a [f32],             // [N, 3]
     pub sh_n: &'a [f32],            // [N, K, 3]
     pub sh_k: usize,                // K = 0, 3, 8 or 15
-    pub turns: &'a [f32],           // [N, 4] wxyz, unit, by which harmonics are turned; empty: they are not
+    pub turns: &'a [f32],           // [N, 4] wxyz, unit, rotations of the harmonics; empty: none
 }
 
 impl Splats<'_> {
@@ -57,7 +57,8 @@ impl Splats<'_> {
 
 /// Gradients, same shapes as `Splats`.
 pub struct Gradients<'a> {
-    /// If true, gradients are added to the present values (of `max_weight` the larger is kept); else they overwrite them.
+    /// If true, gradients are added to the present values (of `max_weight` the larger is kept); else they overwrite
+    /// them.
     pub add: bool,
     pub means: &'a mut [f32],
     pub quats: &'a mut [f32],
@@ -169,7 +170,7 @@ impl View {
     }
 }
 
-/// What the Gaussians are composited over, and the exposure that they are multiplied by.
+/// The background colour under the Gaussians, and the exposure by which the Gaussians are multiplied.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Background {
     pub rgb: [f32; 3],

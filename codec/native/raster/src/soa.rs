@@ -17,7 +17,7 @@ pub struct Soa {
     pub sh0: [Row; 3],
     pub sh_n: [[Row; 3]; 15],
     pub turns: [Row; 4],
-    /// Harmonics are turned.
+    /// The harmonics are rotated.
     pub turned: bool,
 }
 
@@ -82,7 +82,7 @@ fn columns<const D: usize>(rows: &mut [Row; D], flat: &[f32]) {
     }
 }
 
-/// D rows -> [n, D], the mirror of `columns`; 0 where `seen` has no bit; `add`: to what is there.
+/// D rows -> [n, D], the mirror of `columns`; 0 where `seen` has no bit; `add`: adds to the present values.
 #[inline(always)]
 pub fn write_columns<const D: usize>(rows: &[Row; D], seen: u16, add: bool, flat: &mut [f32]) {
     if let ([whole], []) = flat.as_chunks_mut::<D>().0.as_chunks_mut::<CHUNK>()

@@ -1,9 +1,9 @@
 //! Depth sort of the visible Gaussians, nearest first: a stable least-significant-digit radix sort of (depth, index).
 //!
-//! The depths of an image span few exponents, so two digits usually suffice: the low bits, and the others relative to those
-//! of the smallest depth. Ties keep the order of the indices, so the image depends on its input only. A pass counts (the
-//! first one while the keys are made) and moves fixed chunks in parallel; a prefix sum over (digit, chunk) gives each chunk
-//! its places.
+//! The depths of an image span few exponents, so two digits usually suffice: the low bits, and the others relative to
+//! those of the smallest depth. Ties keep the order of the indices, so the image depends on its input only. A pass
+//! counts (the first one while the keys are made) and moves fixed chunks in parallel; a prefix sum over (digit, chunk)
+//! gives each chunk its places.
 
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -43,7 +43,7 @@ impl DepthSort {
         self.places.resize(CHUNKS * BUCKETS, 0);
         let used = projected.len().div_ceil(share);
         self.places[used * BUCKETS..].fill(0); // small scenes fill fewer chunks than the one before
-        // of each chunk: the visible ones, the smallest and the largest depth
+        // per chunk: the number of visible Gaussians, the smallest and the largest depth
         let mut found = [(0, u32::MAX, 0); CHUNKS];
         let chunks = projected.par_chunks(share).zip(self.keys.par_chunks_mut(share));
         let places = self.places.par_chunks_exact_mut(BUCKETS);

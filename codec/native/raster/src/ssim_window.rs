@@ -1,7 +1,8 @@
-//! The 11 x 11 window of SSIM as separable taps over rows of interleaved images: vertical sums into a strip, then horizontal.
+//! The 11 x 11 window of SSIM as separable taps over rows of interleaved images: vertical sums into a strip, then
+//! horizontal.
 //!
-//! A strip is a stretch of columns whose sums live on the stack. Only E[x], E[y], E[x^2 + y^2] and E[xy] are summed, since
-//! SSIM needs the variances only as their sum. Horizontal taps are 3 values apart, one pixel.
+//! A strip is a stretch of columns whose sums live on the stack. Only E[x], E[y], E[x^2 + y^2] and E[xy] are summed,
+//! since SSIM needs the variances only as their sum. Horizontal taps are 3 values apart, one pixel.
 
 use std::ops::Range;
 
@@ -16,7 +17,8 @@ pub const WINDOW: [f32; TAPS] = [
     0.213_005_54, 0.109_360_69, 0.036_000_773, 0.007_598_758, 0.001_028_38,
 ];
 
-/// Values of a strip, and its width with room for the taps on both sides (16, so that 3 * RADIUS fits and vectors align).
+/// Values of a strip, and its width with room for the taps on both sides (16, so that 3 * RADIUS fits and vectors
+/// align).
 pub const STRIP: usize = 384;
 pub const MARGIN: usize = 16;
 pub const WIDE: usize = STRIP + 2 * MARGIN;

@@ -1,8 +1,9 @@
 //! The image side of a training step in one call: render, compare with an 8-bit target image, differentiate.
 //!
-//! Target: unassociated 8-bit colour and optional alpha, composited on the same background as the Gaussians. Loss: the image
-//! loss, plus mask_lambda * mean |alpha - target alpha|, plus depth_lambda * mean |D - alpha d| / d, with D the sum of weight
-//! times depth and d the target depth, where that is known. No buffer with a value per pixel passes through the caller.
+//! Target: unassociated 8-bit colour and optional alpha, composited on the same background as the Gaussians. Loss: the
+//! image loss, plus mask_lambda * mean |alpha - target alpha|, plus depth_lambda * mean |D - alpha d| / d, with D the
+//! sum of weight times depth and d the target depth, where that is known. No buffer with a value per pixel passes
+//! through the caller.
 
 use rayon::prelude::*;
 
@@ -13,14 +14,14 @@ use crate::loss::{ImageLoss, LossValue};
 use crate::rasterizer::Rasterizer;
 use crate::scene::{Background, Gradients, Splats, View};
 
-/// The target of a view: [H, W, 3] and twice [H, W].
+/// The target of a view: rgb [H, W, 3], alpha and depth [H, W].
 #[derive(Clone, Copy)]
 pub struct TargetImage<'a> {
     pub rgb: &'a [u8],
     pub alpha: Option<&'a [u8]>,
     /// World units along the optical axis; 0: unknown.
     pub depth: Option<&'a [f32]>,
-    /// Added by the camera to all light of the Gaussians; the loss compares what is left without it.
+    /// Offset that the camera adds to all light of the Gaussians; the loss compares the images without it.
     pub offset: [f32; 3],
 }
 
@@ -85,7 +86,7 @@ impl Step {
         check_length("target rgb", target.rgb.len(), 3 * pixels)?;
         check_length("target alpha", target.alpha.map_or(pixels, <[u8]>::len), pixels)?;
         check_length("target depth", target.depth.map_or(pixels, <[f32]>::len), pixels)?;
-        // gain sum(w rgb) + (1 - T) offset + T background, less the offset, is that over a background less the offset
+        // gain sum(w rgb) + (1 - T) offset + T background - offset = gain sum(w rgb) + T (background - offset)
         let less = std::array::from_fn(|ch| background.rgb[ch] - target.offset[ch]);
         let shifted = Background {
             rgb: less,
@@ -186,7 +187,7 @@ impl Step {
         });
     }
 
-    /// The loss of depth, a mean over all pixels. Writes its gradient by the sums, and adds that by alpha.
+    /// The depth loss, a mean over all pixels. Writes its gradient by the depth sums, and adds its gradient by alpha.
     fn depth_loss(&mut self, r: &Rasterizer, view: &View, target: Option<&[f32]>, lambda: f32) -> f64 {
         self.grad_depth.clear();
         let Some(target) = target else {
@@ -219,7 +220,7 @@ impl Step {
         self.rows.iter().map(|s| s[7]).sum::<f64>() / pixels as f64
     }
 
-    /// By the gain: sum over pixels of g . (image - T background) / gain; by the offset: sum of g (1 - T).
+    /// Gradient by the gain: sum over pixels of g . (image - T background) / gain; by the offset: sum of g (1 - T).
     fn exposure_gradient(
         &mut self,
         r: &Rasterizer,

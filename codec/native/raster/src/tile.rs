@@ -1,7 +1,7 @@
 //! Layout and batches that the forward and backward tile kernels share.
 //!
-//! A tile is 16 blocks of 4 x 4 pixels, stored block by block, so that a small ellipse touches few vectors. Gaussians are
-//! processed in batches of 64; for each batch a mask tells which Gaussians meet which block.
+//! A tile is 16 blocks of 4 x 4 pixels, stored block by block, so that a small ellipse touches few vectors. Gaussians
+//! are processed in batches of 64; for each batch a mask tells which Gaussians meet which block.
 
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
@@ -50,7 +50,8 @@ pub fn swizzle(x: usize, y: usize) -> (usize, usize) {
     ((y / 4 * 4 + x / 4) & 15, (y % 4 * 4 + x % 4) & 15)
 }
 
-/// A Gaussian relative to one tile: u = l11 x + l21 y + u0, v = l22 y + v0 with x, y in pixels from the corner of the tile.
+/// A Gaussian relative to one tile: u = l11 x + l21 y + u0, v = l22 y + v0 with x, y in pixels from the corner of the
+/// tile.
 #[derive(Clone, Copy, Default)]
 #[repr(C, align(64))]
 pub struct Local {
@@ -67,7 +68,7 @@ pub struct Local {
 }
 
 impl Local {
-    /// One that meets no pixel.
+    /// A Gaussian that meets no pixel.
     const NOWHERE: Local = Local {
         l11: 0.0,
         l21: 0.0,

@@ -1,10 +1,10 @@
-//! Tile binning: depth-sorted Gaussians -> for each 16 x 16 tile the Gaussians whose ellipse (alpha >= ALPHA_MIN) meets it,
-//! in depth order.
+//! Tile binning: depth-sorted Gaussians -> for each 16 x 16 tile the Gaussians whose ellipse (alpha >= ALPHA_MIN) meets
+//! it, in depth order.
 //!
-//! A counting sort. Fixed chunks of the sorted order list and count their tiles in parallel, a prefix sum gives each (tile,
-//! chunk) its first place, and the chunks write their pairs in parallel; the places do not depend on the threads. The
-//! chunk's list then keeps the places instead of the tiles: the backward pass gathers the gradients of a Gaussian from them
-//! in a fixed order.
+//! A counting sort. Fixed chunks of the sorted order list and count their tiles in parallel, a prefix sum gives each
+//! (tile, chunk) its first place, and the chunks write their pairs in parallel; the places do not depend on the
+//! threads. The chunk's list then keeps the places instead of the tiles: the backward pass gathers the gradients of a
+//! Gaussian from them in a fixed order.
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
@@ -16,8 +16,8 @@ use crate::simd::prefetch;
 use crate::tile::BATCH;
 use crate::tile_rect::{TileRect, for_tiles};
 
-/// Chunks of the sorted order, which bound the parallelism of binning. Each chunk has a counter per tile, so few Gaussians
-/// are fewer chunks, down to the minimum.
+/// Chunks of the sorted order, which bound the parallelism of binning. Each chunk has a counter per tile, so few
+/// Gaussians are fewer chunks, down to the minimum.
 const CHUNKS: usize = 16;
 const CHUNKS_MIN: usize = 4;
 const CHUNK_SIZE: usize = 4096;
@@ -40,13 +40,14 @@ pub struct TileBins {
     pub pairs: Vec<AtomicU32>,
     /// [N] where the entries of a Gaussian begin; HIDDEN if it is invisible
     owned: Vec<AtomicU32>,
-    /// of each chunk: for each Gaussian the places of its pairs in `pairs`, << 1, with 1 added to the last one; NOWHERE if
-    /// it has none
+    /// of each chunk: for each Gaussian the places of its pairs in `pairs`, << 1, with 1 added to the last one; NOWHERE
+    /// if it has none
     lists: Vec<Vec<u32>>,
     cursors: Vec<u32>, // [chunks, tiles]
 }
 
-/// Makes place for `more` entries from `used` on, and then for a quarter besides; doubling would cost noticeable memory.
+/// Makes room for `more` entries from `used` on, and a quarter of `used` besides; doubling would cost noticeable
+/// memory.
 #[inline(always)]
 fn grow(list: &mut Vec<u32>, used: usize, more: usize) {
     if list.len() < used + more {
@@ -55,8 +56,8 @@ fn grow(list: &mut Vec<u32>, used: usize, more: usize) {
     }
 }
 
-/// Writes the entries of a Gaussian, tile << 1 | last, to the list from `used` on, and counts them per tile. Returns the new
-/// end. At most FEW entries are written without branches, since branch prediction would fail on which tiles are met.
+/// Writes the entries of a Gaussian, tile << 1 | last, to the list from `used` on, and counts them per tile. Returns
+/// the new end. At most FEW entries are written without branches, since the met tiles are unpredictable.
 #[inline(always)]
 fn append(p: &Projected, tiles: &TileRect, count: &mut [u32], list: &mut Vec<u32>, used: usize) -> usize {
     let [x0, x1, y0, y1] = p.tiles.map(usize::from);
@@ -117,8 +118,8 @@ impl TileBins {
         self.first(t) / BATCH + t
     }
 
-    /// Splits `items` of the rows of tiles from `first` on at row `middle`; `start` gives the place of a tile. Empty stays
-    /// empty.
+    /// Splits `items` of the rows of tiles from `first` on at row `middle`; `start` gives the place of a tile. Empty
+    /// stays empty.
     pub fn cut<'a, T>(
         &self,
         items: &'a mut [T],

@@ -1,6 +1,8 @@
-//! The two passes over all tiles of an image: blending onto the framebuffer, and the gradient sums of the Gaussian-tile pairs.
+//! The two passes over all tiles of an image: blending onto the framebuffer, and the gradient sums of the Gaussian-tile
+//! pairs.
 //!
-//! Both run in parallel over rows of tiles. A row owns its pixels and its pairs, so results do not depend on the threads.
+//! Both run in parallel over rows of tiles. A row owns its pixels and its pairs, so results do not depend on the
+//! threads.
 
 use std::ops::Range;
 
@@ -16,8 +18,8 @@ use crate::size::Size;
 use crate::tile::Hits;
 use crate::tile_binning::TileBins;
 
-/// Blends the tiles of `bins` onto `surface` [H, W], front to back. `seen` gets which Gaussians were drawn on which blocks, for
-/// `backward_tiles`: room for all batches, or nothing where no backward pass follows.
+/// Blends the tiles of `bins` onto `surface` [H, W], front to back. `seen` gets the masks of Gaussians drawn on each
+/// block, for `backward_tiles`: room for all batches, or empty without a backward pass.
 pub fn blend_tiles(
     level: SimdLevel,
     projected: &[Projected],
@@ -42,7 +44,7 @@ pub fn blend_tiles(
             ((band, seen), (band_rest, seen_rest))
         },
         &|row, (mut band, mut seen)| {
-            let mut empty = left * TILE; // where the tiles without Gaussians begin that end here
+            let mut empty = left * TILE; // start of the run of empty tiles that ends here
             for column in 0..columns {
                 let t = row.start * columns + column;
                 let range = bins.tile(t);
@@ -78,8 +80,8 @@ pub fn blend_tiles(
     );
 }
 
-/// Sums over the pixels of each pair of `bins` (`sums`: one a pair), from the image and its gradient; `seen` as `blend_tiles`
-/// left it.
+/// Sums over the pixels of each pair of `bins` (`sums`: one a pair), from the image and its gradient; `seen` as
+/// `blend_tiles` left it.
 pub fn backward_tiles(
     level: SimdLevel,
     projected: &[Projected],

@@ -1,8 +1,9 @@
-//! Coefficients of temporal trajectories while a group is trained: their sum at one frame as the decoder has it, and one
-//! step of Adam along the gradient by that sum and by the bits of the coefficients, in one pass over memory.
+//! Coefficients of temporal trajectories in training: their sum at one frame with rounded coefficients, as the decoder
+//! has it, and one step of Adam along the gradient by that sum and by the bits of the coefficients, in one pass over
+//! memory.
 //!
-//! An attribute has K coefficients of V values each, `[K, V]`. Bits are code lengths under a Laplace distribution for each of
-//! the K, with uniform noise in place of rounding.
+//! An attribute has K coefficients of V values each, `[K, V]`. Bits are code lengths under a Laplace distribution for
+//! each of the K, with uniform noise in place of rounding.
 
 use rayon::prelude::*;
 
@@ -16,7 +17,7 @@ const SHARE: usize = 1 << 12;
 const LN_2: f32 = std::f32::consts::LN_2;
 const LOG2_E: f32 = std::f32::consts::LOG2_E;
 
-/// What the bits of the coefficients weigh in the loss.
+/// The weight of the coefficients' bits in the loss.
 #[derive(Clone, Copy, Debug)]
 pub struct BitPrice<'a> {
     /// Loss of one bit.
@@ -29,15 +30,15 @@ pub struct BitPrice<'a> {
 
 /// [K, V] coefficients of one attribute, and the moments of Adam: the first [K, V], the second [V].
 ///
-/// The gradient by coefficient k at a frame is `at[k]` times that by the sum, and the mean square of `at[k]` over the frames
-/// is the same for all k of an orthonormal transform. So the K share one second moment: their mean square.
+/// The gradient by coefficient k at a frame is `at[k]` times that by the sum, and the mean square of `at[k]` over the
+/// frames is the same for all k of an orthonormal transform. So the K share one second moment: their mean square.
 pub struct Trajectories<'a> {
     pub values: &'a mut [f32],
     pub first: &'a mut [f32],
     pub second: &'a mut [f32],
 }
 
-/// sum over k of at[k] * rounded(values[k]) -> out [V]; what is less than `dead_zone` beyond half a step is rounded to 0.
+/// sum over k of at[k] * rounded(values[k]) -> out [V]; rounded(v) = sign(v) round(max(|v| - dead_zone, 0)).
 ///
 /// # Errors
 /// Lengths that disagree.
@@ -135,7 +136,7 @@ pub fn step(
     Ok((0..at.len()).map(add).collect()) // in order: the same on any number of threads
 }
 
-/// Some of the V: their second moments, their gradient, and values and first moments of each coefficient.
+/// A part of the V: their second moments, their gradient, and values and first moments of each coefficient.
 struct Share<'a> {
     second: &'a mut [f32],
     grad: &'a [f32],
@@ -222,7 +223,8 @@ fn advance_kernel<V: Vector>(
 }
 dispatch!(fn advance = advance_kernel(beta: f32, at: f32, grad: &[f32], by_bits: Option<&[f32]>, rate: &[f32], first: &mut [f32], values: &mut [f32]));
 
-/// The bits of some coefficients and their derivative by the log of the scale; `weight` times that by each value -> out.
+/// The bits of some coefficients and their derivative by the log of the scale; `weight` times their derivative by each
+/// value -> out.
 #[inline(always)]
 fn bits_kernel<V: Vector>(values: &[f32], noise: &[f32], scale: f32, weight: f32, out: &mut [f32]) -> [f64; 2] {
     let law = Laplace::new(scale);

@@ -132,7 +132,7 @@ fn config_into<'py>(py: Python<'py>, c: &Config) -> PyResult<Bound<'py, PyDict>>
     Ok(d)
 }
 
-/// ftyp and moov: what opens a file. `config`: of its track; `others`: of its other tracks.
+/// ftyp and moov, the start of a file. `config`: of its first track; `others`: of its other tracks.
 #[pyfunction]
 #[pyo3(signature = (config, others = Vec::new()))]
 pub fn init_segment<'py>(
@@ -146,8 +146,8 @@ pub fn init_segment<'py>(
     Ok(PyBytes::new(py, &out))
 }
 
-/// moof and mdat of one group; sequence numbers count from 1, frames from 0. `audio`: time, (size, duration) of each sample,
-/// and their bytes.
+/// moof and mdat of one group; sequence numbers count from 1, frames from 0. `audio`: time, (size, duration) of each
+/// sample, and their bytes.
 #[pyfunction]
 #[pyo3(signature = (payload, sequence_number, start_frame, frames, sync, config, audio = None))]
 #[allow(clippy::too_many_arguments, clippy::type_complexity)]
@@ -183,7 +183,7 @@ pub fn fragment<'py>(
 /// An index entry: fragment size, frames, sync, and bytes of the fragment that end with each layer.
 type IndexEntry = (u64, u32, bool, Vec<u64>);
 
-/// What precedes the fragments of a finished file: `init` and an index of each track.
+/// The part of a finished file in front of the fragments: `init` and an index of each track.
 #[pyfunction]
 pub fn finish<'py>(
     py: Python<'py>,
@@ -222,8 +222,8 @@ pub fn track_count(py: Python, buffer: &Bound<PyAny>) -> PyResult<usize> {
     whole::tracks(bytes_of(buffer)?.as_slice()?).map_err(|e| raise(py, e))
 }
 
-/// Config and groups of a track of a file in any object with the buffer protocol; only headers are read. Not strict: what an index can
-/// save of a file with damaged headers; `damage` lists group and message.
+/// Config and groups of a track of a file, given as any object with the buffer protocol; only headers are read. Not
+/// strict: an index recovers groups behind damaged headers; `damage` lists group and message.
 #[pyfunction]
 #[pyo3(signature = (buffer, strict = true, track = 0))]
 pub fn demux<'py>(
@@ -259,7 +259,8 @@ pub fn demux<'py>(
     Ok(d)
 }
 
-/// The audio track of a fragmented MP4 of sound alone: timescale, media_start, entry, and samples as (offset, size, duration).
+/// The audio track of a fragmented MP4 of sound alone: timescale, media_start, entry, and samples as (offset, size,
+/// duration).
 #[pyfunction]
 pub fn read_audio<'py>(py: Python<'py>, buffer: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyDict>> {
     let data = bytes_of(buffer)?;

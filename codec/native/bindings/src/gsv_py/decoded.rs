@@ -29,8 +29,9 @@ pub struct DecodedGroup {
 
 #[pymethods]
 impl DecodedGroup {
-    /// `strict`: damage is an error; otherwise `damage` lists what was not decoded. `reference`: the group that a predicted
-    /// one refers to. `layers`: only so many, the payload may end behind them. `tiles`: of each layer, which tiles; None: all.
+    /// `strict`: damage is an error; otherwise `damage` lists the units that were not decoded. `reference`: the group
+    /// that a predicted one refers to. `layers`: number of layers to decode, the payload may end behind them. `tiles`:
+    /// [layer][tile], whether to decode the tile; None: all.
     #[new]
     #[pyo3(signature = (payload, level, strict = true, *, reference = None, layers = ALL_LAYERS, tiles = None))]
     fn new(
@@ -89,7 +90,7 @@ impl DecodedGroup {
         Some(parents_into(py, self.group().parents.as_ref()?))
     }
 
-    /// How many groups back the one is that this one refers to; 0: it is independent.
+    /// How many groups back the reference is; 0: the group is independent.
     #[getter]
     fn reference(&self) -> u16 {
         self.group().header.reference
@@ -105,7 +106,7 @@ impl DecodedGroup {
         quantized(py, &self.evaluator)
     }
 
-    /// What a decoder will make of `group` (a `QuantizedGroup`), worked out without bytes.
+    /// The result of decoding `group` (a `QuantizedGroup`), computed without bytes.
     #[staticmethod]
     #[pyo3(signature = (group, reference = None))]
     fn reconstruct(py: Python, group: &Bound<PyAny>, reference: Option<Py<DecodedGroup>>) -> PyResult<Self> {
@@ -126,7 +127,7 @@ impl DecodedGroup {
         canonical(py, &self.evaluator.parametric(), sh_coefficients(self.sh_degree()))
     }
 
-    /// What the nodes alone do in all frames: means [T, N, 3] f32 and rotations [T, N, 4] f32 wxyz by which Gaussians are carried.
+    /// Motion by the nodes alone in all frames: means [T, N, 3] f32 and rotations [T, N, 4] f32 wxyz of the Gaussians.
     fn carried<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
         carried(py, &self.evaluator.parametric())
     }
@@ -139,8 +140,8 @@ impl DecodedGroup {
         Ok((index, blend.weight.clone().into_pyarray(py).reshape(shape)?.into_any()))
     }
 
-    /// Attributes of frame `t` of all Gaussians, f32: views of one array, since few large pages are had faster than many small ones.
-    /// `pose`: what `pose_at` gives, by which they are placed.
+    /// Attributes of frame `t` of all Gaussians, f32: views of one array, since few large pages are allocated faster
+    /// than many small ones. `pose`: places the Gaussians, as `pose_at` returns it.
     #[pyo3(signature = (t, pose = None))]
     fn frame<'py>(&self, py: Python<'py>, t: u16, pose: Option<PoseTuple>) -> PyResult<Bound<'py, PyDict>> {
         self.check(t)?;
@@ -160,17 +161,18 @@ impl DecodedGroup {
         Ok(self.evaluator.visible(t).map(|v| v.into_pyarray(py)))
     }
 
-    /// What the payload consists of.
+    /// Report of the units and streams of the payload.
     fn units<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
         report::units_into(py, &self.units)
     }
 
-    /// The tiles of each layer, as dicts of gaussians (decoded), low, high: the corners of the box where they show, world units.
+    /// The tiles of each layer, as dicts of gaussians (decoded), low, high: corners of the box of their visible extent,
+    /// world units.
     fn tiles<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
         report::tiles(py, self.group())
     }
 
-    /// Units that are damaged, or need one that is: dicts of unit, type, layer, tile, message.
+    /// Damaged units, and units that need a damaged one: dicts of unit, type, layer, tile, message.
     fn damage<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
         let list = PyList::empty(py);
         for damage in &self.damage {

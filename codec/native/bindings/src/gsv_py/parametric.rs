@@ -45,7 +45,7 @@ pub struct ParametricEvaluator {
 #[pymethods]
 impl ParametricEvaluator {
     /// `canonical`: means, quats, log_scales, logit_opacities, sh0, shN. `trajectories`: (attribute, [K, C, N]) pairs.
-    /// `turned`: harmonics turn with the nodes.
+    /// `turned`: spherical harmonics rotate with the nodes.
     #[new]
     fn new(
         py: Python,
@@ -126,7 +126,7 @@ impl ParametricEvaluator {
         over_time(py, &p, |t, m, q| p.moved_into(t, m, q))
     }
 
-    /// As of `DecodedGroup`.
+    /// See `DecodedGroup.carried`.
     fn carried<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>)> {
         carried(py, &self.parametric())
     }
@@ -150,7 +150,7 @@ impl ParametricEvaluator {
     }
 }
 
-/// [K, C, N] -> those of each Gaussian.
+/// [K, C, N] -> sparse trajectories, one per Gaussian.
 fn sparse(
     py: Python,
     a: &PyReadonlyArray3<f32>,
@@ -192,10 +192,11 @@ fn sparse(
     }))
 }
 
-/// Gaussians whose coefficients are transposed together: what fits a cache.
+/// Gaussians whose coefficients are transposed together, so that they fit a cache.
 const BLOCK: usize = 256;
 
-/// Attributes of a frame, with `k` coefficients of the higher bands: views of one array, since few large pages are had faster than many small ones.
+/// Attributes of a frame, with `k` coefficients of the higher bands: views of one array, since few large pages are
+/// allocated faster than many small ones.
 pub fn frame<'py, V: Coefficient>(
     py: Python<'py>,
     p: &Parametric<V>,
@@ -261,14 +262,14 @@ pub fn canonical<'py, V: Coefficient>(py: Python<'py>, p: &Parametric<V>, k: usi
     Ok(d)
 }
 
-/// Means [T, N, 3] and rotations [T, N, 4] by which the nodes alone carry Gaussians in all frames.
+/// Means [T, N, 3] and rotations [T, N, 4] of the Gaussians, moved by the nodes alone, in all frames.
 pub fn carried<'py, V: Coefficient>(py: Python<'py>, p: &Parametric<V>) -> PyResult<Pair<'py>> {
     over_time(py, p, |t, m, r| p.carried_into(t, m, r))
 }
 
 type Pair<'py> = (Bound<'py, PyAny>, Bound<'py, PyAny>);
 
-/// [T, N, 3] and [T, N, 4] of what `fill` writes for each frame.
+/// [T, N, 3] and [T, N, 4]: the results of `fill` for each frame.
 fn over_time<'py, V: Coefficient>(
     py: Python<'py>,
     p: &Parametric<V>,

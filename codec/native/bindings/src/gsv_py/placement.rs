@@ -20,7 +20,7 @@ pub fn pose_from((rotation, translation, scale): PoseTuple) -> Pose {
     }
 }
 
-/// The default one without a dict, and with {}.
+/// The placement of a dict; the default one for None and for {}.
 pub fn placement_from(d: Option<Bound<PyAny>>) -> PyResult<Placement> {
     let mut out = Placement::default();
     let Some(d) = d else { return Ok(out) };
@@ -50,7 +50,8 @@ pub fn placement_into<'py>(py: Python<'py>, p: &Placement) -> PyResult<Bound<'py
     Ok(d)
 }
 
-/// The pose at time `u` of the scene, in units of the track's timescale: rotation (wxyz), translation, scale. Checks the placement.
+/// The pose at time `u` of the scene, in units of the track's timescale: rotation (wxyz), translation, scale. Checks
+/// the placement.
 #[pyfunction]
 pub fn pose_at(py: Python, placement: Bound<PyAny>, u: f64) -> PyResult<PoseTuple> {
     let placement = placement_from(Some(placement))?;

@@ -1,4 +1,4 @@
-//! What a payload consists of, for reports: each unit, and each stream of a tile.
+//! Report of a payload: each unit, and each stream of a tile.
 
 use gsv::error::Result;
 use gsv::group::Group;
@@ -20,7 +20,7 @@ pub struct UnitReport {
     bytes: usize,
 }
 
-/// The units of a payload. A tile is told as its streams and, as `tile`, the sizes of these.
+/// The units of a payload. A tile is reported as its streams and, as `tile`, the bytes of their size fields.
 pub fn units(payload: &[u8], h: &Header, reference: Option<&Header>, layers: usize) -> Result<Vec<UnitReport>> {
     let mut out = Vec::new();
     for u in unit::scan(payload, layers, false, |_, _| true)? {

@@ -1,4 +1,4 @@
-//! Coded groups posed anew, for Python.
+//! Reposing of coded groups, for Python.
 
 use super::decoded::DecodedGroup;
 use super::group_from::dense;
@@ -10,8 +10,8 @@ use numpy::PyUntypedArrayMethods;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
-/// The payload of a group of level `level` with other poses of its joints: [K, 6, J] i32 DCT coefficients in the steps of its
-/// rig. All units but that of the poses stay as they are. `reference`: the group that a predicted one refers to.
+/// The payload of a group of level `level` with other poses of its joints: [K, 6, J] i32 DCT coefficients in the steps
+/// of its rig. All units but that of the poses stay as they are. `reference`: the group that a predicted one refers to.
 #[pyfunction]
 #[pyo3(signature = (payload, level, poses, reference = None))]
 pub fn repose<'py>(

@@ -1,4 +1,5 @@
-//! Rigs: `gscodec.bitstream.quantized_group.QuantizedRig` <-> `gsv::rig::Rig`, and the motion that a rig in floats predicts.
+//! Rigs: `gscodec.bitstream.quantized_group.QuantizedRig` <-> `gsv::rig::Rig`, and the motion that a rig in floats
+//! predicts.
 
 use super::values::{array, invalid, value};
 use gsv::header::RigHeader;
@@ -52,7 +53,7 @@ fn integers<const C: usize>(d: &Bound<PyAny>, name: &str) -> PyResult<Vec<[i32; 
     }
 }
 
-/// The fields of a `QuantizedRig` but its poses.
+/// The fields of a `QuantizedRig` without its poses.
 pub fn rig_into<'py>(py: Python<'py>, rig: &Rig, header: &RigHeader) -> PyResult<Bound<'py, PyDict>> {
     let d = PyDict::new(py);
     d.set_item("joints", matrix(py, rig.joints.as_flattened(), 3))?;
@@ -71,12 +72,12 @@ fn matrix<'py, T: Element + Copy>(py: Python<'py>, flat: &[T], width: usize) -> 
         .into_any()
 }
 
-/// Where a rig carries points over the frames, [T, M, 3], and by which rotations, [T, M, 4] wxyz (spec 13.3).
+/// Positions [T, M, 3] and rotations [T, M, 4] wxyz of points that a rig carries over the frames (spec 13.3).
 ///
 /// # Arguments
-/// * `skeleton`: joints [J, 3]; parents [J] u8, at most the own index, which means a root; bind [J, 6], the pose in which the points
-///   rest: rotation vector and translation of each joint.
-/// * `poses`: [T, J, 6]. `points`: [M, 3]; `weights`: [M, J] u8, of a point that does not move all 0.
+/// * `skeleton`: joints [J, 3]; parents [J] u8, at most the own index, which means a root; bind [J, 6], the bind pose,
+///   in which the points rest: rotation vector and translation of each joint.
+/// * `poses`: [T, J, 6]. `points`: [M, 3]; `weights`: [M, J] u8, all 0 for a point that does not move.
 #[pyfunction]
 pub fn rig_motion<'py>(
     py: Python<'py>,

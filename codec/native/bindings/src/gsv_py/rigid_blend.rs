@@ -1,4 +1,4 @@
-//! The blend of rigid motions for training and fitting, and its gradient by what moves the nodes.
+//! The blend of rigid motions for training and fitting, and its gradient by the variables that move the nodes.
 
 use super::values::invalid;
 use gsv::blend::Blend;
@@ -34,7 +34,8 @@ pub fn blend_of(
     })
 }
 
-/// The rows of `a`, named `name`, each of `K` numbers: as many as `count` says, else any number, called `letter`.
+/// The rows of `a`, `K` numbers each: `count` rows, or any number if None. `name`, `letter`: `a` and its length in
+/// messages.
 fn rows<'a, const K: usize>(
     a: &'a PyReadonlyArray2<f32>,
     name: &str,
@@ -48,7 +49,7 @@ fn rows<'a, const K: usize>(
     Ok(a.as_slice()?.as_chunks().0)
 }
 
-/// Nodes: positions at rest [M, 3], rotations [M, 4] wxyz about them, positions [M, 3].
+/// Nodes: rest positions [M, 3], rotations [M, 4] wxyz about them, moved positions [M, 3].
 type Nodes<'py> = (Floats<'py>, Floats<'py>, Floats<'py>);
 
 /// The poses of nodes.
@@ -64,9 +65,9 @@ fn poses(nodes: &Nodes) -> PyResult<RigidBlend> {
     Ok(RigidBlend::new(all.map(pose).collect()))
 }
 
-/// Where [N, 3] positions at rest are carried, [N, 3], and by which rotations, [N, 4] wxyz (spec 13.3).
+/// Carried positions [N, 3] and rotations [N, 4] wxyz of points with rest positions [N, 3] (spec 13.3).
 ///
-/// `nodes`: positions at rest [M, 3], rotations [M, 4] about them, positions [M, 3].
+/// `nodes`: rest positions [M, 3], rotations [M, 4] about them, moved positions [M, 3].
 #[pyfunction]
 pub fn blend_rigid<'py>(
     py: Python<'py>,
@@ -92,7 +93,7 @@ pub fn blend_rigid<'py>(
 /// Gradients [M, 3] and [M, 3] of a loss by the turns and by the shifts of nodes (`gsv::pose_gradient`).
 ///
 /// # Arguments
-/// * `nodes`: as of `blend_rigid`, behind the turns [M, 3] of base rotations [M, 4].
+/// * `nodes`: as in `blend_rigid`; `turned`: rotation vectors (turns) [M, 3], base rotations [M, 4] before the turns.
 /// * `blend`: rest [N, 3], neighbors [N, k], weights [N, k].
 /// * `by_carried`: gradients [N, 3] and [N, 4] by the results of `blend_rigid`.
 /// * `edges`: nodes [M, e] u32 at the other ends, their weights [M, e], strength of the rigidity term.
@@ -156,7 +157,7 @@ pub fn quat_product<'py>(
         .into_any())
 }
 
-/// Harmonics [N, K, 3], turned by the unit quaternions [N, 4] (wxyz), or with `back` by their inverse; a new array.
+/// Harmonics [N, K, 3], rotated by the unit quaternions [N, 4] (wxyz), or with `back` by their inverse; a new array.
 #[pyfunction]
 pub fn turned_harmonics<'py>(
     py: Python<'py>,

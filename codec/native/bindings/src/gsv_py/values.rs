@@ -1,4 +1,5 @@
-//! Checked access to what Python passes: fields of dataclasses, arrays of one dtype and shape, bytes; and errors on the way back.
+//! Checked access to values from Python: fields of dataclasses, arrays of one dtype and shape, bytes; and errors on the
+//! way back.
 
 use gsv::error::Error;
 use numpy::{PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
@@ -6,7 +7,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-/// The exception of gscodec.errors that blames the right one.
+/// The exception of gscodec.errors for an error.
 pub fn raise(py: Python, e: Error) -> PyErr {
     let class = match &e {
         Error::Bitstream { .. } => "BitstreamError",
@@ -27,7 +28,8 @@ pub fn invalid<T>(message: String) -> PyResult<T> {
     Err(PyValueError::new_err(message))
 }
 
-/// The bytes of any object with the buffer protocol, without a copy (the stable ABI of Python 3.10 has no buffers, numpy has).
+/// The bytes of any object with the buffer protocol, without a copy (the stable ABI of Python 3.10 has no buffers,
+/// numpy has).
 pub fn bytes_of<'py>(data: &Bound<'py, PyAny>) -> PyResult<PyReadonlyArray1<'py, u8>> {
     let a = data.py().import("numpy")?.call_method1("frombuffer", (data, "uint8"))?;
     a.extract()

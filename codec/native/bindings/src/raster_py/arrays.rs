@@ -1,4 +1,5 @@
-//! What all bindings of the rasterizer take from Python: f32 arrays, the name of an instruction set; and errors on the way back.
+//! Arguments from Python for all bindings of the rasterizer: f32 arrays, the name of an instruction set; and errors on
+//! the way back.
 
 use numpy::{PyReadonlyArrayDyn, PyReadwriteArrayDyn};
 use pyo3::exceptions::{PyOverflowError, PyValueError};
@@ -8,7 +9,7 @@ use raster::{RasterError, SimdLevel};
 pub type In<'py> = PyReadonlyArrayDyn<'py, f32>;
 pub type InOut<'py> = PyReadwriteArrayDyn<'py, f32>;
 
-/// ValueError for wrong arguments, OverflowError for what is too large.
+/// ValueError for wrong arguments, OverflowError for more work than the limits allow.
 pub fn usage(e: RasterError) -> PyErr {
     match e {
         RasterError::TooMany { .. } => PyOverflowError::new_err(e.to_string()),

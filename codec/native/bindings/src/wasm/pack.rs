@@ -1,9 +1,10 @@
 //! Gaussians -> the format of Spark (https://sparkjs.dev, `PackedSplats`), 16 bytes each, for the GPU renderer of the
 //! player.
 //!
-//! r g b opacity, 8 bits each | x, y | z as half floats, rotation axis (octahedral, 8 bits each) | log scales, angle, 8 bits
-//! each. Half floats are relative to an origin in the middle of the scene, where they are most precise. Colours are those of
-//! the view; Gaussians that the view does not show are left out, unless all are asked for (by who moves the camera himself).
+//! r g b opacity, 8 bits each | x, y | z as half floats, rotation axis (octahedral, 8 bits each) | log scales, angle, 8
+//! bits each. Half floats are relative to an origin in the middle of the scene, where they are most precise. Colours
+//! are those of the view; Gaussians that the view does not show are left out, unless all are asked for (by programs
+//! that move the camera).
 
 use gsv::parametric::Frame;
 use raster::Projected;
@@ -12,8 +13,8 @@ use std::f32::consts::PI;
 /// Log scales that the 254 steps of Spark's encoding span.
 const LOG_SCALE: [f32; 2] = [-12.0, 9.0];
 
-/// Appends Gaussians of `frame` to `out`: those that the view shows, or `all` that are not transparent. `projected`: all of
-/// them after projection.
+/// Appends Gaussians of `frame` to `out`: those that the view shows, or `all` that are not transparent. `projected`:
+/// all of them after projection.
 pub fn pack(frame: &Frame, projected: &[Projected], origin: [f32; 3], all: bool, out: &mut Vec<u8>) {
     let shapes = frame.quats.iter().zip(frame.log_scales.as_chunks::<3>().0);
     for ((p, mean), (quat, log_scale)) in projected.iter().zip(&frame.means).zip(shapes) {

@@ -25,12 +25,12 @@ const SLOTS: usize = 255;
 struct Slot {
     group: Evaluator,
     frame: Frame,
-    turns: Vec<[f32; 4]>,        // by which its harmonics are still to be turned; empty: by none
-    at: Option<(u16, Vec<f32>)>, // which frame it is, and its transform
+    turns: Vec<[f32; 4]>,        // rotations still to be applied to its harmonics; empty: none
+    at: Option<(u16, Vec<f32>)>, // frame number and transform of `frame`
 }
 
 impl Slot {
-    /// Turns the harmonics of the frame, which the rasterizer does for less by itself.
+    /// Rotates the harmonics of the frame; the rasterizer can rotate them itself at lower cost.
     fn turn_harmonics(&mut self) {
         harmonics::turn(&mut self.frame.sh_n, &self.turns);
         self.turns.clear();
@@ -86,8 +86,8 @@ impl Player {
         self.output = text::describe(&self.demuxer, first).into_bytes();
     }
 
-    /// Decodes the input to `slot`. The reference of a predicted group is in the slot `reference`. `keep_leading`, `packed`: as
-    /// of `Decoding`.
+    /// Decodes the input to `slot`. The reference of a predicted group is in the slot `reference`. `keep_leading`,
+    /// `packed`: as in `Decoding`.
     pub fn decode(&mut self, slot: usize, how: [u8; 3], keep_leading: bool, packed: bool) -> bool {
         let [level, reference, layers] = how;
         let wanted = std::mem::take(&mut self.wanted);
@@ -139,8 +139,8 @@ impl Player {
         back
     }
 
-    /// Describes the units of a group. Input: the header of its reference in the first `first` bytes, if it is predicted, then
-    /// its own.
+    /// Describes the units of a group. Input: the header of its reference in the first `first` bytes, if it is
+    /// predicted, then its own.
     pub fn index(&mut self, first: usize) -> bool {
         let (before, own) = self.input.split_at(first.min(self.input.len()));
         match describe_units(before, own) {
@@ -285,7 +285,7 @@ impl Player {
     }
 }
 
-/// `text::index` of a header; `before`: that of its reference, or nothing.
+/// `text::index` of a header; `before`: the header of its reference, or nothing.
 fn describe_units(before: &[u8], own: &[u8]) -> Result<String, Error> {
     let mut how = Decoding::at(&LEVELS[LEVELS.len() - 1]);
     let mut reference = Group::default();
@@ -323,7 +323,7 @@ fn splats(slot: Option<&Option<Slot>>) -> Splats<'_> {
     }
 }
 
-/// Places a frame by a transform as of `Player::pose`.
+/// Places a frame by a transform as in `Player::pose`.
 fn place(frame: &mut Frame, [w, x, y, z, a, b, c, scale]: [f32; 8]) {
     if scale > 0.0 {
         let pose = Pose {

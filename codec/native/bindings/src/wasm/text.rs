@@ -9,7 +9,8 @@ use gsv::tile_bounds;
 use gsv::unit::{self, UnitType};
 use std::fmt::Write;
 
-/// {config, tracks, groups, pending, index, layers, complete}; config is null before moov, pending is null except after a moof.
+/// {config, tracks, groups, pending, index, layers, complete}; config is null before moov, pending is null except after
+/// a moof.
 pub fn describe(d: &Demuxer, first: usize) -> String {
     let groups = list(d.groups().iter().skip(first), entry);
     let index = list(d.index().iter(), entry);
@@ -32,9 +33,9 @@ pub fn header(h: &Header, gaussians: usize) -> String {
     )
 }
 
-/// {header, size, tiles, others}: bytes of the header with the eight before it, and of the payload; of each tile of each layer
-/// [gaussians, leading, offset, size, low x, y, z, high x, y, z], its box in world units, null where it is unbounded; of each
-/// other unit [layer, offset, size]. Offsets are from the start of the payload.
+/// {header, size, tiles, others}: bytes of the header with the eight before it, and of the payload; of each tile of
+/// each layer [gaussians, leading, offset, size, low x, y, z, high x, y, z], its box in world units, null where it is
+/// unbounded; of each other unit [layer, offset, size]. Offsets are from the start of the payload.
 pub fn index(h: &Header, directory: &[unit::Entry], start: usize) -> String {
     let mut places: Vec<Vec<[usize; 2]>> = h.tiles.iter().map(|t| vec![[0; 2]; t.len()]).collect();
     let (mut others, mut at) = (Vec::new(), start);

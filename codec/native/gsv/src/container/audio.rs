@@ -1,4 +1,4 @@
-//! The audio track (spec 2.7): what moov says of it, and the samples that lie in front of a group.
+//! The audio track (spec 2.7): its description in moov, and its samples in front of a group.
 
 /// Most samples in front of a group.
 pub const SAMPLES_MAX: usize = 1 << 16;
@@ -9,16 +9,16 @@ pub const ENTRY_MAX: usize = 4096;
 pub struct AudioTrack {
     /// mdhd: units a second.
     pub timescale: u32,
-    /// The media time that is heard with the start of the first frame (elst).
+    /// The media time that is heard at the start of the first frame (elst).
     pub media_start: u32,
     /// The sample entry mp4a or Opus, a whole box.
     pub entry: Vec<u8>,
 }
 
-/// Samples that lie one behind the other.
+/// Consecutive samples.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct AudioRun {
-    /// Of the first byte, from the start of the file.
+    /// File offset of the first byte.
     pub offset: u64,
     /// Media time of the first sample.
     pub time: u64,

@@ -10,9 +10,9 @@ use crate::levels::Level;
 pub const UP_AXES: [&str; 6] = ["x", "y", "z", "-x", "-y", "-z"];
 /// Names of `color_space` values.
 pub const COLOR_SPACES: [&str; 1] = ["srgb"];
-/// Near plane of a camera of a file that names none, world units.
+/// Default near plane of a camera, where the file gives none, world units.
 pub const NEAR: f32 = 0.01;
-/// Low-pass of a camera of a file that names none, px^2: that of 3D Gaussian Splatting.
+/// Default low-pass of a camera, where the file gives none, px^2: the value of 3D Gaussian Splatting.
 pub const LOW_PASS: f32 = 0.3;
 
 /// A reference camera: OpenCV axes, pixel centres at half-integers.
@@ -27,7 +27,7 @@ pub struct Camera {
     pub viewmat: [f32; 12],
     /// Gaussians whose centre is nearer than this are not drawn, world units.
     pub near: f32,
-    /// Variance of the low-pass with which pictures are drawn, px^2.
+    /// Variance of the low-pass filter of rendering, px^2.
     pub low_pass: f32,
 }
 
@@ -47,7 +47,7 @@ impl Default for Camera {
 
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Config {
-    /// mdhd; a frame lasts `frame_duration` of its units.
+    /// Units a second (mdhd); a frame lasts `frame_duration` units.
     pub timescale: u32,
     pub frame_duration: u32,
     pub level: u8,
@@ -59,7 +59,7 @@ pub struct Config {
     pub cameras: Vec<Camera>,
     /// Not in gsvC: a track of its own (spec 2.7).
     pub audio: Option<AudioTrack>,
-    /// Which of the gsv tracks of the file this is. Not in gsvC.
+    /// Index of the track among the gsv tracks of the file. Not in gsvC.
     pub track: usize,
     /// gsvT.
     pub placement: Placement,
@@ -110,7 +110,7 @@ impl Config {
         })?;
         f.u16(&mut count)?;
         for i in 0..usize::from(count) {
-            // one at a time: a false count ends with the bytes, not with the memory
+            // one at a time: a false count fails at the end of the bytes, before it takes memory
             if i == self.cameras.len() {
                 self.cameras.push(Camera::default());
             }
@@ -149,7 +149,8 @@ fn camera<F: Fields>(f: &mut F, c: &mut Camera) -> Result<()> {
     Ok(())
 }
 
-/// Frames a second as (timescale, frame_duration): exact for whole numbers and for n * 1000/1001 (29.97), else within 1e-6.
+/// Frames a second as (timescale, frame_duration): exact for whole numbers and for n * 1000/1001 (29.97), else within
+/// 1e-6.
 pub fn rate(fps: f64) -> Result<(u32, u32)> {
     if !(1e-3..=1e5).contains(&fps) {
         return Err(Error::Input(format!("expected fps of 0.001 to 100000, got {fps}")));

@@ -1,7 +1,7 @@
 //! Push parser of the container (spec 2): bytes in pieces of any size -> config and groups of one gsv track.
 //!
-//! No I/O inside, so it serves files, HTTP ranges and growing files alike. Media data is never copied: a caller that can
-//! seek asks `skippable` and omits those bytes. Waiting for more bytes is a state, not an error.
+//! No I/O inside, so it serves files, HTTP ranges and growing files alike. Media data is never copied: a caller that
+//! can seek asks `skippable` and omits those bytes. Waiting for more bytes is a state, not an error.
 
 use super::config::Config;
 use super::entry::{Entry, name};
@@ -24,12 +24,12 @@ enum State {
         head: u64,
         size: usize,
     },
-    /// Skipping a body; `media`: that of an mdat, which alone may hold samples (spec 2.4).
+    /// Skipping a body. `media`: the body of an mdat, the only box that may hold samples (spec 2.4).
     Skip { left: u64, media: bool },
 }
 
 pub struct Demuxer {
-    /// Which of the gsv tracks.
+    /// Index of the gsv track.
     number: usize,
     state: State,
     buffer: Vec<u8>,
@@ -42,7 +42,7 @@ pub struct Demuxer {
     end: Option<u64>,
     index: Vec<Entry>,
     layers: Vec<Vec<u64>>,
-    /// Whether the last sidx was that of the track, so that a ssix is, too.
+    /// True if the last sidx is of this track; then a ssix behind it is, too.
     indexed: bool,
 }
 
@@ -131,8 +131,8 @@ impl Demuxer {
         }
     }
 
-    /// The groups according to sidx, for players that fetch only what they show; `offset` and `size` are those of the
-    /// fragments, moof and mdat. The fragments may differ (spec 2.5).
+    /// The groups according to sidx, for players that fetch only the groups that they show. `offset` and `size` are
+    /// those of the fragments, moof and mdat. The fragments may differ (spec 2.5).
     pub fn index(&self) -> &[Entry] {
         &self.index
     }
@@ -153,7 +153,7 @@ impl Demuxer {
         self.groups.truncate(i);
     }
 
-    /// Drops what claims to be a group of the track, but lies among the fragments of others.
+    /// Drops groups that claim to be of the track but lie among the fragments of other tracks.
     pub fn drop_strays(&mut self) {
         if let (Some(first), Some(end), 2..) = (self.index.first(), self.end, self.tracks()) {
             self.groups.retain(|g| (first.offset..end).contains(&g.offset));
@@ -297,7 +297,7 @@ impl Demuxer {
         }
     }
 
-    /// Stores the groups of sidx (spec 2.5), if it is that of the track.
+    /// Stores the groups of sidx (spec 2.5), if it belongs to the track.
     fn announced(&mut self, sidx: &[u8]) -> bool {
         let Some(track) = &self.track else { return false };
         let Some((first, references)) = index::sidx(sidx, track.id) else {

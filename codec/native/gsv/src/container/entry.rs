@@ -5,7 +5,7 @@ use super::audio::AudioRun;
 /// The place and the time of a group.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Entry {
-    /// Of the first byte of its sample, from the start of the file.
+    /// File offset of the first byte of its sample.
     pub offset: u64,
     pub size: u64,
     pub start_frame: u64,

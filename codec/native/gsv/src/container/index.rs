@@ -1,10 +1,11 @@
-//! The bodies of sidx and ssix (spec 2.5 and 2.6) -> the places of the fragments of a track, and in each the ends of the
-//! layers. A malformed box gives None, since a reader can do without an index.
+//! The bodies of sidx and ssix (spec 2.5 and 2.6) -> the positions of the fragments of a track, and the ends of the
+//! layers in each fragment. A malformed box gives None, since a reader does not need an index.
 
 /// An entry of sidx: bytes, duration in units of the timescale, and whether it starts with a sync sample.
 pub type SidxReference = (u32, u32, bool);
 
-/// Spec 2.5: first_offset and the entries of the sidx of track `id`; None if it is malformed, or that of another track.
+/// Spec 2.5: first_offset and the entries of the sidx of track `id`; None if it is malformed, or belongs to another
+/// track.
 pub fn sidx(body: &[u8], id: u32) -> Option<(u64, Vec<SidxReference>)> {
     if body.get(4..8)? != id.to_be_bytes() {
         return None;

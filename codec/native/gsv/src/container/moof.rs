@@ -9,7 +9,8 @@ use super::moov::{Audio, Defaults, Track};
 use crate::error::{Error, Result};
 use crate::fields::{Fields, Reader};
 
-/// Spec 2.4: the group of a moof, with its sound; None if it has none of the track. `start`: offset of the moof box.
+/// Spec 2.4: the group of a moof, with its sound; None if the moof has no group of the track. `start`: offset of the
+/// moof box.
 pub fn read(body: &[u8], track: &Track, start: u64) -> Result<Option<Entry>> {
     for b in boxes(body)?.into_iter().filter(|b| &b.kind == b"traf") {
         let group = traf(b.body, track, start).map_err(|e| e.at(b.offset, "traf box"))?;

@@ -39,7 +39,7 @@ pub struct Defaults {
     pub flags: u32,
 }
 
-/// Parses the body of moov: the track `number` of those with handler volv, and for the first one the audio track.
+/// Parses the body of moov: gsv track `number` (handler volv), and for number 0 also the audio track.
 pub fn read(body: &[u8], number: usize) -> Result<Track> {
     let all = tracks(body, b"volv")?;
     if all.len() > TRACKS_MAX {
@@ -74,7 +74,7 @@ pub fn read(body: &[u8], number: usize) -> Result<Track> {
     })
 }
 
-/// The tracks of a handler.
+/// The tracks with a handler type.
 fn tracks<'a>(moov: &'a [u8], handler: &[u8; 4]) -> Result<Vec<Inner<'a>>> {
     let is = |b: &Inner| find(b.body, &[b"mdia", b"hdlr"]).is_ok_and(|(hdlr, _)| hdlr.get(8..12) == Some(handler));
     Ok(boxes(moov)?
@@ -124,7 +124,7 @@ pub fn audio_track(moov: &[u8]) -> Result<Option<Audio>> {
     Ok(None)
 }
 
-/// track_ID and description of a track of sound; None if its sample entry is another one.
+/// track_ID and description of a track of sound; None if its sample entry is neither mp4a nor Opus.
 fn audio(body: &[u8]) -> Result<Option<(u32, AudioTrack)>> {
     let Ok((stsd, base)) = find(body, &[b"mdia", b"minf", b"stbl", b"stsd"]) else {
         return Ok(None);

@@ -7,7 +7,7 @@ use crate::pose::Pose;
 /// The transform of a track at a time.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Key {
-    /// Of the scene, units of the track's timescale.
+    /// Time of the scene, units of the track's timescale.
     pub time: i32,
     pub pose: Pose,
 }
@@ -20,7 +20,7 @@ pub struct Placement {
     pub offset: i32,
     /// How often the track is played; 0: without end.
     pub repeats: u32,
-    /// By time.
+    /// In order of time.
     pub keys: Vec<Key>,
 }
 
@@ -65,7 +65,7 @@ impl Placement {
         f.u16(&mut count)?;
         let mut last = None;
         for i in 0..usize::from(count) {
-            // one at a time: a false count ends with the bytes, not with the memory
+            // one at a time: a false count fails at the end of the bytes, before it takes memory
             if i == self.keys.len() {
                 self.keys.push(Key::default());
             }

@@ -1,7 +1,7 @@
 //! A whole file in memory -> the groups of a track. Wraps the demuxer, and recovers the groups behind damaged boxes.
 //!
-//! Damaged boxes of a fragment end the walk from box to box. With an index (spec 2.5) that agrees with the groups so far,
-//! the walk continues at the next fragment.
+//! Damaged boxes of a fragment end the walk from box to box. With an index (spec 2.5) that agrees with the groups so
+//! far, the walk continues at the next fragment.
 
 use super::audio::{AudioRun, AudioTrack};
 use super::demux::Demuxer;
@@ -16,8 +16,8 @@ const LOST_MAX: usize = 64;
 /// Bytes pushed to the demuxer at a time between skipped boxes.
 const LOOK: usize = 4096;
 
-/// Reads the headers of a file, for the gsv track `track`. Strict: damage is an error. Otherwise groups that only the index has are listed with the
-/// bytes of their fragment, and the errors are returned with the number of the group.
+/// Reads the headers of a file, for the gsv track `track`. Strict: damage is an error. Otherwise groups that only the
+/// index lists are returned with the bytes of their fragment, and each error with the number of its group.
 ///
 /// # Errors
 /// There is no moov; boxes are damaged and no index helps.
@@ -35,7 +35,7 @@ pub fn read(data: &[u8], strict: bool, track: usize) -> Result<(Demuxer, Vec<(us
         let short = walked.is_err() || demuxer.groups().len() < demuxer.index().len();
         let whole = !demuxer.index().is_empty() && demuxer.groups().len() >= demuxer.index().len();
         match (walked, missing(&demuxer, data.len()).filter(|_| short && !strict)) {
-            (Err(_), None) if whole && !strict => return Ok((demuxer, damage)), // it is behind the groups, of another track
+            (Err(_), None) if whole && !strict => return Ok((demuxer, damage)), // the damage is in another, later track
             (walked, None) => return walked.map(|()| (demuxer, damage)),
             (walked, Some(_)) if damage.len() >= LOST_MAX => return walked.map(|()| (demuxer, damage)),
             (walked, Some((next, _))) if tried == Some(next) => {
@@ -109,7 +109,7 @@ fn no_moov(data: &[u8]) -> Error {
     Error::bitstream(data.len(), "file", "a moov box, found the end of the data")
 }
 
-/// A fragmented MP4 of sound alone, as a multiplexer leaves it -> its first track of mp4a or Opus, and its samples.
+/// A fragmented MP4 with sound only, as a multiplexer writes it -> its first mp4a or Opus track, and the samples.
 ///
 /// # Errors
 /// There is no such track; its boxes break a rule of spec 2.7.

@@ -30,7 +30,7 @@ pub struct Reference {
 pub struct Sound<'a> {
     /// Media time of the first sample.
     pub time: u64,
-    /// Size and duration of each.
+    /// Size and duration of each sample.
     pub samples: &'a [(u32, u32)],
     pub data: &'a [u8],
 }
@@ -65,7 +65,7 @@ fn track_id(number: usize) -> u32 {
     }
 }
 
-/// ftyp and moov, which start every file: of one track, or of several. The sound is that of the first one.
+/// ftyp and moov, the start of every file, for one or more tracks. The sound is that of the first one.
 pub fn init_segment(configs: &[Config]) -> Result<Vec<u8>> {
     let Some(first) = configs.first() else {
         return Err(Error::Input("expected at least one track".into()));
@@ -152,7 +152,8 @@ fn trak(head: &[Vec<u8>], timescale: u32, (handler, name): (&[u8; 4], &[u8]), me
     boxed(b"trak", &[&head.concat(), &mdia])
 }
 
-/// moof and mdat of one group. `sequence_number` counts from 1, `start_frame` from 0; `sound` goes in front of the payload.
+/// moof and mdat of one group. `sequence_number` counts from 1, `start_frame` from 0; `sound` goes in front of the
+/// payload.
 pub fn fragment(
     payload: &[u8],
     sequence_number: u32,
@@ -217,11 +218,11 @@ fn check(sound: &Sound) -> Result<()> {
     )))
 }
 
-/// What precedes the fragments in a finished file: the init segment, and for each track a sidx (spec 2.5), with a ssix (spec
-/// 2.6) where a group has more than one layer. The fragments of the tracks follow one behind the other.
+/// The part of a finished file in front of the fragments: the init segment, and for each track a sidx (spec 2.5), with
+/// a ssix (spec 2.6) where a group has more than one layer. The fragments follow, track after track.
 pub fn finish(init: &[u8], tracks: &[(&Config, Vec<Reference>)]) -> Result<Vec<u8>> {
-    let mut out = Vec::new(); // from the last index on, that of the first track
-    let mut fragments = 0; // bytes, of the tracks before
+    let mut out = Vec::new(); // indexes of the tracks so far, that of the first one last
+    let mut fragments = 0; // bytes of the fragments of the tracks before
     for (number, (config, groups)) in tracks.iter().enumerate() {
         let own = index(track_id(number), config, groups, out.len() as u64 + fragments)?;
         fragments += groups.iter().map(|g| g.size).sum::<u64>();

@@ -1,7 +1,7 @@
-//! Streams -> integers (spec 8 to 10 and 12): positions, deaths, and what else the streams of a tile hold.
+//! Streams -> integers (spec 8 to 10 and 12): positions, deaths, channels, trajectories and lifetimes.
 //!
-//! In: the bytes of one stream with its model. Out: its values, or an error that says where the stream is. Trajectories grow
-//! against the symbols that the level has left.
+//! In: the bytes of one stream with its model. Out: its values, or an error that names the stream and its offset.
+//! Trajectories count against the symbols that the level has left.
 
 use super::GroupDecoder;
 use crate::channels;
@@ -17,7 +17,7 @@ use crate::trajectories::{self, Stop, Trajectories};
 use crate::values::MAX_VALUE;
 use std::sync::atomic::Ordering;
 
-/// The bytes of a stream, and where they are, for messages.
+/// The bytes of a stream, with its offset and label for messages.
 pub struct Source<'a> {
     pub bytes: &'a [u8],
     pub offset: usize,
@@ -42,7 +42,7 @@ impl Source<'_> {
     }
 }
 
-/// What a stream other than positions and deaths holds.
+/// The content of a stream other than positions and deaths.
 pub enum Part {
     Channels(usize, Vec<i32>),
     Trajectories(usize, Trajectories),
@@ -67,7 +67,8 @@ impl GroupDecoder<'_> {
         Ok(points.map(|p| p.map(|v| v << shift)).collect())
     }
 
-    /// Indices of the survivors among those of the reference at `range`; `source`: which have died, None: none has.
+    /// Indices of the survivors among the Gaussians `range` of the reference. `source`: the stream of deaths; None: all
+    /// survive.
     pub fn survivors(&self, range: std::ops::Range<usize>, source: Option<Source>, told: u32) -> Result<Vec<u32>> {
         let (Some(r), Some(source)) = (self.reference, source) else {
             return Ok((range.start as u32..range.end as u32).collect());
@@ -129,7 +130,7 @@ impl GroupDecoder<'_> {
         Ok(Some(part))
     }
 
-    /// Symbols left for a stream. Several streams may see the same number; `count` is what enforces the cap.
+    /// Symbols left for a stream. Several streams may see the same number; `count` enforces the cap.
     fn budget(&self) -> u64 {
         self.how
             .level
@@ -137,7 +138,7 @@ impl GroupDecoder<'_> {
             .saturating_sub(self.symbols.load(Ordering::Relaxed))
     }
 
-    /// Adds the symbols of decoded trajectories to the total and checks the cap. False: broken.
+    /// Adds the symbols of decoded trajectories to the total and checks the cap. False: the stream is broken.
     fn count(&self, t: std::result::Result<Trajectories, Stop>, label: &str) -> Result<(Trajectories, bool)> {
         let symbols = match &t {
             Ok(t) => t.symbols() as u64,

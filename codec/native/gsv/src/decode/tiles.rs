@@ -1,7 +1,7 @@
 //! The tiles of a layer (spec 3.3 and 3.4).
 //!
-//! In: the undamaged units of a group. Out: for each tile its Gaussians as integers, empty where the tile is damaged or was not
-//! asked for. The tiles from whose models the others start come first, then all others in parallel.
+//! In: the undamaged units of a group. Out: for each tile its Gaussians as integers, empty where the tile is damaged or
+//! was not asked for. Leading tiles, from whose models the others start, come first, then all others in parallel.
 
 use super::GroupDecoder;
 use super::streams::{Part, Source};
@@ -15,7 +15,7 @@ use crate::tile::{self, Models, Stream, StreamModel};
 use crate::trajectories::Trajectories;
 use crate::unit::UnitType;
 
-/// A tile, and what its models have learned.
+/// A tile, and the models of its streams after decoding.
 type Learned = (Tile, Vec<(Stream, StreamModel)>);
 
 impl GroupDecoder<'_> {
@@ -30,7 +30,7 @@ impl GroupDecoder<'_> {
                 continue;
             };
             if !self.reference_has(k, t) {
-                return Ok(tiles); // lost with the reference, and so are those that start from it
+                return Ok(tiles); // lost with the reference, and so are the tiles that start from its models
             }
             let (tile, learned) = self.tile(k, t, &models)?;
             if count > 1 {
@@ -49,7 +49,7 @@ impl GroupDecoder<'_> {
         Ok(tiles)
     }
 
-    /// Tile `t` of layer `k`; `models`: what its streams start from.
+    /// Tile `t` of layer `k`; `models`: the initial models of its streams.
     fn tile(&self, k: usize, t: usize, models: &Models) -> Result<Learned> {
         let h = self.header;
         let mut tile = self.blank(k, t);

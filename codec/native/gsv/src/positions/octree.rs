@@ -8,8 +8,8 @@ pub struct Node {
     pub code: u64,
     pub count: u32,
     pub start: u32,      // encoder: index of its first point
-    pub lower: [u32; 3], // face neighbours at the side of 0 of x, y, z: already split
-    pub upper: [u32; 3], // and at the other side: still to be split
+    pub lower: [u32; 3], // face neighbours on the lower side of x, y, z: already split
+    pub upper: [u32; 3], // face neighbours on the upper side: still to be split
 }
 
 impl Node {

@@ -1,5 +1,5 @@
-//! The splits of one octree node: how many of its points lie in the lower half along x, then y, then z, each in the context of
-//! the points that its face neighbours have next to it (spec 8).
+//! The splits of one octree node: how many of its points lie in the lower half along x, then y, then z, each in the
+//! context of the adjacent points in its face neighbours (spec 8).
 
 use super::octree::Node;
 use crate::blocks::Blocks;
@@ -20,7 +20,7 @@ pub fn seen(k: usize, count: u32) -> Seen {
 
 const PLACES: usize = 3 * 7 * 8; // contexts made of axis, occupied face neighbours and depth
 
-/// What is learned of one bin of a split.
+/// Adaptive state of one bin of a split.
 #[derive(Clone)]
 struct SplitBin {
     a: [Counter; EVIDENCE],
@@ -51,7 +51,7 @@ impl Default for SplitModel {
 }
 
 impl SplitModel {
-    /// As of `Counter`.
+    /// See `Counter::settle`.
     pub fn settle(&mut self) {
         self.bins
             .settle(|bin| bin.a.iter_mut().chain(&mut bin.b).for_each(Counter::settle));
@@ -66,8 +66,8 @@ pub struct SplitCoder<'a, C> {
 /// The inputs of the contexts of the seven splits of a node.
 pub struct Split {
     want: [u32; 8],   // encoder: points per child
-    lower: [Seen; 3], // children of the face neighbours at the side of 0
-    upper: [u32; 3],  // points of those at the other side
+    lower: [Seen; 3], // children of the face neighbours on the lower side
+    upper: [u32; 3],  // points of the face neighbours on the upper side
     own: Seen,        // children of this node, as far as known
     count: u32,
     occupied: usize,
@@ -130,8 +130,8 @@ impl Split {
         counts
     }
 
-    /// Codes the child of a single point. Equal to `children`, which most nodes do not need, but without branches that
-    /// cannot be predicted.
+    /// Codes the child of a single point, the case of most nodes. Equal to `children`, but without unpredictable
+    /// branches.
     #[cfg_attr(target_arch = "wasm32", inline(never))] // see ../channels.rs
     pub fn child<C: Bins>(self, coder: &mut SplitCoder<C>) -> usize {
         let [lx, ly, lz] = self.lower;
@@ -218,8 +218,8 @@ fn sum(seen: Seen, mask: usize, half: usize) -> u32 {
     (pairs.wrapping_mul(0x0001_0001_0001_0001) >> 48) as u32
 }
 
-/// Compares the halves of a neighbour along the axis `bit`, within the part given by the bits above `bit`. 0: no points, 1:
-/// more on the low side, 2: more on the high side, 3: equal.
+/// Compares the halves of a neighbour along the axis `bit`, within the part given by the bits above `bit`. 0: no
+/// points, 1: more on the low side, 2: more on the high side, 3: equal.
 #[inline]
 fn halves(seen: Seen, bit: usize, part: usize) -> usize {
     let mask = [7, 7, 6, 6, 4][bit]; // the axis and those split before it

@@ -1,5 +1,5 @@
 //! Random groups for the tests: every optional part, and the extremes of every range.
-#![allow(dead_code)] // each test takes what it needs
+#![allow(dead_code)] // each test uses only a part
 
 use gsv::attributes::Attribute;
 use gsv::companding::Companding;

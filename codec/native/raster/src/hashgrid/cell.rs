@@ -1,4 +1,5 @@
-//! One level of the hash grid: a point -> its cell, the table rows of the 8 corners, trilinear weights and their derivatives.
+//! One level of the hash grid: a point -> its cell, the table rows of the 8 corners, trilinear weights and their
+//! derivatives.
 
 const PRIMES: [u32; 3] = [1, 2_654_435_761, 805_459_861]; // x is not multiplied
 
@@ -10,7 +11,8 @@ pub struct GridLevel {
     pub dense: bool,
 }
 
-/// The cell around a point: table rows of its 8 corners, position in the cell, and whether each coordinate was in [0, 1].
+/// The cell around a point: table rows of its 8 corners, position in the cell, and whether each coordinate is in [0,
+/// 1].
 pub struct Cell {
     pub rows: [u32; 8],
     pub frac: [f32; 3],

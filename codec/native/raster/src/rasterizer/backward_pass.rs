@@ -1,4 +1,5 @@
-//! The backward pass of the rasterizer: gradient of the image -> sums over the pixels of each pair -> gradients of the Gaussians.
+//! The backward pass of the rasterizer: gradient of the image -> sums over the pixels of each pair -> gradients of the
+//! Gaussians.
 
 use super::{Rasterizer, SHARE};
 use crate::adjoint::Pixels;

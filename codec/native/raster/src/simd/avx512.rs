@@ -1,8 +1,8 @@
 //! 16 lanes, AVX-512 F/DQ/VL/BW.
 //!
-//! Why `unsafe` is sound here: every function is `#[inline(always)]` and reached only through `dispatch!`, that is inside a
-//! function that has these target features and that is called only after they were detected. Loads and stores check the
-//! length of the slice first; the intrinsics have no other precondition.
+//! Why `unsafe` is sound here: every function is `#[inline(always)]` and reached only through `dispatch!`, that is
+//! inside a function that has these target features and that is called only after they were detected. Loads and stores
+//! check the length of the slice first; the intrinsics have no other precondition.
 
 use std::arch::x86_64::*;
 use std::ops::{Add, Div, Mul, Neg, Sub};

@@ -1,8 +1,8 @@
 //! SIMD: every kernel is written once, generic over `Vector`, and compiled for each instruction set.
 //!
-//! Instances: `f32` (the scalar reference); AVX2 + FMA and AVX-512, chosen at run time by `SimdLevel`; NEON and WebAssembly
-//! simd128, chosen by the build; a portable one for all other machines. `dispatch!` makes the entry point of a kernel: it
-//! compiles the instance inside a function with the target features, so that the intrinsics inline.
+//! Instances: `f32` (the scalar reference); AVX2 + FMA and AVX-512, chosen at run time by `SimdLevel`; NEON and
+//! WebAssembly simd128, chosen by the build; a portable one for all other machines. `dispatch!` makes the entry point
+//! of a kernel: it compiles the instance inside a function with the target features, so that the intrinsics inline.
 
 #[cfg(target_arch = "x86_64")]
 pub mod avx2;

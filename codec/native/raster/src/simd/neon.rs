@@ -1,7 +1,7 @@
 //! 4 lanes, NEON, which every 64-bit ARM processor has.
 //!
-//! Why `unsafe` is sound here: the target always has the feature, so the intrinsics have no precondition; only loads and stores
-//! do, and they check the length of the slice first.
+//! Why `unsafe` is sound here: the target always has the feature, so the intrinsics have no precondition; only loads
+//! and stores do, and they check the length of the slice first.
 
 use std::arch::aarch64::*;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};

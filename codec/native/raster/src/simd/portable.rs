@@ -1,7 +1,7 @@
 //! 4 lanes in plain Rust, for machines without an instance of their own; on x86-64 it is compiled for the tests.
 //!
-//! The compiler turns most of the arrays into scalar instructions; four pixels at a time still skip more work than one, so
-//! this is up to twice as fast as `scalar`.
+//! The compiler turns most of the arrays into scalar instructions; four pixels at a time still skip more work than one,
+//! so this is up to twice as fast as `scalar`.
 
 use std::array::from_fn;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Not, Sub};
