@@ -1,8 +1,8 @@
-// Adaptive bitrate: a Source over the representations of a DASH manifest (.mpd). Each group comes from the best one that link
-// and device sustain.
+// Adaptive bitrate: a Source over the representations of a DASH manifest (.mpd). Each group comes from the best
+// representation that link and device sustain.
 //
-// Read are @bandwidth and BaseURL of each Representation (on-demand profile: one indexed file each). The representation changes
-// at sync groups only, and all files must have the same ones.
+// Only @bandwidth and BaseURL of each Representation are read (on-demand profile: one indexed file each). The
+// representation changes at sync groups only, and all files must have the same ones.
 
 import { Source, StreamError } from "./source.js";
 
@@ -108,7 +108,7 @@ export class AdaptiveSource extends EventTarget {
     this.decode.set(this.#chosen.get(i), ms);
   }
 
-  // The best representation to sustain: up by one step at a time, down at once.
+  // The best sustainable representation: up by one step at a time, down at once.
   #choose() {
     const [n, d] = this.config.fps;
     const fits = (k) => this.#files[k].bandwidth < SHARE * this.link && ((this.decode.get(k) ?? 0) * n) / d < 1000 * BUSY;

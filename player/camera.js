@@ -1,4 +1,4 @@
-// Views: an orbit around a target, or a reference camera of the file; OpenCV axes, as codec/camera.py.
+// Views: an orbit around a target, or a reference camera of the file; OpenCV axes, as codec/model/camera.py.
 
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -17,7 +17,7 @@ export function upVector(axis) {
   return v;
 }
 
-// A view from `eye` for who packs all Gaussians: its direction and lens do not matter.
+// A view from `eye` to pack all Gaussians: its direction and lens do not matter.
 export const viewFrom = ([x, y, z]) => new Float32Array([16, 16, 8, 8, 8, 8, 1, 0, 0, -x, 0, 1, 0, -y, 0, 0, 1, -z, NEAR, LOW_PASS]);
 
 // Low-pass of views from other places than the cameras of a config, px^2.
@@ -111,7 +111,7 @@ export class Camera {
     return view;
   }
 
-  // What the scene stands on: the lowest point below its middle.
+  // Foot of the scene: the lowest point below its middle.
   get foot() {
     return this.center.map((v, i) => (this.up[i] ? (this.up[i] > 0 ? this.low : this.high)[i] : v));
   }

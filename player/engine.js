@@ -4,8 +4,9 @@
 //                                                                 \--visible Gaussians--> GPU, on a canvas above
 //                                                                 \--an answer--> `ask`, for scenes of other programs
 //
-// A group of many tiles is shared by the workers of a set: each decodes and keeps its tiles alone, and nothing is copied. Of a
-// large group only the tiles in view are fetched and decoded, and others when the view comes to them (parts.js).
+// A group of many tiles is shared by the workers of a set: each decodes and keeps only its tiles, and nothing is
+// copied. Of a large group only the tiles in view are fetched and decoded, and others when the view comes to them
+// (parts.js).
 
 import { AdaptiveSource } from "./abr.js";
 import { lowPassOf } from "./camera.js";
@@ -22,8 +23,8 @@ const SHARES_MAX = 4; // workers of a set; the others start when a group has til
 const RASTER_WORKERS_MAX = 8;
 const PIECES_MAX = 100; // of a group in a worker, see SLOTS of player.rs
 
-// A script from another origin cannot be a worker, but a worker may import it. Bundlers know a worker by these words, and
-// are to leave `script` alone.
+// A script from another origin cannot be a worker, but a worker may import it. Bundlers detect a worker by this
+// expression, and must leave `script` alone.
 function start(script = "./worker.js") {
   if (new URL(import.meta.url).origin === location.origin) {
     return new Worker(new URL("./worker.js", import.meta.url), { type: "module" });
@@ -34,14 +35,16 @@ function start(script = "./worker.js") {
 }
 
 export class Engine extends EventTarget {
-  // bytes of a group, or of the one that it is predicted from, above which only its tiles in view are fetched and decoded
+  // bytes of a group, or of the one that it is predicted from, above which only its tiles in view are fetched and
+  // decoded
   static partly = 1 << 20;
-  groups = new Map(); // group -> {state: fetching | decoding | ready, set, pieces, left, header, layers, abort, content, flags}
-  // set: workers that hold it; pieces: how many of them do; left: what these have yet to decode; order: see tiles.js; content: a
-  // Whole or Parts; of Parts flags: tiles that were asked for, orders: how often; waiting: orders of each worker
-  view = null; // () => what is to be seen: a view of the renderer, null for all, undefined if it is not known yet; without it
-  // large groups are decoded whole, too; of the tracks of a scene the host has it
-  pose = null; // that of the track in a scene, see tracks.js
+  groups = new Map(); // group -> {state: fetching | decoding | ready, header, layers, abort, and the fields below}
+  // set: workers that hold it; pieces: number of workers that hold tiles of it; left: orders still to be decoded;
+  // order: see tiles.js; content: a Whole or Parts; flags: requested tiles of Parts; orders: number of orders so far;
+  // waiting: orders of each worker
+  view = null; // () => view of the renderer; null: all tiles; undefined: not known yet. Without it
+  // large groups are decoded whole, too; in a scene of several tracks only the host has it
+  pose = null; // transform of the track in a scene, see tracks.js
   failed = new Map(); // group -> message
   layers; // number of layers of each group to fetch and draw
   choice = new LayerChoice();
@@ -52,13 +55,13 @@ export class Engine extends EventTarget {
   #asked = new Map(); // id -> {resolve, reject} of a request
   #requests = 0;
 
-  scene = null; // of the tracks of a file that has several, or a placed one
+  scene = null; // the tracks of a file that has several tracks, or a placed one
 
-  // canvas: null if nothing is to be drawn; track: which one of the file; host: the engine of the first one, which draws this
-  // one, too
-  constructor(canvas, src, { track = 0, host = null } = {}) {
+  // canvas: null if nothing is to be drawn; track: its index in the file; host: the engine of the first track, which
+  // draws this one, too; alone: reads one track only, without its placement
+  constructor(canvas, src, { track = 0, host = null, alone = false } = {}) {
     super();
-    Object.assign(this, { host, layers: host?.layers ?? AUTO });
+    Object.assign(this, { host, alone, layers: host?.layers ?? AUTO });
     this.source = /\.mpd($|[?#])/.test(src) ? new AdaptiveSource(src) : new Source(src, track);
     this.source.addEventListener("received", ({ detail: { bytes, ms } }) => {
       if (bytes > 20_000) this.stats.link = (8e-3 * bytes) / ms;
@@ -79,10 +82,11 @@ export class Engine extends EventTarget {
 
   // Resolves when the config and the first groups are known.
   async open() {
-    this.loading = this.host?.loading ?? load(new URL("./native.wasm.gz", import.meta.url)); // while the first bytes of the file are on their way
+    this.loading = this.host?.loading ?? load(new URL("./native.wasm.gz", import.meta.url)); // while the file opens
     this.loading.then((m) => this.closed || this.#connect(m), () => {});
     await this.source.open(async () => Native.create(await this.loading));
-    if (this.#rasters.length && !this.host && (this.source.tracks > 1 || placed(this.source.config))) {
+    const several = this.source.tracks > 1 || placed(this.source.config);
+    if (several && this.#rasters.length && !this.host && !this.alone) {
       this.scene = new Scene(this, (track) => new Engine(null, this.source.url, { track, host: this }));
       await this.scene.open((type, detail) => this.#say(type, detail));
     }
@@ -123,7 +127,7 @@ export class Engine extends EventTarget {
     this.renderer.close();
   }
 
-  // Who draws from now on: "cpu", "gpu", or "auto", the GPU if it is hardware. Rejects if the GPU cannot be used.
+  // The renderer from now on: "cpu", "gpu", or "auto", the GPU if it is hardware. Rejects if the GPU cannot be used.
   use(how) {
     const { background, cameras } = this.source.config;
     return this.renderer.use(how, this.bounds, background, lowPassOf(cameras));
@@ -193,19 +197,19 @@ export class Engine extends EventTarget {
     return this.groups.get(i)?.state === "ready";
   }
 
-  // Gaussians of frame t that are there.
+  // Number of decoded Gaussians in the groups of frame t.
   gaussians(t) {
     const parts = this.scene?.parts(t) ?? [{ engine: this, t }];
     return parts.reduce((n, part) => n + (part.engine.groups.get(part.engine.groupOf(part.t))?.header?.gaussians ?? 0), 0);
   }
 
-  // What is to be seen of this track, as of `view`, where it was made.
+  // `view()` as a view of this track before its transform.
   sight() {
     const view = (this.host ?? this).view();
     return view && this.pose ? unplaced(view, this.pose) : view;
   }
 
-  // Flags of the tiles of a group that are to be seen, as soon as that is known.
+  // Flags of the tiles of a group in view, as soon as the view is known.
   async #seen(content, layers, signal) {
     while (this.sight() === undefined && !this.closed) {
       await new Promise(requestAnimationFrame);
@@ -240,12 +244,12 @@ export class Engine extends EventTarget {
     this.forget();
   }
 
-  // Gives up all groups that are not being decoded.
+  // Releases all groups that are not being decoded.
   forget() {
     for (const [k, g] of this.groups) this.#release(k, g);
   }
 
-  // Gives a group up, unless it is being decoded.
+  // Releases a group, unless it is being decoded.
   #release(k, g) {
     if (g.state === "decoding" || g.left > 0) return;
     g.abort?.abort(new DOMException("not needed any more", "AbortError"));
@@ -287,7 +291,7 @@ export class Engine extends EventTarget {
     try {
       const content = (entry.content = await this.#fetch(i, layers, abort.signal));
       if (content.seen) {
-        if (!this.bounds) this.#say("bounds", (this.bounds = content.bounds)); // who hears it knows the view
+        if (!this.bounds) this.#say("bounds", (this.bounds = content.bounds)); // its listener makes the view
         entry.flags = await this.#seen(content, layers, abort.signal);
         await content.fetch(entry.flags, layers, abort.signal);
       }
@@ -305,7 +309,8 @@ export class Engine extends EventTarget {
     }
   }
 
-  // Gives the tiles of group i with flags, all if null, to the workers of its set; more: to those that have others already.
+  // Gives the tiles of group i with flags, all if null, to the workers of its set; more: in addition to tiles that they
+  // have already.
   #share(i, entry, flags, more = false) {
     const { set, layers, content, pieces: n } = entry;
     for (let k = 0; k < n; k++) {
@@ -317,7 +322,7 @@ export class Engine extends EventTarget {
     entry.orders = (entry.orders ?? 0) + entry.left;
   }
 
-  // Gives worker k of a set what it is to decode next of group i: one order at a time, so that it can draw in between.
+  // Sends worker k of a set its next order for group i: one order at a time, so that it can draw in between.
   #next(i, { set, layers, waiting }, k) {
     const order = waiting[k]?.shift();
     if (order) set[k].postMessage({ type: "decode", group: i, level: this.source.level(i), layers, bounds: !this.bounds, ...order });
@@ -342,7 +347,7 @@ export class Engine extends EventTarget {
     entry.growing = false;
   }
 
-  // Group i, and what it is predicted from: whole, or described, to be fetched by its parts.
+  // Group i and its reference: whole, or described, to be fetched by parts.
   async #fetch(i, layers, signal) {
     const { source } = this;
     const { native } = source;
@@ -385,7 +390,7 @@ export class Engine extends EventTarget {
   }
 
   #fail(i, message) {
-    if (this.failed.has(i)) return; // another worker has told already
+    if (this.failed.has(i)) return; // another worker has reported it
     const entry = this.groups.get(i);
     if (entry) this.#release(i, { ...entry, state: "failed", left: 0 });
     this.failed.set(i, message);

@@ -1,5 +1,5 @@
-// Draws images on the GPU with Spark (three.js), with the constants of the spec (clause 14). spark.js is larger than the rest
-// of the player, so it is loaded only when it is used; without it or without a GPU the CPU draws.
+// Draws images on the GPU with Spark (three.js), with the constants of the spec (clause 14). spark.js is larger than
+// the rest of the player, so it is loaded only when it is used; without it or without a GPU the CPU draws.
 
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i; // slower than the wasm rasterizer
 const ALPHA_MIN = 1 / 255;
@@ -77,13 +77,13 @@ export class Gpu {
     this.#scene.add(this.#sorter, this.#world);
   }
 
-  // Shows the scene in a headset until the session ends: from where the view (19 numbers) looks, `metres` for a unit of it.
-  // With `foot`, a point of the scene, it stands on the floor of the room (augmented reality), and a tap moves it there.
-  // Calls tick() for each image of the session: meanwhile the window's own clock may stand still.
+  // Shows the scene in a headset until the session ends: seen as by the view (20 numbers), `metres` for a unit of it.
+  // With `foot`, a point of the scene, it stands on the floor of the room (augmented reality), and a tap moves it
+  // there. Calls tick() for each image of the session: meanwhile the window's own clock may stand still.
   async enter(session, { view, metres, foot }, tick) {
     const { xr } = this.#renderer;
     xr.enabled = true;
-    xr.setReferenceSpaceType(foot ? "local-floor" : "local"); // the origin is the head at the start, or the floor below it
+    xr.setReferenceSpaceType(foot ? "local-floor" : "local"); // origin: the head at the start, or the floor below it
     await xr.setSession(session);
     this.#head = new this.#spark.PerspectiveCamera();
     const { Matrix4 } = this.#spark;
@@ -114,17 +114,17 @@ export class Gpu {
 
   #place(matrix) {
     this.#world.matrix.copy(matrix);
-    this.#scene.updateMatrixWorld(true); // Spark looks before the next rendering does it
+    this.#scene.updateMatrixWorld(true); // Spark reads it before the next rendering updates it
   }
 
-  // Where the head is, in units of the scene; null outside of a session.
+  // Position of the head, in units of the scene; null outside of a session.
   get head() {
     if (!this.#head) return null;
     const { position } = this.#head;
     return position.clone().applyMatrix4(this.#world.matrix.clone().invert()).toArray();
   }
 
-  // Shows Gaussians that `Native.pack` made for the view (19 numbers); resolves when they are on the canvas, one after another.
+  // Shows Gaussians that `Native.pack` made for the view (20 numbers); resolves when they are on the canvas, in order.
   draw(view, packed) {
     this.#busy = this.#busy.then(() => this.#draw(view, packed));
     return this.#busy;

@@ -6,7 +6,7 @@ const SLOW = 3; // measurements in a row above HIGH after which a layer is dropp
 const PATIENCE = 8000; // ms until it is tried again; doubled after each failed attempt
 
 export class LayerChoice {
-  reason = null; // what limits the layers, for the viewer
+  reason = null; // text for the viewer: the limit on the layers; null: none
   #device = Infinity; // layers that this device draws in time
   #chosen = Infinity;
   #slow = 0;

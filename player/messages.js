@@ -1,4 +1,4 @@
-// What the viewer is told beside the image: notes in the corner, failures, the busy sign, the time bar, statistics.
+// Messages to the viewer beside the image: notes in the corner, failures, the busy sign, the time bar, statistics.
 //
 // In: the state of the player and of its engine. Out: text and colours of the controls.
 
@@ -35,7 +35,7 @@ export class Messages {
     this.player.$(".busy").hidden = !this.#busySince || now - this.#busySince < STALL;
   }
 
-  // The time, the time bar and the statistics, and what goes slowly.
+  // Updates the time, the time bar, the statistics and the notes on slow playback.
   follow(now) {
     const { player } = this;
     while (this.#times.length && this.#times[0] < now - 1000) this.#times.shift();

@@ -1,10 +1,10 @@
-// The wasm decoder and rasterizer: one instance per worker, and one on the page for the container. The exports are those of
-// codec/native/bindings/src/wasm.rs; addresses are valid until the next call, so data is copied here.
+// The wasm decoder and rasterizer: one instance per worker, and one on the page for the container. The exports are
+// those of codec/native/bindings/src/wasm.rs; addresses are valid until the next call, so data is copied here.
 
 // A module whose only function uses i8x16.splat: does this browser have simd128?
 const SIMD = [0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 10, 10, 1, 8, 0, 65, 0, 253, 15, 253, 98, 11];
 
-const HEADER_MAX = 1 << 22; // bytes of the header of a group: more than 65,535 units and tiles, the most there are, take
+const HEADER_MAX = 1 << 22; // bytes of the header of a group: more than the maximum of 65,535 units and tiles takes
 export const NONE = 255; // no slot
 export const ALL = 255; // layers
 export const AUTO = 0; // as many layers as link and device sustain
@@ -19,7 +19,7 @@ export async function load(url) {
   return WebAssembly.compileStreaming(new Response(module, { headers: { "Content-Type": "application/wasm" } }));
 }
 
-// A stream of gzip, unpacked; as it is where the server has declared it as Content-Encoding, which the browser has undone.
+// Unpacks a stream of gzip; unchanged where the server declared Content-Encoding, which the browser has undone.
 async function plain(stream) {
   const [look, all] = stream.tee();
   const reader = look.getReader();
@@ -82,9 +82,9 @@ export class Native {
 
   // Groups
 
-  // reference: the slot of the reference of a predicted group; layers: number to decode; wanted: flags of the tiles to decode,
-  // all if null; keepLeading: whether the tiles that they start from stay when they are not wanted; packed: the payload has no
-  // bytes of other tiles.
+  // reference: the slot of the reference of a predicted group; layers: number to decode; wanted: flags of the tiles to
+  // decode, all if null; keepLeading: whether leading tiles, from which they start, stay when they are not wanted;
+  // packed: the payload omits the bytes of other tiles.
   decode(slot, payload, level, { reference = NONE, layers = ALL, wanted = null, keepLeading = true, packed = false } = {}) {
     this.put(payload);
     if (wanted) this.bytes(this.x.wanted(wanted.length), wanted.length).set(wanted);
@@ -112,7 +112,7 @@ export class Native {
     return JSON.parse(this.text());
   }
 
-  // pose: the transform that places the frame, with a scale of 0 nothing is shown; without one it is where it was made.
+  // pose: the transform that places the frame, with a scale of 0 nothing is shown; empty: the frame is not moved.
   frame(slot, t, pose = []) {
     this.#floats(pose);
     this.check(this.x.frame(slot, t));
@@ -128,7 +128,7 @@ export class Native {
     return new Float32Array(this.output().buffer);
   }
 
-  // The box of most means (a Float32Array of each who has some): from the 1st to the 99th percentile.
+  // The box of most means, from the 1st to the 99th percentile. means: a Float32Array of each worker.
   bounds(...means) {
     this.#floats(...means);
     this.x.bounds();
@@ -143,8 +143,9 @@ export class Native {
 
   // Image
 
-  // view: 20 floats, see wasm.rs; ends: of bands for which others project, too, see `divide`. Calls take(band) for each band;
-  // `splats` is a view into the memory of the instance. Returns the number of bands, and the load of each row of tiles.
+  // view: 20 floats, see wasm.rs; ends: of bands, where other workers project for them, too, see `divide`. Calls
+  // take(band) for each band; `splats` is a view into the memory of the instance. Returns the number of bands, and the
+  // load of each row of tiles.
   project(view, count, take, ends = []) {
     this.#floats(view, ends);
     const bands = this.x.project(count);
@@ -164,15 +165,16 @@ export class Native {
     return Array.from(this.floats());
   }
 
-  // The visible Gaussians, or all, for Spark (see pack.rs), relative to an origin: a view into the memory of the instance.
+  // The visible Gaussians, or all, for Spark (see pack.rs), relative to an origin: a view into the memory of the
+  // instance.
   pack(view, origin, all) {
     this.put(new Uint8Array(view.buffer, view.byteOffset, view.byteLength));
     this.check(this.x.pack(...origin, all));
     return this.bytes(this.x.output(), this.x.output_length());
   }
 
-  // Draws the Gaussians of a band, an array of each who has projected some. Returns [rows, width, 4], a view into the memory of
-  // the instance.
+  // Draws the Gaussians of a band; pieces: one array from each worker that projected some. Returns [rows, width, 4], a
+  // view into the memory of the instance.
   draw(pieces, width, rows, background) {
     const size = pieces.reduce((n, piece) => n + piece.length, 0);
     const to = this.bytes(this.x.splats(size / this.x.splat_size()), size);
@@ -182,7 +184,7 @@ export class Native {
   }
 }
 
-// Bytes of the header of a group with the eight before it, of which the first four tell it.
+// Bytes of the header of a group with the eight bytes before it, the first four of which hold its length.
 export function headerSize(payload) {
   const size = payload.length < 8 ? 0 : new DataView(payload.buffer, payload.byteOffset).getUint32(0);
   if (size > HEADER_MAX) throw new Error(`the header of a group has ${size} bytes, expected at most ${HEADER_MAX}`);

@@ -2,8 +2,8 @@
 //
 //   first bytes --header--> index of tiles, with boxes --view--> flags of tiles --ranges--> units --packed--> worker
 //
-// A tile needs the leading ones of its layer, from whose models it starts; a tile of survivors also the tile of the reference
-// with its number, and the leading ones there. `index`: see text.rs.
+// A tile needs the leading tiles of its layer, from whose models it starts; a tile of survivors also needs the tile of
+// the reference with its number, and the leading tiles there. `index`: see text.rs.
 
 import { headerSize } from "./native.js";
 
@@ -12,7 +12,7 @@ const GAP = 1 << 11; // bytes between two units up to which they are fetched at 
 const [STILL, MOVING] = [0.01, 0.3]; // margin around the image, in shares of its sides
 const BATCH = 4; // tiles that a worker decodes at once while it draws
 const EDGE = 0.05; // share of the Gaussians outside of the bounds on each side, at most
-const [COUNT, LEADING, OFFSET, SIZE, BOX] = [0, 1, 2, 3, 4]; // places in the description of a tile
+const [COUNT, LEADING, OFFSET, SIZE, BOX] = [0, 1, 2, 3, 4]; // indices in the description of a tile
 
 export class Parts {
   before = null; // Parts of the reference
@@ -21,10 +21,10 @@ export class Parts {
   #held = new Map(); // offset -> bytes of a unit
   #view = "";
 
-  // read(start, end, signal): bytes of the payload; first: those that it starts with
+  // read(start, end, signal): bytes of the payload; first: its first bytes
   static async open(read, first, signal) {
     const parts = new Parts();
-    if (first.length < 8) first = await read(0, FIRST, signal); // behind sound
+    if (first.length < 8) first = await read(0, FIRST, signal); // the sound in front of it fills them
     const size = headerSize(first);
     if (first.length < size) first = await read(0, size, signal);
     Object.assign(parts, { head: first.subarray(0, size) });
@@ -39,7 +39,7 @@ export class Parts {
     Object.assign(this, { before, key });
   }
 
-  // Bytes that are here.
+  // Number of bytes held.
   get length() {
     return [...this.#held.values()].reduce((n, unit) => n + unit.length, this.head.length);
   }
@@ -56,7 +56,8 @@ export class Parts {
     return [-1, 1].flatMap((sign) => [0, 1, 2].map((axis) => side(axis, sign)));
   }
 
-  // Flags of the tiles of the first `layers` layers whose boxes a view touches, all if it is null; more around it while it moves.
+  // Flags of the tiles of the first `layers` layers whose boxes touch the view, all if it is null; with a larger margin
+  // while it moves.
   seen(view, layers) {
     const moving = this.#view && `${view}` !== this.#view;
     this.#view = `${view}`;
@@ -65,7 +66,7 @@ export class Parts {
     return Uint8Array.from(this.index.tiles.flatMap((tiles, k) => tiles.map((tile) => flag(tile, k))));
   }
 
-  // Fetches what the tiles with flags need, and of the reference.
+  // Fetches the units that the tiles with flags need, also those of the reference.
   async fetch(flags, layers, signal) {
     await Promise.all([this.#fetch(flags, layers, false, signal), this.before?.#fetch(this.#survivors(flags), layers, true, signal)]);
   }
@@ -87,7 +88,8 @@ export class Parts {
     await Promise.all(runs.map(take));
   }
 
-  // [offset, size] of the units that a decoder of the tiles with flags reads, in order; leading: it keeps all leading tiles.
+  // [offset, size] of the units that a decoder of the tiles with flags reads, in order; leading: it keeps all leading
+  // tiles.
   #units(flags, layers, leading) {
     let at = 0;
     const own = this.index.tiles.flatMap((tiles, k) => {
@@ -106,9 +108,9 @@ export class Parts {
     return Uint8Array.from(known.flatMap((n, k) => Array.from({ length: n }, (_, t) => flags[starts[k] + t])));
   }
 
-  // What worker k of n decodes of the tiles with flags; more: pieces of it, of a few tiles each.
+  // Orders of worker k of n: its part of the tiles with flags; more: in pieces of a few tiles each.
   orders(flags, layers, k, n, more) {
-    let count = 0; // as many tiles for each
+    let count = 0; // the same number of tiles for each worker
     const own = flags.map((flag) => Number(flag && count++ % n === k));
     return (more ? batches(own) : [own]).map((wanted) => {
       const before = this.before && this.#survivors(wanted);

@@ -1,8 +1,8 @@
 import type { Camera } from "./embed/stream.js";
 
 /**
- * `<gsv-player src="movie.gsv" autoplay loop>`: the player with its controls. Attributes are listed in player.js. Events:
- * ready, picture, ended, error.
+ * `<gsv-player src="movie.gsv" autoplay loop>`: the player with its controls. Attributes are listed in player.js.
+ * Events: ready, picture, ended, error.
  */
 export class GsvPlayer extends HTMLElement {
   paused: boolean;

@@ -1,12 +1,12 @@
-// <gsv-player src="URL"> plays a .gsv file: opening, the clock, the image, and the actions of the viewer. resolution.js says
-// how fine the image is, messages.js what the viewer is told.
+// <gsv-player src="URL"> plays a .gsv file: opening, the clock, the image, and the actions of the viewer. resolution.js
+// chooses the resolution of the image, messages.js informs the viewer.
 //
-// Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the image fills the
-// element); quality="auto" or 0.1 to 1; layers="2" or "all", else as many as link and device sustain; renderer="cpu" or "gpu",
-// else the GPU if it is hardware; camera="NAME", of the file; background="rrggbb"; controls="off"; of sound: muted,
-// volume="0.5".
-// Properties: paused, frame, frameCount, fps, camera, stats. Methods: play(), pause(), show(frame). Events: ready, picture,
-// ended, error.
+// Attributes: src (.gsv, or a DASH manifest .mpd); autoplay; loop; speed="0.5"; size="512x512" (else the image fills
+// the element); quality="auto" or 0.1 to 1; layers="2" or "all", else as many as link and device sustain;
+// renderer="cpu" or "gpu", else the GPU if it is hardware; camera="NAME", of the file; background="rrggbb";
+// controls="off"; of sound: muted, volume="0.5".
+// Properties: paused, frame, frameCount, fps, camera, stats. Methods: play(), pause(), show(frame). Events: ready,
+// picture, ended, error.
 
 import { Camera, viewFrom } from "./camera.js";
 import { MARKUP, onDrag, onKeys } from "./controls.js";
@@ -186,7 +186,7 @@ export class GsvPlayer extends HTMLElement {
     }
   }
 
-  // Not before there is sound to play: others do not load it.
+  // Called only when there is sound to play: other streams do not load sound.js.
   async #hear(engine) {
     const { Sound } = await import("./sound.js");
     if (this.engine === engine) this.sound = new Sound(this, engine);
@@ -208,7 +208,7 @@ export class GsvPlayer extends HTMLElement {
     this.#messages.note("live", source.complete ? null : unfinished);
   }
 
-  // Begins when what the first frame shows is decoded, and looks at it when its size is known.
+  // Begins when the content of the first frame is decoded; makes the camera when the bounds are known.
   #begin(engine) {
     const { scene } = engine;
     const { header } = this;
@@ -311,7 +311,7 @@ export class GsvPlayer extends HTMLElement {
     return this.camera.view(...this.#resolution.size(sharp));
   }
 
-  // Rounds to a hundredth of the scene: smaller motions of the head need no other Gaussians.
+  // Rounds to a hundredth of the scene: smaller motions of the head need no new Gaussians.
   #near(v) {
     const step = this.camera.radius / 50;
     return Math.round(v / step) * step;
@@ -347,7 +347,8 @@ export class GsvPlayer extends HTMLElement {
     }
   }
 
-  // Enters virtual ("vr") or augmented reality ("ar"): a scene as tall as a person, drawn on the GPU; in "ar" on the floor.
+  // Enters virtual ("vr") or augmented reality ("ar"): a scene as tall as a person, drawn on the GPU; in "ar" on the
+  // floor.
   async #enter(way) {
     const { engine, camera } = this;
     try {

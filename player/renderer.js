@@ -6,15 +6,15 @@ const TILE = 16; // rows of a tile of the rasterizer
 export class Renderer {
   #images = new Map(); // id -> {t, view, gpu, pieces, packed, parts, blend, gaussians}
   #projected = new Map(); // id -> {left, load, ms} of images that several workers project
-  #load = new Float32Array(0); // of each row of tiles of the last image that several have projected
+  #load = new Float32Array(0); // of each row of tiles of the last image that several workers have projected
   #next = 1;
   #shown = 0;
   gpu = null;
   #how = "cpu";
   #closed = false;
 
-  // rasters: number of raster workers; stats: gets project, blend and gaussians; divide(load): ends of bands of about the same
-  // load; say(type, detail): events picture, nogpu, fatal
+  // rasters: number of raster workers; stats: gets project, blend and gaussians; divide(load): ends of bands of about
+  // the same load; say(type, detail): events picture, nogpu, fatal
   constructor(canvas, { rasters, stats, divide, say }) {
     Object.assign(this, { canvas, rasters, stats, divide, say });
     this.context = canvas?.getContext("2d", { alpha: false });
@@ -67,8 +67,8 @@ export class Renderer {
     return this.#images.size < IN_FLIGHT;
   }
 
-  // Registers an image {t, view, gaussians, pieces, divided}: as many group workers project it; divided: in several pieces.
-  // Returns what they must be asked for.
+  // Registers an image {t, view, gaussians, pieces, divided}: `pieces` group workers project it; divided: in several
+  // pieces. Returns the request to send to them.
   begin(image, background) {
     const id = this.#next++;
     const gpu = this.gpu;
@@ -78,7 +78,7 @@ export class Renderer {
     return { type: "draw", background, id, ends: image.divided ? this.#ends(image.view[1]) : [] };
   }
 
-  // Pieces of an image must agree on its bands: by the load of the image before.
+  // Pieces of an image must agree on its bands; they follow from the load of the image before.
   #ends(height) {
     const rows = Math.ceil(height / TILE);
     return this.divide(this.#load.length === rows ? this.#load : new Float32Array(rows).fill(1));

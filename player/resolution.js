@@ -1,7 +1,7 @@
 // The resolution of the image: a still one is sharp, a moving one as fine as the device draws in time.
 //
-// In: the size of the element and the times of the stages. Out: width and height of the image in pixels, and the load that
-// the choice of layers goes by.
+// In: the size of the element and the times of the stages. Out: width and height of the image in pixels, and the load
+// for the choice of layers.
 
 const PIXELS_MAX = 4e6; // of a still image
 const PIXELS_START = 420_000; // of a moving one, before any measurement

@@ -1,14 +1,14 @@
 // The sound of a stream, and while it runs the clock of the page.
 //
-// The samples that came with a group go, in an MP4 of their own, to decodeAudioData, and are started at their time on the
-// clock of an AudioContext: at once, exactly at loops and seeks, and without https, which WebCodecs needs. Decoders differ
-// in what they drop at the start of a file, not at its end: a chunk is placed by its end. `delay` is how long after its
-// time a picture appears, measured.
+// The samples of a group go, in an MP4 of their own, to decodeAudioData, and start at their time on the clock of an
+// AudioContext: at once, exactly at loops and seeks, and without https, which WebCodecs needs. Decoders differ in the
+// samples that they drop at the start of a file, not at its end: a chunk is placed by its end. `delay`: measured time
+// from when a picture is due until it appears.
 
 const AHEAD = 1; // seconds that are scheduled ahead
 const OFF = 0.01; // seconds from the position of the page above which sound starts anew: a seek, a stall
-const DELAY_OFF = 0.02; // seconds that `delay` may change before it does, too
-const SETTLE = 4; // samples of the group before, on which the decoder settles
+const DELAY_OFF = 0.02; // change of `delay` in seconds above which sound starts anew
+const SETTLE = 4; // samples of the group before, for the decoder to settle
 const KEPT = 40; // decoded chunks
 
 const u32 = (...words) => words.flatMap((v) => [24, 16, 8, 0].map((n) => (v >>> n) & 255));
@@ -35,10 +35,10 @@ function mp4({ entry, timescale }, samples, parts) {
 
 export class Sound {
   delay = 0.015; // seconds
-  #at = null; // what plays: second t of the video was due at `heard`, a time of the context; next, base: the group that follows
+  #at = null; // running sound: second t of the video was due at context time heard; next, base: the group that follows
   #last = null; // time of the context at the last `passed`
   #nodes = new Set();
-  #chunks = new Map(); // group -> promise of what #decode gives
+  #chunks = new Map(); // group -> promise of the result of #decode
   #closing = new AbortController();
 
   // player: its bar, and its attributes `muted` and `volume`
@@ -94,14 +94,14 @@ export class Sound {
     return before === null || this.#last === null ? null : Math.min(Math.max(this.#last - before, 0), 0.25);
   }
 
-  // Seconds of the video that the page is before `t` at a time of the context.
+  // Seconds by which the sound, at a time of the context, is ahead of second `t` of the video.
   #before(t, heard) {
     const { source, fps } = this.engine;
     const [off, length] = [this.#at.t + (heard - this.#at.heard) * this.#at.speed - t, source.frameCount / fps];
     return this.#at.loops ? off - length * Math.round(off / length) : off;
   }
 
-  // The page was at `frame` (with a fraction) at the last `passed`, and plays or not.
+  // Follows the page, which was at `frame` (with a fraction) at the last `passed`; plays: whether it plays.
   follow(frame, plays, loops) {
     if (!plays || this.#last === null) return this.#stop();
     const { source, fps } = this.engine;
@@ -131,7 +131,7 @@ export class Sound {
     this.#at = null;
   }
 
-  // Starts the sound of group i, `base` seconds later than in the file: after as many loops.
+  // Starts the sound of group i, `base` seconds (the loops before) later than in the file.
   async #play(at, i, base) {
     if (!this.#chunks.has(i)) this.#chunks.set(i, this.#decode(i).catch((e) => this.#fail(e)));
     if (this.#chunks.size > KEPT) this.#chunks.delete(this.#chunks.keys().next().value);

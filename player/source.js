@@ -1,9 +1,10 @@
-// A .gsv file behind a URL: the places of its groups, and their bytes by HTTP Range, sound included. With an index of layers
-// (ssix) only the requested layers are fetched, and of groups in parts only what is asked for (parts.js).
+// A .gsv file behind a URL: the positions of its groups, and their bytes by HTTP Range, sound included. With an index
+// of layers (ssix) only the requested layers are fetched, and of groups in parts only the requested units (parts.js).
 //
-// A finished file has an index (sidx), so one small request finds all groups; without it the headers of the fragments are
-// walked, and a growing file is polled. A server that ignores Range sends the whole file, which is then kept. All request
-// headers work without a CORS preflight, so any static host will do. A broken connection is resumed where it broke.
+// A finished file has an index (sidx), so one small request finds all groups; without it the headers of the fragments
+// are walked, and a growing file is polled. A server that ignores Range sends the whole file, which is then kept. All
+// request headers work without a CORS preflight, so any static host will do. A broken connection is resumed where it
+// broke.
 
 import { ALL } from "./native.js";
 
@@ -25,7 +26,7 @@ const sleep = (ms, signal) =>
 export class StreamError extends Error {}
 
 export class Source extends EventTarget {
-  groups = []; // {start_frame, frames, sync, offset, size, indexed, ends}: of the payload, or of the fragment if `indexed`;
+  groups = []; // {start_frame, frames, sync, offset, size, indexed, ends}: of the payload, of the fragment if `indexed`
   // ends: bytes of it that end with each layer, if that is known
   config = null;
   total = null; // bytes of the file, null if unknown
@@ -37,9 +38,9 @@ export class Source extends EventTarget {
   #whole = null; // all bytes so far, from a server without Range
   #closing = new AbortController();
 
-  tracks = 1; // of the file
+  tracks = 1; // number of tracks of the file
 
-  // track: which of them
+  // track: index of the track to read
   constructor(url, track = 0) {
     super();
     this.track = track;
@@ -76,7 +77,7 @@ export class Source extends EventTarget {
     }
   }
 
-  // The first bytes of the file, before the decoder is there to ask for more.
+  // The first bytes of the file, read before the decoder is loaded.
   async #start() {
     const head = await this.#read(0, HEAD);
     return this.total > HEAD && this.total <= SMALL && !this.#whole ? this.#read(0, this.total, undefined, head) : head;
@@ -171,7 +172,7 @@ export class Source extends EventTarget {
     this.#say("groups");
   }
 
-  // The entry of the group in a fragment of the index, or in the start of one.
+  // The entry of the group in a fragment of the index, or in its first bytes.
   #inside(g, fragment) {
     const known = this.native.describe().groups.length;
     this.native.x.seek(g.offset);
@@ -201,7 +202,7 @@ export class Source extends EventTarget {
       return true;
     }
     const at = x.position() + left;
-    const bytes = await this.#read(left > 0 ? at - 1 : at, at + STEP); // the last byte of a body that may be missing shows that it is there
+    const bytes = await this.#read(left > 0 ? at - 1 : at, at + STEP); // its last byte shows that a body is complete
     if (left > 0 && bytes.length) x.skip(left);
     const rest = left > 0 ? bytes.subarray(1) : bytes;
     if (rest.length) this.native.push(rest);
@@ -322,7 +323,7 @@ export class Source extends EventTarget {
       else chunks.push(value);
     }
     const bytes = Number(response.headers.get("content-length") ?? 0);
-    this.#say("received", { bytes: this.received - before, ms: performance.now() - began }); // with what came beside it
+    this.#say("received", { bytes: this.received - before, ms: performance.now() - began }); // with parallel requests
     // another origin hides Content-Range, but not Content-Length
     if (status === 206 && !range && bytes && bytes < end - start) {
       this.total = start + bytes;

@@ -1,9 +1,10 @@
-// Which worker decodes which tiles of a group, and the Gaussians of all in the order of the group. `index`: of the units of a group, see text.rs.
+// Assigns the tiles of a group to workers, and joins the Gaussians of all in the order of the group. `index`: of the
+// units of a group, see text.rs.
 
-const [COUNT] = [0]; // places in the description of a tile
+const [COUNT] = [0]; // indices in the description of a tile
 const EACH = 4; // tiles of a worker at least: all decode the leading tiles, from which the others start
 
-// A group that is here as a whole. reference: {key, payload}, null if it is independent
+// A group whose payload is here as a whole. reference: {key, payload}, null if it is independent
 export class Whole {
   constructor(native, payload, reference) {
     this.index = native.index(payload, reference?.payload);
@@ -35,7 +36,7 @@ export function order(index, layers, n) {
   return index.tiles.slice(0, layers).flatMap((tiles, layer) => tiles.map((tile, t) => [(layer + t) % n, tile[COUNT]]));
 }
 
-// One answer {values} or {buffer} from those of all workers of a group: as if one had all of its Gaussians.
+// One answer {values} or {buffer} from those of all workers of a group: as if one worker had all of its Gaussians.
 export function joined(answers, order) {
   const [first] = answers;
   if (answers.length === 1) return first;

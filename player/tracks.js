@@ -1,16 +1,17 @@
-// The tracks of a scene (spec 2.8): each has an engine of its own, which decodes it; the engine of the first one draws them all.
+// The tracks of a scene (spec 2.8): each has an engine of its own, which decodes it; the engine of the first one draws
+// them all.
 //
-// Frames are those of the scene, on the clock of the first track. A track that is damaged or not there is left out, and the
-// others go on; one that is only late is waited for, as a single track is.
+// Frames are those of the scene, on the clock of the first track. A track that is damaged or not there is left out, and
+// the others go on; the scene waits for a late track, as a single track does.
 
 const NOTHING = [1, 0, 0, 0, 0, 0, 0, 0]; // a transform that shows nothing
 
-// Whether a track is shown in another way than it was made.
+// Whether a track has a placement other than the default.
 export function placed({ placement: p }) {
   return Boolean(p && (p.name || p.hidden || p.offset || p.repeats !== 1 || p.keys));
 }
 
-// A point where a transform places it.
+// A point moved by a transform.
 function moved([w, x, y, z, a, b, c, s], [px, py, pz]) {
   const [tx, ty, tz] = [2 * (y * pz - z * py), 2 * (z * px - x * pz), 2 * (x * py - y * px)];
   return [
@@ -20,7 +21,7 @@ function moved([w, x, y, z, a, b, c, s], [px, py, pz]) {
   ];
 }
 
-// A view of the scene as a view of a track that its transform has not placed: world-to-camera with the transform before it.
+// A view of the scene as a view of a track before its transform: world-to-camera with the transform in front.
 export function unplaced(view, pose) {
   const [origin, ...axes] = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]].map((p) => moved(pose, p));
   const own = Array.from(view);
@@ -107,7 +108,7 @@ export class Scene {
     return all.filter((p) => !p.hidden && p.t !== null && !p.engine.failed.has(p.engine.groupOf(p.t)));
   }
 
-  // Starts fetching and decoding what frame t shows, and what comes next.
+  // Starts fetching and decoding the groups of frame t, and the next ones.
   want(t, loop) {
     for (const { engine, t: own, pose } of this.parts(t)) {
       engine.pose = pose;
@@ -115,7 +116,7 @@ export class Scene {
     }
   }
 
-  // Without anything to show the first track has the workers that draw the background.
+  // {engine, t} of the tracks that frame t shows; without any the first track, whose workers draw the background.
   #wanted(t) {
     if (!this.opened) return [{ engine: this.host, t: 0 }];
     const shown = this.#shown(t);
@@ -127,7 +128,7 @@ export class Scene {
     return this.opened && this.#wanted(t).every(({ engine, t: own }) => engine.ready(engine.groupOf(own)));
   }
 
-  // What is drawn in frame t: {engine, t, pose}.
+  // The tracks drawn in frame t: {engine, t, pose}.
   parts(t) {
     return this.#wanted(t).map((p) => ({ pose: this.#pose(p.engine, t), ...p }));
   }
@@ -136,7 +137,7 @@ export class Scene {
     return engine.source.native.pose(this.#time(engine, t));
   }
 
-  // The box of the tracks where frame t shows them, null until those of all are known.
+  // The box of the tracks as placed in frame t, null until the boxes of all are known.
   bounds(t) {
     const engines = this.#wanted(t).map(({ engine }) => engine);
     if (!this.opened || engines.some(({ bounds }) => !bounds)) return null;

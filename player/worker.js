@@ -1,20 +1,21 @@
 // A worker of the player, in one of two roles.
 //
-// group:  decodes and keeps groups, or its tiles of them; frame t + view -> projected Gaussians of each band of rows, to the
-//         worker of the band, or the visible ones packed for the GPU, or the attributes of all, to the page.
-// raster: projected Gaussians of a band, a piece from each group worker that has tiles of the group -> its pixels, to the page.
+// group:  decodes and keeps groups, or its tiles of them; frame t + view -> projected Gaussians of each band of rows,
+//         to the worker of the band, or the visible ones packed for the GPU, or the attributes of all, to the page.
+// raster: projected Gaussians of a band, a piece from each group worker that has tiles of the group -> its pixels, to
+//         the page.
 //
-// Two sets of group workers alternate: one shows its group while the other decodes the next, so decoded groups are never copied.
-// Each worker keeps its tiles of the last reference, since more predicted groups will follow.
+// Two sets of group workers alternate: one shows its group while the other decodes the next, so decoded groups are
+// never copied. Each worker keeps its tiles of the last reference, since more predicted groups will follow.
 
 import { NONE, Native } from "./native.js";
 
-const LOST = 8; // images after one of which pieces are missing, since a group worker has failed
+const LOST = 8; // newer images after which an image with missing pieces is dropped: a group worker has failed
 
 const roles = { group: groupWorker, raster: rasterWorker };
 
 self.onmessage = async ({ data }) => {
-  const early = []; // what comes before the instance is there
+  const early = []; // messages that arrive before the instance is ready
   self.onmessage = (e) => early.push(e);
   const native = await Native.create(data.module);
   roles[data.role](native, data);
@@ -101,7 +102,7 @@ function groupWorker(native, { ports }) {
     self.postMessage({ type: "packed", id, piece, buffer, ms: performance.now() - start }, [buffer]);
   }
 
-  // Of a group in one piece: who asks for all of a group has it so.
+  // Only for groups in one piece: an engine that is asked for attributes has no `view`, so it decodes groups whole.
   function attributes({ id, group, t }) {
     native.frame(groups.get(group)[0], t);
     const values = [0, 1, 2, 3, 4, 5].map((which) => native.attribute(which));

@@ -1,4 +1,4 @@
-"""The npm package: packed, installed and imported; frames and pictures beside those of decoder and renderer."""
+"""The npm package: packed, installed and imported; frames and pictures against those of decoder and renderer."""
 
 import base64
 import functools
@@ -16,9 +16,12 @@ import pytest
 from playing import FPS, GROUPS, LENGTH, Static, camera_of, pixels, psnr, sequence, serving
 from synthetic import encode_sequence
 
-from gscodec.decode import open_stream
+from gscodec.decode import open_scene, open_stream
+from gscodec.decode.scene import Track
 from gscodec.encode.encode import stream_config
 from gscodec.encode.settings import EncodeSettings
+from gscodec.encode.tracks import TrackPlan, write_tracks
+from gscodec.model.placement import Placement
 from gscodec.render.image import render_image
 
 ROOT = Path(__file__).parent.parent
@@ -30,7 +33,7 @@ PAGE = """<!doctype html><link rel="icon" href="data:,"><canvas></canvas><script
     "gscodec/playcanvas": "/node_modules/gscodec/embed/playcanvas.js",
     "playcanvas": "/playcanvas.mjs"
 }}</script>"""
-INSTALLED = ("build/tools", "player/examples")  # where PlayCanvas may be: `make tools`, or npm install for the examples
+INSTALLED = ("build/tools", "player/examples")  # folders of PlayCanvas: `make tools`, or npm install for the examples
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +51,9 @@ def app(tmp_path_factory, gsv):
     (path / "package.json").write_text('{"name": "app", "private": true}')
     run(["npm", "install", "--no-audit", "--no-fund", *path.glob("*.tgz")], cwd=path)
     shutil.copy(gsv, path / "a.gsv")
+    stream = open_scene(gsv).tracks[0].stream
+    placements = (Placement("late", offset=3), Placement("far", keys=((0, (1, 0, 0, 0), (3, 0, 0), 1.0),)))
+    write_tracks(path / "two.gsv", [TrackPlan.of(Track(stream, p)) for p in placements])
     (path / "index.html").write_text(PAGE)
     return path
 
@@ -72,7 +78,7 @@ def test_what_is_packed(app):
 
 
 def test_types_name_what_there_is(browser, address):
-    """Each member that a declaration names is one of the class."""
+    """Each member in a declaration is a member of the class."""
     browser.goto(address)
     for module, name in (("embed/stream", "GsvStream"), ("embed/stream", "Camera"), ("embed/playback", "Playback")):
         text = (ROOT / f"player/{module}.d.ts").read_text()
@@ -128,18 +134,20 @@ def test_frames_of_an_address_and_of_a_blob(browser, address, gsv):
             continue
         t, count, arrays = answer
         want, arrays = stream.frame(t), [np.frombuffer(base64.b64decode(a), np.float32) for a in arrays]
-        shown = np.isfinite(arrays[3])  # the decoder leaves out those that are not there
+        shown = np.isfinite(arrays[3])  # the decoder leaves out Gaussians outside their lifetime
         assert len(shown) == count
         for name, got in zip(names, arrays, strict=True):
             got = got.reshape(count, *getattr(want, name).shape[1:])[shown]
             np.testing.assert_allclose(got, getattr(want, name), rtol=1e-5, atol=1e-5, err_msg=f"{name} of {t}")
 
 
-def test_it_draws_on_a_canvas(browser, address, gsv):
+@pytest.mark.parametrize("name", ["a.gsv", "two.gsv"])
+def test_it_draws_on_a_canvas(browser, address, gsv, name):
+    """Of a file of several tracks the first one, as `frame` has it: not placed, from its own first frame."""
     browser.goto(address)
     script = f"""{OPEN}
         const canvas = document.querySelector("canvas");
-        const stream = await GsvStream.open("a.gsv", {{ canvas, layers: "auto" }});
+        const stream = await GsvStream.open("{name}", {{ canvas, layers: "auto" }});
         const camera = stream.camera();
         camera.orbit(0.2, 0.1);
         window.view = Array.from(camera.view(200, 150));
@@ -187,7 +195,7 @@ SCENE = """Promise.all([import("three"), import("gscodec/three")]).then(async ([
 
 
 def scene_comes_to(browser, want) -> bool:
-    """Splats are sorted at their own pace."""
+    """Waits for the picture: splats are sorted asynchronously."""
     for _ in range(200):
         got = pixels(browser, "new Promise((done) => setTimeout(() => done(window.scene.draw()), 30))")
         if browser.eval("window.scene.shown") == 8 and psnr(got, want) >= 33:

@@ -9,7 +9,7 @@ export interface PlaybackOptions {
   loop?: boolean;
   /** Default: 1. */
   speed?: number;
-  /** Whether the scene is turned so that its up is y, as in the scene of the program; default: true. */
+  /** Whether the stream is rotated so that its up is y, as in the scene of the program; default: true. */
   upright?: boolean;
 }
 

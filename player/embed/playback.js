@@ -24,10 +24,11 @@ export class Playback {
       if (this.#closed) stream.close();
       return stream;
     });
-    this.ready.catch(() => {}); // who waits for `ready` gets it
+    this.ready.catch(() => {}); // callers that await `ready` get the error
   }
 
-  // rows: of the rotation to the axes of the scene; there: origin of packed Gaussians, low and high corner of most of them
+  // Sets rows (rotation to the axes of the scene) and, in these axes, origin of packed Gaussians, low and high corner
+  // of the box of most of them.
   #place({ bounds, origin }, up) {
     this.rows = upright(up);
     const turn = (point) => this.rows.map((row) => row[0] * point[0] + row[1] * point[1] + row[2] * point[2]);
@@ -41,7 +42,7 @@ export class Playback {
     return Math.floor(this.position);
   }
 
-  // For each image of the scene. eye: place of the viewer in units of the stream, for colours that depend on the view.
+  // For each image of the scene. eye: position of the viewer in units of the stream, for view-dependent colours.
   async tick(eye) {
     const now = performance.now();
     const passed = Math.min(now - this.#last, 250) / 1000;

@@ -2,8 +2,8 @@ import type { Script } from "playcanvas";
 import type { Playback } from "./playback.js";
 
 /**
- * Plays a .gsv file below its entity. Units are those of the stream; y is up. Fires "frame" (number) for each new frame and
- * "error" (Error) if the stream cannot be played.
+ * Plays a .gsv file below its entity. Units are those of the stream; y is up. Fires "frame" (number) for each new frame
+ * and "error" (Error) if the stream cannot be played.
  */
 export class GsvScript extends Script {
   static scriptName: "gsv";

@@ -1,5 +1,6 @@
-// GsvScript: a script that plays a .gsv file on an entity of a PlayCanvas scene, by its GSplat component: the frame is one
-// texture, in the 16 bytes a Gaussian that the decoder packs, which the engine unpacks and sorts with all other splats.
+// GsvScript: a script that plays a .gsv file on an entity of a PlayCanvas scene, by its GSplat component: the frame is
+// one texture, in the 16 bytes a Gaussian that the decoder packs, which the engine unpacks and sorts with all other
+// splats.
 
 import { BoundingBox, Entity, GSplatContainer, GSplatFormat, Mat4, PIXELFORMAT_RGBA32U, Quat, Script, Vec3 } from "playcanvas";
 import { Playback } from "./playback.js";
@@ -80,7 +81,7 @@ export class GsvScript extends Script {
     this.playback.tick(this.#eye());
   }
 
-  // Place of the viewer in units of the stream.
+  // Position of the viewer in units of the stream.
   #eye() {
     const camera = this.app.systems.camera.cameras[0]?.entity;
     if (!this.#splats || !camera) return [0, 0, 0];
@@ -99,7 +100,7 @@ export class GsvScript extends Script {
     this.fire("frame", this.playback.frame);
   }
 
-  // One with room for `count` Gaussians.
+  // A container with room for `count` Gaussians.
   #container(count, bounds) {
     const { gsplat } = this.#splats;
     if (gsplat?.resource.maxSplats >= count) return gsplat.resource;

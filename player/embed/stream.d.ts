@@ -9,7 +9,7 @@ export interface Gaussians {
   quats: Float32Array;
   /** [N, 3], natural logarithms of the standard deviations. */
   logScales: Float32Array;
-  /** [N]; -Infinity where the Gaussian is not there in this frame. */
+  /** [N]; -Infinity for Gaussians that this frame does not show. */
   logitOpacities: Float32Array;
   /** [N, 3]; colour = 0.5 + 0.28209479 * sh0 + the higher bands, sRGB. */
   sh0: Float32Array;
@@ -26,9 +26,9 @@ export interface ReferenceCamera {
   k: number[];
   /** [3, 4], world to camera, row by row. */
   viewmat: number[];
-  /** Nothing nearer than this is drawn. */
+  /** Gaussians whose centre is nearer than this are not drawn. */
   near: number;
-  /** Variance of the low-pass with which pictures are drawn, pixels^2. */
+  /** Variance of the low-pass filter of rendering, pixels^2. */
   low_pass: number;
 }
 
@@ -45,19 +45,19 @@ export interface Config {
 }
 
 /**
- * 20 numbers: width, height, fx, fy, cx, cy in pixels; the 12 of world to camera, [3, 4] row by row, axes x right, y down,
- * z ahead; near plane; low-pass.
+ * 20 numbers: width, height, fx, fy, cx, cy in pixels; the 12 of world to camera, [3, 4] row by row, axes x right, y
+ * down, z ahead; near plane; low-pass.
  */
 export type View = Float32Array;
 
-/** A camera that orbits the scene, or stands where one of the stream stood. */
+/** A camera that orbits the scene, or looks through a camera of the stream. */
 export class Camera {
   constructor(bounds: ArrayLike<number>, up: string, references?: ReferenceCamera[]);
   /** The view of an image of `width` x `height` pixels. */
   view(width: number, height: number): View;
   /** Looks through camera `i` of the stream, until the next motion. */
   use(i: number): void;
-  /** Turns; in shares of the shorter side of the image, as all motions. */
+  /** Turns by shares of the shorter side of the image; `pan` takes the same unit. */
   orbit(dx: number, dy: number): void;
   pan(dx: number, dy: number): void;
   /** Goes closer by a factor. */
@@ -68,11 +68,11 @@ export class Camera {
 /** A .gsv file, decoded by web workers. Requests are answered one after another. */
 export class GsvStream {
   /**
-   * Resolves when the first group of frames is decoded. Rejects if there is no stream, it is damaged, or the browser cannot
-   * play it.
+   * Resolves when the first group of frames is decoded. Rejects if there is no stream, it is damaged, or the browser
+   * cannot play it.
    *
-   * source: an address (HTTP Range is used where the host knows it), or a Blob or File; canvas: where `draw` draws; layers:
-   * how many of each group are fetched, "auto": as many as the link carries.
+   * source: an address (HTTP Range is used where the host knows it), or a Blob or File; canvas: where `draw` draws;
+   * layers: how many of each group are fetched, "auto": as many as the link carries.
    */
   static open(
     source: string | URL | Blob,
@@ -84,7 +84,7 @@ export class GsvStream {
   readonly config: Config;
   /** Box of most Gaussians (1 to 99 %) of the first frame: x, y, z of its low and of its high corner. */
   readonly bounds: number[];
-  /** Middle of the box, which packed Gaussians are relative to. */
+  /** Middle of the box; packed Gaussians are relative to it. */
   readonly origin: number[];
   /** Whether the first group is decoded again while the last one plays; true at first. */
   loop: boolean;
@@ -93,11 +93,11 @@ export class GsvStream {
   /** The Gaussians of frame `t`. Rejects with RangeError if there is no such frame. */
   frame(t: number): Promise<Gaussians>;
   /**
-   * The Gaussians of frame `t` that are not transparent as [N, 4] words, 16 bytes each, Spark's PackedSplats, relative to
-   * `origin`; with colours as seen from `eye`.
+   * The Gaussians of frame `t` that are not transparent as [N, 4] words, 16 bytes each, Spark's PackedSplats, relative
+   * to `origin`; with colours as seen from `eye`.
    */
   packed(t: number, eye?: ArrayLike<number>): Promise<Uint32Array>;
-  /** Draws frame `t` on the canvas, which becomes as large as the view; resolves when it is there. */
+  /** Draws frame `t` on the canvas, which becomes as large as the view; resolves when the image is there. */
   draw(t: number, view: View): Promise<void>;
   /** Ends its workers and requests. */
   close(): void;

@@ -1,4 +1,4 @@
-// GsvStream: the frames of a .gsv file for programs of others, as arrays, packed for GPU renderers, or drawn on a canvas.
+// GsvStream: the frames of a .gsv file for other programs, as arrays, packed for GPU renderers, or drawn on a canvas.
 // The engine of the page decodes; requests are answered one after another.
 
 import { Camera, viewFrom } from "../camera.js";
@@ -13,12 +13,12 @@ export class GsvStream {
   #url = null; // of a Blob
   #turn = Promise.resolve(); // of the last request
 
-  // source: an address or a Blob; canvas: for `draw`; layers: how many of each group, "auto" or "all"
+  // source: an address or a Blob; canvas: for `draw`; layers: number of layers of each group, "auto" or "all"
   static async open(source, { canvas = null, layers = "all" } = {}) {
     if (typeof Worker === "undefined") throw new Error("GsvStream needs web workers: use it in a browser.");
     const stream = new GsvStream();
     if (source instanceof Blob) stream.#url = URL.createObjectURL(source);
-    stream.#engine = new Engine(canvas, stream.#url ?? String(source));
+    stream.#engine = new Engine(canvas, stream.#url ?? String(source), { alone: true });
     stream.#engine.layers = { auto: AUTO, all: ALL }[layers] ?? layers;
     try {
       await stream.#race(stream.#engine.open());
@@ -52,7 +52,7 @@ export class GsvStream {
     return [0, 1, 2].map((i) => (bounds[i] + bounds[i + 3]) / 2);
   }
 
-  // A camera that orbits the scene, as that of the page.
+  // A camera that orbits the scene, as in the page.
   camera() {
     return new Camera(this.bounds, this.config.up, this.config.cameras);
   }

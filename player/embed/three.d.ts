@@ -8,7 +8,7 @@ export interface GsvObjectEventMap extends Object3DEventMap {
 
 /**
  * Plays a .gsv file in a three.js scene that has a SparkRenderer. Units are those of the stream; y is up. Give the
- * SparkRenderer `preBlurAmount: 0.3, blurAmount: 0` to see what gscodec draws.
+ * SparkRenderer `preBlurAmount: 0.3, blurAmount: 0` to get the image that gscodec draws.
  */
 export class GsvObject extends Group<GsvObjectEventMap> {
   constructor(options: PlaybackOptions);

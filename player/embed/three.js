@@ -1,4 +1,5 @@
-// GsvObject: an Object3D that plays a .gsv file in a three.js scene; Spark sorts and draws it with all other splats there.
+// GsvObject: an Object3D that plays a .gsv file in a three.js scene; Spark sorts and draws it with all other splats
+// there.
 
 import { PackedSplats, SplatMesh } from "@sparkjsdev/spark";
 import { Group, Matrix4 } from "three";
@@ -29,7 +30,7 @@ export class GsvObject extends Group {
     });
   }
 
-  // Place of the viewer in units of the stream.
+  // Position of the viewer in units of the stream.
   #eye(viewToWorld) {
     const { origin } = this.playback.stream ?? { origin: [0, 0, 0] };
     const eye = this.position.clone().setFromMatrixPosition(viewToWorld);
