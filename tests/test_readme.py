@@ -62,6 +62,31 @@ def test_table_of_training():
         assert all(map(agrees, figures, values)), (name, preset, figures, values)
 
 
+def test_table_of_other_qualities():
+    found = {(e["capture"], e["preset"], e["quality"]): e for e in result("train")["entries"] if e["frames"][2] == 1}
+    for name, quality, *figures in rows("capture, preset | `--quality`"):
+        e = found[*name.split(", "), float(quality)]
+        assert all(map(agrees, figures, [e[k] for k in ("kb_per_frame", "psnr_fg", "seconds_per_frame")])), name
+
+
+def test_table_of_frames_alone():
+    entries = [e for e in result("train")["entries"] if e["preset"] == "medium" and e["quality"] is None]
+    recipes = {
+        "stream": "gscodec",
+        "alone with the steps of medium's keyframe": "alone",
+        "the same coded": "alone-coded",
+        "alone in full": "full",
+        "V3's recipe": "v3",
+        "V3's recipe and packing": "v3-coded",
+    }
+    for name, *figures in rows("capture, step of the frames, recipe"):
+        capture, step, recipe = name.split(", ")[:3]
+        at = 1 if recipe == "stream" else int(step)
+        [e] = (e for e in entries if (e["capture"], e["recipe"], e["frames"][2]) == (capture, recipes[recipe], at))
+        psnr = np.mean(e["psnr_of_frame"][:: int(step) // at])
+        assert all(map(agrees, figures, [e["kb_per_frame"], psnr, e["seconds_per_frame"]])), (name, psnr)
+
+
 def test_table_of_stress():
     found, table = {e["case"]: e for e in result("stress")["entries"]}, rows("stress case")
     assert {name for name, *_ in table} == set(found)
