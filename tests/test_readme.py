@@ -65,7 +65,7 @@ def test_table_of_training():
 def test_table_of_other_qualities():
     found = {(e["capture"], e["preset"], e["quality"]): e for e in result("train")["entries"] if e["frames"][2] == 1}
     for name, quality, *figures in rows("capture, preset | `--quality`"):
-        e = found[*name.split(", "), float(quality)]
+        e = found[(*name.split(", "), float(quality))]
         assert all(map(agrees, figures, [e[k] for k in ("kb_per_frame", "psnr_fg", "seconds_per_frame")])), name
 
 
