@@ -238,6 +238,7 @@ def test_batch_is_the_sum_of_its_views():
     batch = CpuBackend().photometric_loss(params, views)
     single = [CpuBackend().photometric_loss(params, [view]) for view in views]
     assert batch.loss == pytest.approx(sum(s.loss for s in single))
+    assert CpuBackend().photometric_loss_value(params, views) == batch.loss
     for name in PARAMETERS:
         total = sum(np.asarray(s.grads[name], np.float64) for s in single)
         assert np.abs(total).max() > 0

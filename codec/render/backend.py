@@ -103,6 +103,9 @@ class Backend(Protocol):
     def photometric_loss(self, params: Params, views: Sequence[TargetView], weights: LossWeights) -> RenderLoss:
         """Loss of Gaussians against the targets of `views`, and its gradients."""
 
+    def photometric_loss_value(self, params: Params, views: Sequence[TargetView], weights: LossWeights) -> float:
+        """`RenderLoss.loss` of `photometric_loss`, without gradients."""
+
     def start_photometric_loss(self, params: Params, views: Sequence[TargetView], weights: LossWeights) -> PendingLoss:
         """Starts `photometric_loss` of the current Gaussians, in parallel to the caller.
 

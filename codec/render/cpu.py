@@ -60,19 +60,22 @@ class CpuBackend:
         arrays = tuple(a.copy() for a in _arrays(params))
         return self._worker.submit(self._photometric_loss, params, arrays, views, weights).result
 
+    def photometric_loss_value(
+        self, params: Params, views: Sequence[TargetView], weights: LossWeights = IMAGE_ALONE
+    ) -> float:
+        """See `Backend`. Raises as `photometric_loss`."""
+        values, _ = self._step(_arrays(params), views, weights, None)
+        return float(np.array([v[0] for v in values]).sum())
+
     def _photometric_loss(
         self, params: Params, arrays: tuple[np.ndarray, ...], views: Sequence[TargetView], weights: LossWeights
     ) -> RenderLoss:
         """`photometric_loss` of the `arrays`; the gradients have the types (array or tensor) of `params`."""
-        if not views:
-            raise UsageError("a batch has at least one view, got none")
-        grads, statistics = self.workspace.gradients(arrays)
-        step, native = self.workspace.native.step, [_native_view(v) for v in views]
-        lambdas = (weights.ssim, weights.mask, weights.depth)
-        values, radii = call(step, arrays, native, lambdas, (grads, statistics))
+        grads, statistics = out = self.workspace.gradients(arrays)
+        values, radii = self._step(arrays, views, weights, out)
         losses, exposure = np.array([v[:6] for v in values]), np.array([v[6:] for v in values])
         loss, means = float(losses[:, 0].sum()), losses[:, 1:].mean(0).tolist()
-        others = float((losses[:, 4:6] @ lambdas[1:]).sum())  # mask and depth
+        others = float((losses[:, 4:6] @ (weights.mask, weights.depth)).sum())
         return RenderLoss(
             loss,
             loss - others,
@@ -83,6 +86,15 @@ class CpuBackend:
             grad_exposure=exposure,
             **dict(zip(STATISTICS, statistics, strict=True)),
         )
+
+    def _step(
+        self, arrays: tuple[np.ndarray, ...], views: Sequence[TargetView], weights: LossWeights, out: tuple | None
+    ) -> tuple[list, np.ndarray]:
+        """Losses and exposure gradients of each view, and radii [N]; `out`: gradients and statistics to fill."""
+        if not views:
+            raise UsageError("a batch has at least one view, got none")
+        lambdas = (weights.ssim, weights.mask, weights.depth)
+        return call(self.workspace.native.step, arrays, [_native_view(v) for v in views], lambdas, out)
 
     def backpropagate(
         self, params: Params, camera: Camera, background: Sequence[float], pixel_gradient: PixelGradient

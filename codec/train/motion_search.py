@@ -21,11 +21,10 @@ import torch
 from ..farthest_point_sampling import farthest_points
 from ..model.camera import fibonacci_directions
 from ..model.rotations import quat_multiply, quat_to_rotvec, rotate, rotvec_to_quat
-from ..render.backend import RenderLoss
 from ..render.optimizer import Adam
 from .deformation_graph import Pose
 from .model import REMOVED_LOGIT, quat_product
-from .views import start_photometric_loss
+from .views import Target, photometric_loss_value, start_photometric_loss
 
 if TYPE_CHECKING:
     from .tracking import Tracker
@@ -118,8 +117,8 @@ class _Bodies:
         from scipy.spatial import cKDTree
 
         part, limb = self._part[self._moving].numpy(), np.zeros(len(self.still), int)
-        present = self._loss(self._params, self._frame).loss
-        worth = [self._loss(self._without(k), self._frame).loss - present for k in range(len(limb))]
+        present = self._loss(self._params, self._frame)
+        worth = [self._loss(self._without(k), self._frame) - present for k in range(len(limb))]
         lost = sorted((k for k in range(len(limb)) if worth[k] < 0 and (part == k).any()), key=worth.__getitem__)
         if lost:
             means = self._means.numpy()
@@ -172,18 +171,21 @@ class _Bodies:
         """[P] int, part of each of `points` [P, 3]."""
         return self._of_seed[torch.cdist(points, self._seeds).argmin(1)]
 
-    def _loss(self, params: dict, frame: int) -> RenderLoss:
-        t = self.tracker
-        targets = [t.views.target(i, frame, self._scale) for i in self._cameras]
-        return start_photometric_loss(params, targets, t.settings, np.random.default_rng(0), t.views.backend)()
+    def _targets(self, frame: int) -> list[Target]:
+        return [self.tracker.views.target(i, frame, self._scale) for i in self._cameras]
+
+    def _loss(self, params: dict, frame: int) -> float:
+        """Loss of the small views of `frame`."""
+        t, rng = self.tracker, np.random.default_rng(0)
+        return photometric_loss_value(params, self._targets(frame), t.settings, rng, t.views.backend)
 
     def loss_before(self) -> float:
         """Loss of the frame before, as it was fitted."""
-        return self._loss(self.tracker.model.params, self._frame - 1).loss
+        return self._loss(self.tracker.model.params, self._frame - 1)
 
     def loss(self, motion: np.ndarray) -> float:
         """Loss after a motion."""
-        return self._loss(self._moved(motion), self._frame).loss
+        return self._loss(self._moved(motion), self._frame)
 
     def _turned(self, motion: np.ndarray, points: torch.Tensor, part: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """`points` [P, 3] of the parts `part` [P] after a motion, and their rotations [P, 4]."""
@@ -202,9 +204,11 @@ class _Bodies:
         """The motion that some gradient steps reach from `motion`; `only`: [parts, 1], 1 for parts that may move."""
         t, s = self.tracker, self.settings
         values, adam = {"motion": motion.copy()}, Adam(t.views.backend, t.settings.tracking.node_adam)
+        targets = self._targets(self._frame)
         for step in range(s.steps):
             params = self._moved(values["motion"])
-            grads = self._loss(params, self._frame).grads
+            rng = np.random.default_rng(0)  # the backgrounds of all trials are the same
+            grads = start_photometric_loss(params, targets, t.settings, rng, t.views.backend)().grads
             by_means, by_quats = (grads[n] * self._moving[:, None] for n in ("means", "quats"))
             arm = params["means"] - self._centers[self._part]
             arm = arm - t.radius * torch.from_numpy(values["motion"])[self._part, 3:]

@@ -263,6 +263,13 @@ def start_photometric_loss(
     return backend.start_photometric_loss(params, views, _weights(settings))
 
 
+def photometric_loss_value(
+    params: dict, targets: Sequence[Target], settings: TrainSettings, rng: np.random.Generator, backend: Backend
+) -> float:
+    """`photometric_loss` of Gaussians against all `targets`, summed, without gradients."""
+    return backend.photometric_loss_value(params, [_target_view(t, rng) for t in targets], _weights(settings))
+
+
 def _weights(settings: TrainSettings) -> LossWeights:
     return LossWeights(settings.ssim_lambda, settings.mask_lambda, settings.depth_lambda)
 

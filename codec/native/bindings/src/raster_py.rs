@@ -193,7 +193,7 @@ impl Rasterizer {
     }
 
     /// One training step on a batch of views. Returns for each (loss, l1, mse, ssim, mask, depth, gradient of the gain,
-    /// of the offset), and [N] the largest radii. The gradients are those of the sum of the losses. A view is (camera,
+    /// of the offset), and [N] the largest radii. The gradients are those of the sum of the losses; None: they are not computed. A view is (camera,
     /// (background, (gain, offset) or None), (rgb, alpha or None, depth or None)); the lambdas are those of
     /// SSIM, mask and depth.
     fn step<'py>(
@@ -202,10 +202,10 @@ impl Rasterizer {
         params: Params,
         views: Vec<TargetView>,
         lambdas: (f32, f32, f32),
-        grads: Grads,
+        grads: Option<Grads>,
     ) -> PyResult<(Vec<Value>, Bound<'py, PyArray1<f32>>)> {
         let mut grads = grads;
-        let (splats, mut out) = (splats(&params)?, gradients(&mut grads)?);
+        let (splats, mut out) = (splats(&params)?, grads.as_mut().map(gradients).transpose()?);
         let lambdas = Lambdas {
             ssim: lambdas.0,
             mask: lambdas.1,
@@ -228,7 +228,7 @@ impl Rasterizer {
                 },
             );
             let v = py
-                .detach(|| step.run(inner, &splats, &view, background, target, lambdas, &mut out))
+                .detach(|| step.run(inner, &splats, &view, background, target, lambdas, out.as_mut()))
                 .map_err(usage)?;
             let StepValue { image, mask, depth, .. } = v;
             values.push((v.loss, image.l1, image.mse, image.ssim, mask, depth, v.gain, v.offset));
@@ -236,7 +236,9 @@ impl Rasterizer {
                 .iter_mut()
                 .zip(inner.projected())
                 .for_each(|(r, p)| *r = r.max(p.radius()));
-            out.add = true;
+            if let Some(out) = &mut out {
+                out.add = true;
+            }
         }
         Ok((values, PyArray1::from_vec(py, radii)))
     }

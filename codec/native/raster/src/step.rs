@@ -67,6 +67,8 @@ pub struct Step {
 }
 
 impl Step {
+    /// `out`: None: the loss alone, without gradients by the Gaussians.
+    ///
     /// # Errors
     /// Wrong lengths, an empty or too large view, too many Gaussian-tile pairs.
     #[allow(clippy::too_many_arguments)] // one training step has these inputs
@@ -78,7 +80,7 @@ impl Step {
         background: Background,
         target: TargetImage,
         lambdas: Lambdas,
-        out: &mut Gradients,
+        out: Option<&mut Gradients>,
     ) -> Result<StepValue, RasterError> {
         splats.check()?;
         view.check()?;
@@ -93,11 +95,13 @@ impl Step {
             ..background
         };
         rasterizer.run(|r| {
-            r.forward_here(splats, view, shifted, true, target.depth.is_some())?;
+            r.forward_here(splats, view, shifted, out.is_some(), target.depth.is_some())?;
             let start = Clock::start();
             let value = self.photometric_loss(r, view, background, target, lambdas)?;
             r.timings.loss = start.ms();
-            r.backward_here(splats, &self.grad_image, &self.grad_alpha, &self.grad_depth, out)?;
+            if let Some(out) = out {
+                r.backward_here(splats, &self.grad_image, &self.grad_alpha, &self.grad_depth, out)?;
+            }
             Ok(value)
         })
     }
