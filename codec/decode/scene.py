@@ -178,7 +178,8 @@ def open_scene(path: str | Path, *, strict: bool = True, layers: int | None = No
 
     Raises:
         FileNotFoundError: the file does not exist.
-        BitstreamError: it is not a .gsv file, or its first track cannot be read.
+        BitstreamError: it is not a .gsv file, or its first track is damaged.
+        LimitError: its first track exceeds a limit.
     """
     data, name = open_bytes(path), str(path)
     try:

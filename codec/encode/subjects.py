@@ -31,7 +31,8 @@ class _Group:
 
 
 def find_subjects(stream: Stream) -> list[np.ndarray]:
-    """Labels [N] of each group; 0 is the largest subject of the first groups. All 0 if there is one subject."""
+    """Labels [N] of each group; 0 is the largest subject of the first groups. All 0 if there is one subject, or if
+    there are more than `MOST`."""
     reach = None
     found: list[np.ndarray] = []
     last: tuple[np.ndarray, np.ndarray] | None = None  # means and labels in the frame before
