@@ -3,6 +3,8 @@
 import itertools
 import json
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +14,9 @@ from gscodec import _native
 from gscodec.atomic_write import read_arrays, write_arrays
 from gscodec.bitstream.color import correlate, decorrelate
 from gscodec.bitstream.quantization import steps_for, subject_radius
+from gscodec.commands.eval import evaluate_stream
 from gscodec.decode import Stream, open_stream
+from gscodec.decode.maps import write_maps
 from gscodec.encode.axis_order import sorted_axes
 from gscodec.encode.coder import CoderState, GroupCoder
 from gscodec.encode.encode import StreamOutput, encode_groups, stream_config
@@ -21,7 +25,7 @@ from gscodec.encode.rdo import coded_layers
 from gscodec.encode.rotation_residuals import EXPONENT_UNIT, fit_scale_exponents, quantize_rotations, step_factors
 from gscodec.encode.settings import EncodeSettings, PlanSettings, RdoSettings, ScaleExponentSettings
 from gscodec.encode.writer import StreamWriter
-from gscodec.errors import BitstreamError, CaptureError, UsageError
+from gscodec.errors import BitstreamError, CaptureError, LimitError, UsageError
 from gscodec.fit import fit_groups
 from gscodec.model.camera import Camera, look_at
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
@@ -29,6 +33,7 @@ from gscodec.model.gaussians import SH_C0, Gaussians, concatenate
 from gscodec.model.parametric_group import NodeMotion, ParametricGroup
 from gscodec.model.rotations import quat_conjugate, quat_multiply
 from gscodec.model.temporal_transform import dct_basis
+from gscodec.progress import Bar
 
 
 def write(sequence, out, quality=50.0, **settings):
@@ -375,6 +380,50 @@ def test_random_access_bounds_the_prediction(tmp_path):
         stream = open_stream(tmp_path / "a.gsv")
         assert "".join("PS"[g["sync"]] for g in stream.groups) == syncs
         assert len(stream.frame(19)) == len(stream.frame(0))
+
+
+def test_no_prediction_across_a_group_as_long_as_random_access(tmp_path):
+    """Not even by the shorter groups around it."""
+    group, same = turning(60, frames=8), np.arange(60, dtype=np.int32)
+    frames = [group.frame(t) for t in range(8)]
+    groups = [DenseGroup(frames[:4]), DenseGroup(frames, parents=same), DenseGroup(frames[:4], parents=same)]
+    write(turning().with_groups(groups), tmp_path / "a.gsv", random_access=8)
+    stream = open_stream(tmp_path / "a.gsv")
+    assert [g["sync"] for g in stream.groups] == [True] * 3
+    assert len(stream.frame(15)) == 60
+
+
+def test_some_frames_are_compared_with_the_same_frames(tmp_path, capsys):
+    """`eval --frames`: frame t of the stream beside frame t of the capture, rates of the whole stream."""
+    write(turning(60, frames=4), tmp_path / "a.gsv")
+    capture = Path(__file__).parent.parent / "examples" / "lumberjack"
+    with Bar() as bar:
+        measure = partial(evaluate_stream, tmp_path / "a.gsv", capture, split="test", bar=bar)
+        whole, last = measure(frames=None), measure(frames="3:4")
+    assert [(r["frame"], r["psnr"]) for r in last["per_frame"]] == [(3, whole["per_frame"][3]["psnr"])]
+    assert last["kb_per_frame"] == whole["kb_per_frame"] > 0
+    assert "a.gsv has 4 frames" in capsys.readouterr().err
+
+
+def test_maps_replace_all_planes_of_earlier_maps(tmp_path):
+    write(turning(60, frames=4), tmp_path / "a.gsv")
+    stream, maps = open_stream(tmp_path / "a.gsv"), tmp_path / "maps"
+    write_maps(stream, maps)
+    planes = set(maps.rglob("*.png"))
+    plane = min(p for p in planes if not p.name.endswith(".high.png") and p.with_suffix(".high.png") not in planes)
+    plane.with_suffix(".high.png").write_bytes(plane.read_bytes())
+    write_maps(stream, maps)
+    assert set(maps.rglob("*.png")) == planes
+
+
+def test_a_group_beyond_the_level_is_refused(tmp_path):
+    """The level is in the head of the file, which is written first; a decoder would refuse the group."""
+    group = turning(60, frames=4).groups[0]
+    config = stream_config(fps=25, sh_degree=0, gaussians=60, frames=4)
+    groups = turning().with_groups([group, DenseGroup([group.frame(0)] * 65)])
+    with pytest.raises(LimitError, match=r"group 1: .*65 frames, level 1 allows 64; use shorter groups"):
+        encode_sequence(groups, tmp_path / "a.gsv", config, EncodeSettings(quality=50, refine=0))
+    assert not (tmp_path / "a.gsv").exists()
 
 
 @pytest.mark.parametrize("parents", [np.zeros(60, int), np.arange(50), np.arange(60) + 1])

@@ -63,12 +63,14 @@ def evaluate_stream(
     chosen = frame_range(frames, min(whole.frame_count, reference.frame_count))
 
     def measure(stream, size: int) -> dict:
-        options = {"size": size, "progress": on_progress}
+        options = {"size": size, "stream_frames": whole.frame_count, "progress": on_progress}
         if splats:
-            options["stream_frames"] = whole.frame_count
             return evaluate_splats(stream.frame, reference, frames=chosen, **options)
         capture = reference.frames(chosen.start, chosen.stop).with_low_pass(low_pass_of(whole.cameras))
-        return evaluate_capture(stream.frame, capture, split=split, **options)
+        found = evaluate_capture(lambda t: stream.frame(chosen.start + t), capture, split=split, **options)
+        for row in found["per_frame"]:
+            row["frame"] += chosen.start
+        return found
 
     result = measure(whole, whole.byte_count)
     if isinstance(whole, Scene):  # its tracks have layers of their own

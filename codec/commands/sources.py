@@ -147,9 +147,9 @@ _MODES = {
 
 
 def _largest(sequence: GaussianSequence) -> dict:
-    """What the level of the stream must have room for."""
+    """Caps that the level of the stream must cover."""
     first = [g.frame(0) for g in sequence.groups]
-    counts = {"gaussians": len(first[0]), "frames": max(len(g) for g in sequence.groups)}
+    counts = {"gaussians": max(map(len, first)), "frames": max(len(g) for g in sequence.groups)}
     return {"sh_degree": max(g.sh_degree for g in first), **counts}
 
 

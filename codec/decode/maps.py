@@ -90,10 +90,12 @@ def _write(path: Path, data: bytes) -> None:
 def _write_plane(path: Path, plane: np.ndarray) -> int:
     """Writes bits 0 to 15 to PATH.png, and the higher bits to PATH.high.png if any is set; returns how many images."""
     write_png(path.with_name(path.name + ".png"), (plane & 0xFFFF).clip(0).astype(np.uint16))
-    high = plane.clip(0) >> 16
-    if high.any():
-        write_png(path.with_name(path.name + ".high.png"), high.astype(np.uint16))
-    return 1 + int(high.any())
+    high, more = plane.clip(0) >> 16, path.with_name(path.name + ".high.png")
+    if not high.any():
+        more.unlink(missing_ok=True)  # of earlier maps
+        return 1
+    write_png(more, high.astype(np.uint16))
+    return 2
 
 
 def _facts(q: QuantizedGroup) -> dict:

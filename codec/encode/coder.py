@@ -201,7 +201,7 @@ class GroupCoder:
     def _independent(self, state, group, importance, quality, first_frame) -> tuple[CodedGroup, CoderState | None]:
         coded, quantized = self._packed(self.quantized(group, importance, quality), group, first_frame)
         if self.settings.random_access <= len(group):
-            return coded, state
+            return coded, None  # no later group is near enough to be predicted
         return coded, _state_of(quantized, coded.payload, chosen=self.has_pictures(group))
 
     def _packed(

@@ -14,8 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import _native
 from ..bitstream.levels import smallest_level
 from ..bitstream.quantization import QUALITY_DEFAULT
+from ..errors import LimitError
 from ..model.camera import Camera
 from ..model.parametric_group import ParametricGroup
 from .audio import AudioTrack
@@ -171,7 +173,7 @@ def _code_all(groups: Iterable[ParametricGroup], coder: GroupCoder, writer: Stre
     mark = clock()
     for group in groups:
         report.seconds["input"] += clock() - mark
-        mark = clock()
+        mark, before = clock(), state
         if coder.settings.bitrate:
             start = QUALITY_DEFAULT if quality is None else quality
             coded, state, quality = code_at_rate(coder, state, group, (writer.frames, writer.bytes, start))
@@ -185,6 +187,7 @@ def _code_all(groups: Iterable[ParametricGroup], coder: GroupCoder, writer: Stre
             coded, state = coder.code(state, group, importance, report.quality, writer.frames)
         report.loss = coder.settings.loss
         report.seconds["code"] += clock() - mark
+        _check(coded, before, writer)
         kept = {} if quality is None else {"quality": np.array(quality)}
         kept |= state.to_arrays() if state else {}
         writer.append(coded.payload, len(group), sync=coded.independent, state=kept)
@@ -192,6 +195,19 @@ def _code_all(groups: Iterable[ParametricGroup], coder: GroupCoder, writer: Stre
         if on_group:
             on_group(report)
         mark = clock()
+
+
+def _check(coded: CodedGroup, before: CoderState | None, writer: StreamWriter) -> None:
+    """Decodes a group as a decoder of the level of the stream does.
+
+    Raises:
+        LimitError: the group exceeds a cap of the level.
+    """
+    reference = None if coded.independent else before.decoded
+    try:
+        _native.DecodedGroup(coded.payload, writer.config["level"], reference=reference)
+    except LimitError as e:
+        raise LimitError(f"group {writer.groups}: {e}; use shorter groups (--gop) or a lower --quality") from None
 
 
 def _account(report: EncodeReport, writer: StreamWriter, coded: CodedGroup, group: ParametricGroup) -> None:

@@ -66,6 +66,7 @@ def evaluate_capture(
     split: str = "test",
     *,
     size: int | None = None,
+    stream_frames: int | None = None,
     with_vmaf: bool = True,
     progress: Progress | None = None,
 ) -> dict:
@@ -75,6 +76,7 @@ def evaluate_capture(
         frame_source: frame -> Gaussians as shown, for every frame of the capture.
         split: cameras to compare with, "test" or "train".
         size: bytes of the stream, for the rates.
+        stream_frames: number of frames in the stream; None: as in the capture.
         with_vmaf: also VMAF, which takes about as long as all other measures.
         progress: called with (images done, images).
 
@@ -103,7 +105,7 @@ def evaluate_capture(
                 if progress:
                     progress(t * len(views) + n + 1, capture.frame_count * len(views))
             rows.append({"frame": t} | {k: _mean(i[k] for i in images) for k in images[0]})
-        report = _report(capture.frame_count, counts, size, rows)
+        report = _report(stream_frames or capture.frame_count, counts, size, rows)
         report["vmaf"] = _mean(m.score() for m in vmaf if m)
         report["vmaf_crop"] = [m.crop() for m in vmaf if m]
     report["flicker"] = _mean(m.flicker for m in temporal)
