@@ -121,6 +121,21 @@ def nothing_finite(root):
     write_table(root / "sparse_pc.ply", {"vertex": rows})
 
 
+def cut_points(root):
+    path = root / "init_pt_cld.npz"
+    path.write_bytes(path.read_bytes()[:100])
+
+
+def calibrated_by(text):
+    """intri.yml where the matrix of cam10 is `text`."""
+
+    def harm(root):
+        before, matrix = (root / "intri.yml").read_text().split("K_cam10: ")
+        (root / "intri.yml").write_text(f"{before}K_cam10: {text}\n{matrix[matrix.index('dist_cam10') :]}")
+
+    return harm
+
+
 def overwrite(name, text):
     return lambda root: (root / name).write_text(text)
 
@@ -148,6 +163,7 @@ def overwrite(name, text):
         ),
         (dynamic3dgs, camera_short_of_a_frame, r"train_meta.json: camera cam00 has 1 of 2 frames, expected w, h"),
         (dynamic3dgs, overwrite("init_pt_cld.npz", "x"), r"init_pt_cld.npz: not a point cloud of Dynamic 3D Gaussians"),
+        (dynamic3dgs, cut_points, r"init_pt_cld.npz: not a point cloud of Dynamic 3D Gaussians"),
         (
             zju_mocap,
             overwrite("annots.npy", "x"),
@@ -183,6 +199,8 @@ def test_a_broken_calibration_is_named(tmp_path, write, harm, message):
             without_a_translation,
             r"frame 000001: .*extri.yml: T_000001 is missing or wrong, expected 3",
         ),
+        (easyvolcap, calibrated_by("3.0"), "intri.yml: K_cam10 is missing or wrong, expected 3 x 3 finite numbers"),
+        (easyvolcap, calibrated_by("{ a: 1 }"), "intri.yml: K_cam10 is missing or wrong, expected 3 x 3"),
         (zju_mocap, annotations("D", [[], [], [1, 2]]), r"D has 2 values, expected 4, 5 or 8 finite ones"),
         (zju_mocap, annotations("R", [VIEWS[0][:3, :3], VIEWS[1][:3, :3], "x"]), r"K, D, R or T is not of numbers"),
     ],
@@ -202,6 +220,8 @@ def test_a_broken_frame_of_a_camera_is_named(tmp_path, write, harm, message):
         (one_model, "masks/cam2/1.png.png", "cam2 is left out: .*: 1 masks for 2 frames"),
         (actorshq, "masks/cam2/cam2_mask000001.png", "cam2 is left out: .*: 1 masks for 2 frames"),
         (easyvolcap, "images/cam2", "cam2 is left out: no video, looked for cam2"),
+        (easyvolcap, "images/cam2/000000.png", "cam2 is left out: picture 0 is missing, though .*images/cam0 has it"),
+        (actorshq, "rgbs/cam2/cam2_rgb000000.png", "cam2 is left out: picture 0 is missing, though .*rgbs/cam0 has it"),
         (moving_easyvolcap, "images/cam2/000001.png", r"cam2 is left out: .*: 1 frames, but poses of 2; expected one"),
     ],
 )
@@ -211,6 +231,31 @@ def test_a_broken_camera_is_left_out(tmp_path, write, gone, message):
     path.rename(tmp_path / "gone")
     with pytest.warns(UserWarning, match=message):
         assert [c.name for c in open_capture(tmp_path).cameras] == ["cam0", "cam10"]
+
+
+@pytest.mark.parametrize("first", [1, 7])
+def test_masks_of_other_frames_are_no_masks_of_these(tmp_path, first):
+    """Masks of the frames 0 to 3; images from `first` on."""
+    easyvolcap(tmp_path)
+    for name in NAMES:
+        for t in (1, 0):
+            (tmp_path / f"images/{name}/{t:06}.png").rename(tmp_path / f"images/{name}/{first + t:06}.png")
+        for t in range(4):
+            write_image(tmp_path / f"masks/{name}/{t}.png", np.full((H, W, 1), 50 + t, np.uint8))
+    if first == 1:
+        assert [int(open_capture(tmp_path).view(2, t).alpha[0, 0]) for t in range(2)] == [51, 52]
+        return
+    message = "no camera can be used; .*masks/cam10: 4 masks for 2 frames, expected the numbers of frames"
+    with pytest.raises(CaptureError, match=message), pytest.warns():
+        open_capture(tmp_path)
+
+
+def test_notes_of_macos_are_no_pictures(tmp_path):
+    easyvolcap(tmp_path)
+    for name in NAMES:
+        (tmp_path / f"images/{name}/._000000.png").write_bytes(b"\0\5\x16\7")
+    capture = open_capture(tmp_path)
+    assert (capture.frame_count, int(capture.view(2, 1).rgb[0, 0, 0])) == (2, 21)
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,8 @@ def test_an_alpha_channel_without_masks_says_nothing(rig, masked):
     capture = save()
     assert capture.has_alpha == bool(masked)
     assert (capture.view(1, 1).alpha is not None) == bool(masked)
+    write_image(folder / "images/cam0/000.png", pixels(0, 0, channels=3))
+    assert save().has_alpha == bool(masked), "no alpha channel is an opaque one"
 
 
 def test_pose_becomes_opencv_world_to_camera(rig):
@@ -97,7 +99,8 @@ def test_near_plane_is_the_files_or_a_share_of_the_distance(rig):
     assert [c.near for c in save().cameras] == pytest.approx([0.2 * 10**0.5] * 3), "all look at the origin"
     data["near"] = 0.5
     data["frames"][0]["near"] = 0.25
-    assert sorted({c.near for c in save().cameras}) == [0.25, 0.5]
+    data["frames"][2]["near"] = 0.01
+    assert sorted({c.near for c in save().cameras}) == pytest.approx([0.01, 0.25, 0.5])
     assert {c.low_pass for c in save().cameras} == {PIXEL_LOW_PASS}
 
 
@@ -163,11 +166,12 @@ def test_static_capture_of_two_files_is_one_frame(rig):
         for key in ("camera", "frame", "split"):
             f.pop(key, None)
     everything = [f for f in data["frames"] if f["file_path"].endswith("000.png")]
-    data["frames"] = everything[2:]
-    (path / "transforms_test.json").write_text(json.dumps(data))
+    (path / "transforms_test.json").write_text(json.dumps({"fl_x": 30.0, "frames": everything[2:]}))
     data["frames"] = everything[:2]
     capture = save("transforms_train.json")
     assert (capture.frame_count, len(capture.cameras), capture.indices("test")) == (1, 3, [2])
+    assert capture.fps == 25, "only the first file states it"
+    assert open_capture(path / "transforms_train.json").indices("test") == [2]
 
 
 def test_nerfstudio_split_lists(rig):
@@ -178,6 +182,29 @@ def test_nerfstudio_split_lists(rig):
     assert save().indices("test") == [0]
 
 
+def test_null_says_that_there_is_none(rig):
+    _, data, save = rig
+    data["test_filenames"] = data["frames"][0]["mask_path"] = None
+    assert len(save().cameras) == 3
+
+
+def test_a_frame_of_another_size_is_named(rig):
+    path, data, save = rig
+    write_image(path / "images/cam1/001.png", np.zeros((32, 48, 4), np.uint8))
+    data["frames"][3] |= {"w": 48, "h": 32}
+    message = "cam1 is left out: frame 1: image .*001.png is 48x32, expected 24x16 as the first image of its camera"
+    with pytest.warns(UserWarning, match=message):
+        save()
+
+
+def test_images_that_have_no_frame_of_their_own_are_named(rig):
+    _, data, save = rig
+    for f in data["frames"]:
+        del f["frame"]
+    with pytest.warns(UserWarning, match="camera cam1: 1 of 2 images are left out: they have the frame or time of"):
+        assert save().frame_count == 1
+
+
 def test_focal_length_from_angle_and_per_frame(rig):
     _, data, save = rig
     del data["fl_x"]
@@ -186,14 +213,17 @@ def test_focal_length_from_angle_and_per_frame(rig):
     assert save().cameras[0].K[0, 0] == pytest.approx(W)
 
 
-def test_masks_folder(rig):
+@pytest.mark.parametrize("folder", ["images/", "images_2/", ""])
+def test_masks_folder(rig, folder):
     path, data, save = rig
-    for f in data["frames"]:
+    for i, f in enumerate(data["frames"]):
+        f["file_path"] = f["file_path"].replace("images/", folder)
         write_image(path / f["file_path"], pixels(0, 0, channels=3))
-        write_image(path / f["file_path"].replace("images", "masks"), np.full((H, W, 1), 77, np.uint8))
+        write_image(path / "masks" / f["file_path"].removeprefix(folder), np.full((H, W, 1), 77 + i, np.uint8))
     capture = save()
     assert capture.has_alpha
-    assert (capture.view(0, 0).alpha == 77).all()
+    assert [int(capture.view(k, 0).alpha[0, 0]) for k in range(3)] == [77, 79, 81]
+    assert len({m for feed in capture.footage for m in feed.mask_files}) == 6
     write_image(path / "masks/cam0/000.png", np.zeros((3, 5, 1), np.uint8))
     with pytest.raises(CaptureError, match=r"masks/cam0/000.png: mask is 5x3, its image 24x16"):
         capture.view(0, 0)
@@ -212,6 +242,7 @@ def break_pose(values):
         (break_pose([[1, 2], [3]]), "transform_matrix is not 4x4 finite numbers"),
         (lambda f: f.__setitem__("frame", 7), "frame 0 is missing"),
         (lambda f: f.__setitem__("file_path", "images/none.png"), r"frame 0: image .*none.png is missing"),
+        (lambda f: f.__setitem__("mask_path", "none.png"), r"frame 0: mask .*none.png is missing"),
         (lambda f: f.__setitem__("w", 99), r"frame 0: image .*000.png is 24x16, expected 99x16"),
         (lambda f: f.__setitem__("fl_x", -1), "frame 0: focal length -1 x -1 is not positive"),
         (lambda f: f.__setitem__("cx", "left"), "frame 0: not a number"),
@@ -270,6 +301,14 @@ def test_a_moving_camera_without_a_name(rig):
     assert [c.name for c in capture.cameras] == ["images_cam0", "images_cam1", "images_cam2"]
     assert (capture.frame_count, capture.moves) == (2, True)
     np.testing.assert_allclose(capture.camera(1, 1).viewmat, np.linalg.inv(pose(3) @ GL), atol=1e-9)
+
+
+def test_test_images_of_the_training_camera_are_named(rig):
+    _, data, save = rig
+    for i, f in enumerate(data["frames"]):
+        f |= {"camera": "one", "frame": i, "split": "test" if i == 3 else "train"}
+    with pytest.warns(UserWarning, match=r"camera one: 1 of 6 images are left out, the first one is 001.png: a"):
+        assert save().frame_count == 5
 
 
 @pytest.mark.parametrize(
@@ -349,6 +388,10 @@ def test_damaged_and_missing_images(rig):
         ("{", "not valid JSON"),
         ('{"frames": []}', "no 'frames'"),
         ('{"frames": [{}]}', r"frames\[0\] has no file_path"),
+        ('{"frames": [{"file_path": null}]}', r"frames\[0\] has no file_path"),
+        ('{"frames": [{"file_path": 3}]}', r"file_path of frames\[0\] is 3, expected the name of an image"),
+        ('{"frames": [{"file_path": "a", "mask_path": 3}]}', r"mask_path of frames\[0\] is 3, expected the name"),
+        ('{"test_filenames": 3, "frames": [{"file_path": "a"}]}', r"test_filenames is 3, expected a list of the names"),
         ('{"frames": [{"file_path": "a", "frame": "x"}]}', r"frame or time of frames\[0\] is not a number"),
         ('{"fps": "fast", "frames": [{"file_path": "a"}]}', r"fps, frame or time is not a number"),
         (

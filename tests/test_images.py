@@ -5,7 +5,7 @@ import pytest
 from test_capture import write_image
 
 from gscodec.capture import View, composite
-from gscodec.capture.images import read_image, resize_area
+from gscodec.capture.images import read_image, read_mask, resize_area
 from gscodec.errors import CaptureError
 
 
@@ -36,6 +36,24 @@ def test_a_truncated_image_is_named_in_one_line(tmp_path):
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(CaptureError, match=r"^.*a.png: damaged image \(.+\), expected a whole file; copy it again$"):
         read_image(path)
+
+
+@pytest.mark.parametrize(
+    ("values", "dtype", "expected"),
+    [
+        ([(9, 255), (200, 255)], "uint8", [9, 200]),  # opaque alpha says nothing
+        ([(9, 255), (200, 7)], "uint8", [255, 7]),
+        ([(0,), (1,)], "uint8", [0, 255]),
+        ([(0,), (1,)], "uint16", [0, 255]),
+        ([(0.25,), (1.0,)], "float", [64, 255]),
+        ([(0,), (0,)], "uint8", [0, 0]),
+    ],
+)
+def test_masks_say_coverage(tmp_path, values, dtype, expected):
+    colour = [(v[0],) * 3 + v[1:] for v in values]
+    path = tmp_path / ("a.tif" if dtype == "float" else "a.png")
+    write_image(path, np.array([colour], {"float": "f4"}.get(dtype, dtype)), dtype)
+    assert read_mask(path).tolist() == [expected]
 
 
 def test_grey_image(tmp_path):

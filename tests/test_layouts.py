@@ -55,6 +55,33 @@ def test_known_points_are_where_the_pictures_show_them(tmp_path, layout, monkeyp
         assert np.abs(p[:, :2] / p[:, 2:] - centroids(capture.view(i, 0).rgb)).max() < 0.5
 
 
+@pytest.mark.parametrize(
+    ("layouts", "layout", "named"),
+    [
+        (LAYOUTS, "easyvolcap", "intri.yml"),
+        (MOVING, "easyvolcap", "cameras/cam10/extri.yml"),
+        (LAYOUTS, "colmap, one folder", "colmap/sparse/0/cameras.txt"),
+    ],
+)
+def test_one_of_several_calibration_files_stands_for_the_folder(tmp_path, layouts, layout, named):
+    name, write = layouts[layout]
+    write(tmp_path)
+    assert find_capture(tmp_path / named) == name
+    capture = open_capture(tmp_path / named)
+    assert (capture.name, len(capture.cameras), capture.frame_count) == (tmp_path.name, len(NAMES), FRAMES)
+
+
+@pytest.mark.parametrize("terms", [4, 5, 8])
+def test_a_lens_of_easyvolcap_has_the_terms_of_opencv(tmp_path, terms):
+    rig_layouts.easyvolcap(tmp_path)
+    row = f"rows: {terms}\n   cols: 1\n   dt: d\n   data: [ {', '.join(['0.'] * terms)} ]"
+    five = "rows: 5\n   cols: 1\n   dt: d\n   data: [ 0., 0., 0., 0., 0. ]"
+    text = (tmp_path / "intri.yml").read_text()
+    assert five in text
+    (tmp_path / "intri.yml").write_text(text.replace(five, row))
+    assert len(open_capture(tmp_path).cameras) == len(NAMES)
+
+
 def centroids(rgb):
     """[3, 2] centroid of the blob in each channel, pixels."""
     y, x = np.mgrid[: rgb.shape[0], : rgb.shape[1]] + 0.5

@@ -124,6 +124,13 @@ def test_what_is_no_lens_is_refused(tmp_path):
         open_capture(tmp_path)
 
 
+def test_a_camera_that_has_no_lens_is_named(tmp_path):
+    wrong = (5, (60.0, 61.0, 81.0, 59.0, -50.0, 0.0, 0.0, 0.0), 4)
+    nerfstudio(tmp_path, (FISHEYE, wrong, FISHEYE), camera_model="OPENCV_FISHEYE")
+    with pytest.warns(UserWarning, match=r"camera images_1 is left out: fisheye distortion .* is not that of a lens"):
+        assert [c.name for c in open_capture(tmp_path).cameras] == ["images_0", "images_2"]
+
+
 def d_nerf(root, file, times):
     frames = []
     for i, time in enumerate(times):

@@ -5,7 +5,9 @@ import json
 import cv2
 import numpy as np
 import pytest
-from rig_layouts import LAYOUTS, zju_mocap
+from rig_layouts import LAYOUTS, NAMES, easyvolcap, qualisys, zju_mocap
+from rig_layouts import H as SMALL_H
+from rig_layouts import W as SMALL_W
 from test_capture import GL, write_image
 from test_cli import fails, run
 
@@ -109,15 +111,44 @@ def test_masks_go_where_the_reader_of_the_layout_looks(tmp_path, layout):
         assert (again.view(i, 1).alpha[:4] == 255).all(), layout
 
 
+def test_every_picture_has_a_mask_also_those_after_the_shortest_camera(tmp_path):
+    easyvolcap(tmp_path)
+    for k, name in enumerate(NAMES):
+        for t in range(5 if k else 4):
+            write_image(tmp_path / f"images/{name}/{t:06}.png", picture(k, t))
+    with pytest.warns(UserWarning, match="the capture ends at frame 4"):
+        capture = open_capture(tmp_path)
+    assert make_masks(capture.frames(1)) == 4 + 5 + 5
+    with pytest.warns(UserWarning, match="the capture ends at frame 4"):
+        assert len(open_capture(tmp_path).cameras) == 3
+
+
+def test_a_picture_that_cannot_be_read_leaves_no_masks(tmp_path):
+    write_scene(tmp_path, frames=3)
+    (tmp_path / "images/cam0/002.png").write_bytes(b"broken")
+    with pytest.raises(CaptureError, match=r"002.png: not a readable image"):
+        make_masks(open_capture(tmp_path), plates(tmp_path))
+    assert not [p for p in (tmp_path / "masks").rglob("*") if p.is_file()]
+
+
 def test_the_command_takes_plates_and_keeps_what_was_edited(tmp_path):
     write_scene(tmp_path, frames=3)
     plates(tmp_path)
     done = run("masks", tmp_path)
     assert done.returncode == 0, done.stderr
     assert "6 masks from plates, the first one is" in done.stdout
+    fails(run("masks", tmp_path, "--plate", tmp_path, "--moving"), "--moving and --plate", "exclude each other")
     fails(run("masks", tmp_path), "000.png: there are masks already; delete them, or say --overwrite to replace them")
     done = run("masks", tmp_path, "--moving", "--overwrite")
     assert "6 masks from moving objects" in done.stdout
+
+
+def test_plates_of_a_named_calibration_file_are_in_the_folder(tmp_path):
+    qualisys(tmp_path)
+    for name in NAMES:
+        write_image(tmp_path / "plate" / f"{name}.png", np.zeros((2 * SMALL_H, 2 * SMALL_W, 3), np.uint8))
+    done = run("masks", tmp_path / "calibration" / "rig.qca.txt")
+    assert "masks from plates" in done.stdout, done.stderr
 
 
 def test_what_cannot_be_masked_is_said(tmp_path):

@@ -1,5 +1,6 @@
 """Qualisys calibrations, and the videos of a capture: any order of frames, threads, short and damaged files."""
 
+import subprocess
 import threading
 
 import cv2
@@ -55,9 +56,36 @@ def test_video_frames_in_any_order(qualisys):
     order = [0, 1, 2, 1, 59, 3, 30, 30, 4, 58]
     for t in order:
         assert abs(int(video.frame(t)[24, 32, 0]) - 4 * t) <= 6, t
-    with pytest.raises(CaptureError, match=r"a.mp4: frame 99 cannot be decoded, the header promises 60"):
+    with pytest.raises(CaptureError, match=r"a.mp4: frame 99 cannot be decoded, the video has 60 frames"):
         video.frame(99)
     assert abs(int(video.frame(5)[24, 32, 0]) - 20) <= 6
+
+
+SLOWER = "setpts='if(lt(N,20),N,20+3*(N-20))/50/TB'"
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "frames"),
+    [
+        ((), ("-vf", SLOWER, "-fps_mode", "vfr", "-g", "10", "a.mp4"), 60),  # of two rates
+        ((), ("-c", "copy", "-f", "matroska", "-"), 60),  # without a duration
+        (("-ss", "0.3"), ("-c", "copy", "a.mp4"), 45),  # with frames before its start
+    ],
+)
+def test_videos_whose_headers_mislead(qualisys, tmp_path, before, after, frames):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    coded = ("-i", "videos/a.mp4", "-c:v", "libx264", "-g", "40", "whole.mp4")
+    for command in (coded, (*before, "-i", "whole.mp4", *after)):
+        done = subprocess.run([ffmpeg, "-v", "error", *command], cwd=tmp_path, capture_output=True, check=True)
+    path = tmp_path / "a.mp4"
+    if done.stdout:
+        path.write_bytes(done.stdout)
+    video, other = Video(path), Video(path)
+    assert video.frame_count == frames
+    in_order = [other.frame(t) for t in range(frames)]
+    for t in (0, frames - 1, 3, 40, 20, 41, 2):
+        np.testing.assert_array_equal(video.frame(t), in_order[t])
+    assert abs(int(in_order[-1][24, 32, 0]) - 4 * 59) <= 6
 
 
 def test_views_from_threads(qualisys):

@@ -15,17 +15,31 @@ from .qualisys import open_qualisys
 from .transforms import open_transforms
 from .zju_mocap import FILE, open_zju_mocap
 
+OTHERS = (TRAIN, "meta.json")  # JSON files of another layout, and of SOG
+PARTS = ("intri.yml", "extri.yml", "cameras.bin", "cameras.txt", "images.bin", "images.txt")  # one file of several
+
 
 def _transforms(path: Path) -> list[tuple[Path, str]]:
-    if path.is_file():
-        return [(path, "train")] if path.suffix == ".json" and path.name != TRAIN else []
+    if path.is_file() and path.name != "transforms_train.json":
+        return [(path, "train")] if path.suffix == ".json" and path.name not in OTHERS else []
+    folder = path.parent if path.is_file() else path
     if (path / "transforms.json").is_file():
         return [(path / "transforms.json", "train")]
-    train = path / "transforms_train.json"
+    train = folder / "transforms_train.json"
     if not train.is_file():
         return []
-    test = next((p for s in ("test", "val") if (p := path / f"transforms_{s}.json").is_file()), None)
+    test = next((p for s in ("test", "val") if (p := folder / f"transforms_{s}.json").is_file()), None)
     return [(train, "train"), *([(test, "test")] if test else [])]
+
+
+def capture_folder(path: Path) -> Path:
+    """The folder of the capture at `path`, which is this folder or a calibration file in it."""
+    if not path.is_file():
+        return path
+    if path.name in PARTS:  # up to four folders down: cameras/CAMERA/, colmap/sparse/0/
+        places = path.absolute().parents[:4]
+        return next((p for p in places if (p / "images").is_dir() or (p / "videos").is_dir()), path.parent)
+    return path.parent.parent if path.match("calibration/*.qca.txt") else path.parent
 
 
 def _qualisys(path: Path) -> Path | None:
@@ -33,11 +47,6 @@ def _qualisys(path: Path) -> Path | None:
         return path if path.name.endswith(".qca.txt") else None
     found = [f for pattern in ("calibration/*.qca.txt", "*.qca.txt") for f in sorted(path.glob(pattern))]
     return found[0] if found else None
-
-
-def _open_qualisys(path: Path, calibration: Path) -> Capture:
-    root = path if path.is_dir() else calibration.parent
-    return open_qualisys(root.parent if root.name == "calibration" else root, calibration)
 
 
 def _file(path: Path, name: str) -> Path | None:
@@ -79,7 +88,11 @@ LAYOUTS = {
         lambda path: _file(path, "calibration.csv"),
         lambda _, calibration: open_actorshq(calibration),
     ),
-    "qualisys": ("calibration/*.qca.txt with videos/ (Qualisys)", _qualisys, _open_qualisys),
+    "qualisys": (
+        "calibration/*.qca.txt with videos/ (Qualisys)",
+        _qualisys,
+        lambda _, calibration: open_qualisys(capture_folder(calibration), calibration),
+    ),
     "colmap": (
         "images/ with sparse/ (COLMAP), in the folder or in one for each frame",
         find_model,
@@ -91,14 +104,20 @@ LOOKED_FOR = tuple(what for what, _, _ in LAYOUTS.values())
 
 def find_capture(path: Path) -> str | None:
     """The layout of `path`, a key of `LAYOUTS`; None: not a capture."""
-    return next((name for name, (_, find, _) in LAYOUTS.items() if find(Path(path))), None)
+    path = _start(Path(path))
+    return next((name for name, (_, find, _) in LAYOUTS.items() if find(path)), None)
+
+
+def _start(path: Path) -> Path:
+    """Where to look for a calibration: in the folder, if `path` is one of several files of it."""
+    return capture_folder(path) if path.name in PARTS else path
 
 
 def open_capture(path: str | Path) -> Capture:
     """Opens a capture in any known layout.
 
     Args:
-        path: its folder, or the calibration file itself (transforms.json, *.qca.txt).
+        path: its folder, or the calibration file itself (transforms.json, intri.yml, *.qca.txt, cameras.bin).
 
     Raises:
         CaptureError: nothing is there, the layout is unknown or the calibration or the images are unusable.
@@ -107,9 +126,10 @@ def open_capture(path: str | Path) -> Capture:
     path = Path(path)
     if not path.exists():
         raise CaptureError(f"{path}: no such file or folder, expected a capture")
+    start = _start(path)
     for _, find, read in LAYOUTS.values():
-        if calibration := find(path):
-            return read(path, calibration)
+        if calibration := find(start):
+            return read(start, calibration)
     empty = path.is_dir() and not any(path.iterdir())
     what = "the folder is empty" if empty else "not a capture"
     raise CaptureError(f"{path}: {what}; looked for {', for '.join(LOOKED_FOR)}")

@@ -10,6 +10,7 @@ Rot_name [3, 3] or R_name (a rotation vector), T_name; W_name and H_name if the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,11 +46,22 @@ class _Yaml:
 
     def matrix(self, key: str, *shape: int) -> np.ndarray:
         """[*shape] f64. Raises CaptureError: it is missing, has another shape, or is not finite."""
-        m = self._file.getNode(key).mat()
-        if m is None or m.size != np.prod(shape) or not np.isfinite(m).all():
-            size = " x ".join(map(str, shape))
-            raise CaptureError(f"{self.path}: {key} is missing or wrong, expected {size} finite numbers")
-        return m.reshape(shape).astype(np.float64)
+        return self._numbers(key, (np.prod(shape),), " x ".join(map(str, shape))).reshape(shape)
+
+    def distortion(self, key: str) -> np.ndarray:
+        """[4, 5 or 8] f64. Raises CaptureError: as `matrix`."""
+        return self._numbers(key, (4, 5, 8), "4, 5 or 8")
+
+    def _numbers(self, key: str, sizes: Sequence[int], expected: str) -> np.ndarray:
+        """A matrix as one row, whose length is one of `sizes`; `expected`: these in words."""
+        cv2 = require("cv2", "reading calibrations")
+        try:
+            m = self._file.getNode(key).mat()
+        except cv2.error:  # not a matrix
+            m = None
+        if m is None or m.size not in sizes or not np.isfinite(m).all():
+            raise CaptureError(f"{self.path}: {key} is missing or wrong, expected {expected} finite numbers")
+        return m.ravel().astype(np.float64)
 
     def has(self, key: str) -> bool:
         return not self._file.getNode(key).empty()
@@ -125,7 +137,7 @@ def _camera(name: str, intrinsics: _Yaml, extrinsics: _Yaml, feed: Feed) -> Came
         R = require("cv2", "reading rotation vectors").Rodrigues(extrinsics.matrix(f"R_{name}", 3))[0]
     viewmat = rigid(R, extrinsics.matrix(f"T_{name}", 3))
     keys = [k for k in (f"D_{name}", f"dist_{name}") if intrinsics.has(k)]
-    distortion = intrinsics.matrix(keys[0], 5) if keys else np.zeros(0)
+    distortion = intrinsics.distortion(keys[0]) if keys else np.zeros(0)
     width = intrinsics.number(f"W_{name}") or feed.width
     height = intrinsics.number(f"H_{name}") or feed.height
     return Camera(name, K, viewmat, width, height, distortion)

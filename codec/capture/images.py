@@ -72,24 +72,35 @@ def read_image(path: Path) -> View:
         CaptureError: the file is missing, not an image or damaged.
         UsageError: OpenImageIO is not installed.
     """
+    rgb, alpha, spec = _pixels(path)
+    if alpha is not None and not spec.getattribute("oiio:UnassociatedAlpha"):
+        top = 255 if rgb.dtype == np.uint8 else 1
+        rgb = _divide(rgb.astype(np.float32), alpha.astype(np.float32) / top, top).astype(rgb.dtype)
+    if not _step(spec):
+        rgb = _srgb(rgb)
+    return View(_u8(rgb), None if alpha is None else _u8(alpha))
+
+
+def _pixels(path: Path):
+    """[H, W, 3] colour and [H, W] alpha (or None) as stored, u8 or f32 (0 to 1), and OpenImageIO's description."""
     image = _open(path)
     spec = image.spec()
-    integer = np.dtype(str(spec.format)).kind == "u" if str(spec.format) != "half" else False
-    pixels = image.read_image("uint8" if integer and str(spec.format) == "uint8" else "float")
+    pixels = image.read_image("uint8" if str(spec.format) == "uint8" else "float")
     message = image.geterror()
     image.close()
     if pixels is None or message:
         raise CaptureError(f"{path}: damaged image ({first_line(message)}), expected a whole file; copy it again")
     colour, a = _channels(spec.channelnames)
     pixels = pixels.reshape(spec.height, spec.width, -1)
-    alpha = None if a is None else pixels[..., a]
-    rgb = pixels[..., colour]
-    if alpha is not None and not spec.getattribute("oiio:UnassociatedAlpha"):
-        top = 255 if rgb.dtype == np.uint8 else 1
-        rgb = _divide(rgb.astype(np.float32), alpha.astype(np.float32) / top, top).astype(rgb.dtype)
-    if not integer:
-        rgb = _srgb(rgb)
-    return View(_u8(rgb), None if alpha is None else _u8(alpha))
+    return pixels[..., colour], None if a is None else pixels[..., a], spec
+
+
+def _step(spec) -> float:
+    """The value 1 of an integer image among the values that `_pixels` returns; 0: a float image."""
+    dtype = np.dtype(str(spec.format))
+    if dtype.kind != "u":
+        return 0.0
+    return 1.0 if dtype == np.uint8 else 1 / np.iinfo(dtype).max
 
 
 def first_line(message: str) -> str:
@@ -98,12 +109,15 @@ def first_line(message: str) -> str:
 
 
 def read_mask(path: Path, *, labels: bool = False) -> np.ndarray:
-    """[H, W] u8 coverage: the alpha channel of the file if it has one, else its first colour channel. With `labels`,
-    255 where any channel is not 0."""
-    view = read_image(path)
+    """[H, W] u8 coverage: the alpha channel of the file unless it is opaque everywhere, else its first colour channel.
+    Float values are coverage too; integers of 0 and 1 mean 0 and 255. With `labels`, 255 where any channel is not 0."""
+    rgb, alpha, spec = _pixels(path)
     if labels:
-        return np.where((view.rgb > 0).any(-1), 255, 0).astype(np.uint8)
-    return np.ascontiguousarray(view.rgb[..., 0]) if view.alpha is None else view.alpha
+        return np.where((rgb > 0).any(-1), 255, 0).astype(np.uint8)
+    values = rgb[..., 0] if alpha is None or (_u8(alpha) == 255).all() else alpha
+    if 0 < values.max() <= _step(spec) * (1 + 1e-6):
+        return np.where(values > 0, 255, 0).astype(np.uint8)
+    return _u8(values)
 
 
 def _srgb(linear: np.ndarray) -> np.ndarray:

@@ -30,7 +30,8 @@ def make_masks(
     overwrite: bool = False,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> int:
-    """Writes a mask for every camera and frame, in the place where the capture's reader looks for it; all or none.
+    """Writes a mask for every picture of every camera, also of frames that `capture` leaves out, in the place where its
+    reader looks for it; all or none.
 
     Args:
         plates: folder with CAMERA.png (or another image) of each camera; None: moving pixels are the subject.
@@ -46,32 +47,29 @@ def make_masks(
     """
     _check(capture, plates, overwrite)
     find = [plate_finder(capture, i, plates) if plates else None for i in range(len(capture.cameras))]
-    parts: list[tuple[Path, Path]] = []
+    parts: list[tuple[Path, Path]] = []  # NAME.part and NAME
 
-    def one(index: int) -> list[tuple[Path, Path]]:
-        feed, written = capture.footage[index], []
-        likely = find[index] or moving_finder(feed, capture.frame_count, capture.fps)
-        try:
-            found = 0
-            for t in range(capture.frame_count):
-                alpha = mask_of(feed.picture(t).rgb, likely(t))
-                found += bool(alpha.any())
-                written.append(_write_part(feed.mask_files[t], alpha))
-        except BaseException:
-            _remove(written)
-            raise
-        if found < capture.frame_count:
-            name, none = capture.cameras[index].name, capture.frame_count - found
-            warnings.warn(f"camera {name}: nothing is found in {none} of {capture.frame_count} frames", stacklevel=2)
-        return written
+    def one(index: int) -> None:
+        feed, found = capture.footage[index], 0
+        likely = find[index] or moving_finder(feed, len(feed), capture.fps)
+        for t in range(len(feed)):
+            alpha = mask_of(feed.picture(t).rgb, likely(t))
+            found += bool(alpha.any())
+            path = feed.mask_files[t]
+            part = path.with_name(path.name + ".part")
+            parts.append((part, path))
+            _write(part, alpha)
+        if found < len(feed):
+            name, none = capture.cameras[index].name, len(feed) - found
+            warnings.warn(f"camera {name}: nothing is found in {none} of {len(feed)} frames", stacklevel=2)
 
     try:
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            for done, written in enumerate(pool.map(one, range(len(capture.cameras))), 1):
-                parts += written
+            for done, _ in enumerate(pool.map(one, range(len(capture.cameras))), 1):
                 on_progress(done, len(capture.cameras))
-    except BaseException:
-        _remove(parts)
+    except BaseException:  # all cameras have stopped
+        for part, _ in parts:
+            part.unlink(missing_ok=True)
         raise
     for part, path in parts:
         os.replace(part, path)
@@ -115,15 +113,7 @@ def mask_of(rgb: np.ndarray, found: Likely) -> np.ndarray:
     return cv2.ximgproc.guidedFilter(rgb, large, max(1, round(scale)), (0.02 * 255) ** 2)
 
 
-def _write_part(path: Path, alpha: np.ndarray) -> tuple[Path, Path]:
-    """Writes NAME.part; returns its path and its final path."""
+def _write(path: Path, alpha: np.ndarray) -> None:
     cv2 = require("cv2", "making masks")
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(cv2.imencode(".png", alpha)[1].tobytes())
-    return part, path
-
-
-def _remove(parts: list[tuple[Path, Path]]) -> None:
-    for part, _ in parts:
-        part.unlink(missing_ok=True)
+    path.write_bytes(cv2.imencode(".png", alpha)[1].tobytes())

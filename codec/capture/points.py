@@ -5,6 +5,8 @@ The points of COLMAP models are read in colmap_points.py. Positions are in the w
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,7 +78,7 @@ def read_npz_points(path: Path) -> Points:
     try:
         with np.load(path, allow_pickle=False) as z:
             data = z["data"]
-    except (ValueError, OSError, EOFError, KeyError) as e:
+    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError) as e:
         raise CaptureError(f"{path}: not a point cloud of Dynamic 3D Gaussians ({e}), expected an array 'data'") from e
     if data.ndim != 2 or data.shape[1] < 6 or data.dtype.kind != "f":
         raise CaptureError(f"{path}: 'data' is {list(data.shape)} {data.dtype}, expected [points, 7] numbers: xyz, rgb")

@@ -116,13 +116,18 @@ class Feed:
         return view if self.has_alpha else replace(view, alpha=None)
 
     def opaque(self) -> bool:
-        """Whether the first picture has an alpha channel of its own that is 255 everywhere."""
+        """Whether the first picture is opaque: no mask file, and no alpha channel or one that is 255 everywhere."""
         if self.masks or not self.has_alpha:
-            return False
+            return not self.masks
         try:
             return bool((self.picture(0).alpha == 255).all())
         except CaptureError:  # raised again where the picture is needed
             return False
+
+    def numbers(self) -> list[int]:
+        """The last number in the name of each image; empty: a video, or there are none."""
+        found = [] if isinstance(self._source, Video) else [re.findall(r"[0-9]+", p.stem) for p in self._source]
+        return [int(n[-1]) for n in found] if all(found) else []
 
     def name(self, t: int) -> Path:
         """The file that has frame `t`."""
@@ -130,19 +135,29 @@ class Feed:
 
 
 def feed_of(source: Video | Sequence[Path], masks: Path, depths: DepthImages | None = None) -> Feed:
-    """The footage of a camera whose masks are files in a folder of its own, in the order of their numbers.
+    """The footage of a camera whose masks are files in a folder of its own. If there are as many as frames, their order
+    counts, otherwise their numbers.
 
     Raises:
-        CaptureError: see `Feed`.
+        CaptureError: see `Feed`; or no mask has the number of a frame.
     """
     if isinstance(source, Video):
         stems = [f"{t:06}" for t in range(source.frame_count)]
     else:
         stems = [image.stem for image in source]
     there = numbered(masks)
-    return Feed(
-        source, there, there if len(there) == len(stems) else [masks / f"{stem}.png" for stem in stems], depths=depths
-    )
+    if there and len(there) != len(stems):
+        by_numbers = {_numbers(m.stem): m for m in there}
+        found = [by_numbers.get(_numbers(stem)) for stem in stems]
+        if not any(found):
+            raise CaptureError(f"{masks}: {len(there)} masks for {len(stems)} frames, expected the numbers of frames")
+        there = found
+    return Feed(source, there, there or [masks / f"{stem}.png" for stem in stems], depths=depths)
+
+
+def _numbers(stem: str) -> tuple[int, ...] | str:
+    """The numbers in the name of a picture or mask; the name itself if there are none."""
+    return tuple(map(int, re.findall(r"[0-9]+", stem))) or stem
 
 
 def assemble(
@@ -154,7 +169,7 @@ def assemble(
     points: Points | None = None,
 ) -> Capture:
     """The capture of the cameras that `usable` returned. It ends with the shortest feed; a camera whose feed is less
-    than half as long as the median is left out.
+    than half as long as the median, or lacks a picture before its end, is left out.
 
     Args:
         tracks: calibration of each camera, with or without distortion.
@@ -331,13 +346,16 @@ def _fitted(track: Track, feed: Feed) -> tuple[Track, Feed]:
                 f"{feed.path} is {feed.width}x{feed.height}, expected {camera.width}x{camera.height} "
                 f"as {calibration} says, or that shape at another scale"
             )
-    return [camera.resized(feed.width, feed.height) for camera in track], feed
+    track, lens = [camera.resized(feed.width, feed.height) for camera in track], Undistortion()
+    for camera in track:
+        lens.camera(camera)  # raises CaptureError if it is no lens
+    return track, feed
 
 
 def numbered(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> list[Path]:
     """The images of a folder (or files with other `suffixes`) in the order of the numbers in their names."""
     paths = [p for p in folder.iterdir() if p.suffix.lower() in suffixes] if folder.is_dir() else []
-    return sorted(paths, key=by_number)
+    return sorted((p for p in paths if not p.name.startswith("._")), key=by_number)  # ._NAME: macOS's notes on NAME
 
 
 def by_number(path: Path) -> list:
@@ -360,17 +378,33 @@ def find_video(folders: Sequence[Path], name: str) -> Path:
 
 
 def _same_length(tracks: Sequence[Track], feeds: Sequence[Feed]) -> tuple[list[Track], list[Feed], int]:
-    """Tracks and feeds without the cameras whose feed is far too short; the number of frames of the shortest feed."""
-    usual = sorted(map(len, feeds))[len(feeds) // 2]
-    keep = [i for i, f in enumerate(feeds) if 2 * len(f) >= usual]
+    """Tracks and feeds without the cameras whose feed is far too short or lacks a picture before its end; the number of
+    frames of the shortest feed."""
+    usual, longest = sorted(map(len, feeds))[len(feeds) // 2], max(feeds, key=len)
+    gaps = [_gap(f, longest) for f in feeds]
+    keep = [i for i, f in enumerate(feeds) if 2 * len(f) >= usual and gaps[i] is None]
     for i, f in enumerate(feeds):
-        if len(f) < usual:
+        if gaps[i] is not None:
+            warnings.warn(
+                f"{f.path.parent}: camera {tracks[i][0].name} is left out: picture {gaps[i]} is missing, though "
+                f"{longest.path.parent} has it",
+                stacklevel=5,
+            )
+        elif len(f) < usual:
             what = f"the capture ends at frame {len(f)}" if i in keep else "the camera is left out"
             warnings.warn(f"{f.path}: short, {len(f)} of {usual} frames; {what}", stacklevel=5)
     count = min(len(feeds[i]) for i in keep)
     if count < 1:
         raise CaptureError(f"{feeds[keep[0]].path}: the videos have no frames")
     return [tracks[i] for i in keep], [feeds[i] for i in keep], count
+
+
+def _gap(feed: Feed, longest: Feed) -> int | None:
+    """Number of the first picture that `feed` lacks before its end, by the names; None: it lacks none."""
+    own, every = feed.numbers(), longest.numbers()
+    if not set(own) < set(every) or own == every[: len(own)]:
+        return None
+    return next(n for n in every if n not in own)
 
 
 def _size(shape: tuple[int, ...]) -> str:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -55,17 +56,17 @@ def open_transforms(files: list[tuple[Path, str]]) -> Capture:
     Raises:
         CaptureError: no camera can be used; names file, camera and frame.
     """
-    entries, fps, points = [], FPS, None
+    entries, fps, points = [], None, None
     for path, split in files:
         data = _load(path)
         entries += _entries(data, path, split)
-        fps = _fps(data, path)
+        fps = fps or _fps(data, path)
         points = points or _points(data, path)
     source = files[0][0]
     times = _common_times(entries)
 
     def make(name: str, own: list[Entry]) -> tuple[Track, Feed]:
-        of_camera = _at_times(own, times)
+        of_camera = _at_times(name, own, times)
         files = [e.mask or _mask_file(source.parent, e.image, e.values) for e in of_camera]
         images, masks, depths = [e.image for e in of_camera], [e.mask for e in of_camera], _depths(source, of_camera)
         return _track(name, of_camera), Feed(images, masks, files, depths=depths)
@@ -73,7 +74,7 @@ def open_transforms(files: list[tuple[Path, str]]) -> Capture:
     tracks, feeds = usable(source, _by_camera(entries), make)
     if not any(track[0].split == "train" for track in tracks):
         raise CaptureError(f"{source}: all {len(tracks)} cameras are test cameras, training needs split 'train' too")
-    return assemble(source.parent.resolve().name, tracks, feeds, fps, points=points)
+    return assemble(source.parent.resolve().name, tracks, feeds, fps or FPS, points=points)
 
 
 def _load(path: Path) -> dict:
@@ -101,26 +102,30 @@ def _points(data: dict, path: Path) -> Points | None:
     return read_ply_points(path.parent / name)
 
 
-def _fps(data: dict, path: Path) -> float:
-    """Frames a second: `fps` of the file, or from entries that have both a frame number and a time in seconds."""
+def _fps(data: dict, path: Path) -> float | None:
+    """Frames a second: `fps` of the file, or from entries that have both a frame number and a time in seconds; None:
+    the file does not tell."""
     try:
         both = {int(f["frame"]): float(f["time"]) for f in data["frames"] if "frame" in f and "time" in f}
         fps = float(data.get("fps") or 0)
     except (TypeError, ValueError) as e:
         raise CaptureError(f"{path}: fps, frame or time is not a number ({e})") from e
     if fps > 0 or not both:
-        return fps if fps > 0 else FPS
+        return fps if fps > 0 else None
     a, b = min(both), max(both)
-    return (b - a) / (both[b] - both[a]) if both[b] > both[a] else FPS
+    return (b - a) / (both[b] - both[a]) if both[b] > both[a] else None
 
 
 def _entries(data: dict, path: Path, split: str) -> list[Entry]:
     shared = {k: v for k, v in data.items() if k != "frames"}
-    listed = {n: s for s in ("train", "test", "val") for n in data.get(f"{s}_filenames", [])}
+    listed = {n: s for s in ("train", "test", "val") for n in _names(data, f"{s}_filenames", path)}
     out = []
     for i, f in enumerate(data["frames"]):
-        if not isinstance(f, dict) or "file_path" not in f:
+        if not isinstance(f, dict) or not f.get("file_path"):
             raise CaptureError(f"{path}: frames[{i}] has no file_path")
+        for key in ("file_path", "mask_path"):
+            if not isinstance(f.get(key) or "", str):  # null: there is none
+                raise CaptureError(f"{path}: {key} of frames[{i}] is {f[key]!r}, expected the name of an image")
         values = {**shared, **f}
         image = _with_suffix(path.parent / f["file_path"])
         own = str(f.get("split", listed.get(f["file_path"], split)))
@@ -139,6 +144,13 @@ def _entries(data: dict, path: Path, split: str) -> list[Entry]:
             )
         )
     return _name_cameras(out)
+
+
+def _names(data: dict, key: str, path: Path) -> list[str]:
+    names = data.get(key) or []
+    if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+        raise CaptureError(f"{path}: {key} is {names!r}, expected a list of the names of images")
+    return names
 
 
 def _name_cameras(entries: list[Entry]) -> list[Entry]:
@@ -181,8 +193,8 @@ def _with_suffix(path: Path) -> Path:
 
 
 def _mask(root: Path, image: Path, f: dict) -> Path | None:
-    """mask_path of the entry, or the same name under masks/ instead of the first folder (images/)."""
-    if "mask_path" in f:
+    """mask_path of the entry, or the same name under masks/, there without a first folder images, images_2 ..."""
+    if f.get("mask_path"):
         return root / f["mask_path"]
     here = _mask_file(root, image, f)
     if not (root / "masks").is_dir():
@@ -194,7 +206,8 @@ def _mask(root: Path, image: Path, f: dict) -> Path | None:
 def _mask_file(root: Path, image: Path, f: dict) -> Path:
     """The path of an image's mask, as .png."""
     parts = [p for p in Path(f["file_path"]).parts if p not in (".", "..", "/")]
-    return (root / "masks").joinpath(*(parts[1:] or parts)).with_name(image.stem + ".png")
+    own = parts[1:] if len(parts) > 1 and parts[0].startswith("images") else parts
+    return (root / "masks").joinpath(*own).with_name(image.stem + ".png")
 
 
 def _depths(source: Path, entries: list[Entry]) -> DepthImages | None:
@@ -235,20 +248,34 @@ def _by_camera(entries: list[Entry]) -> dict[str, list[Entry]]:
     return dict(sorted(out.items()))
 
 
-def _at_times(entries: list[Entry], times: list[float]) -> list[Entry]:
-    """The entries of one camera, one for each of `times`.
+def _at_times(name: str, entries: list[Entry], times: list[float]) -> list[Entry]:
+    """The entries of camera `name`, one for each of `times`; warns about entries of the same frame, and about test
+    images among training images.
 
     Raises:
-        CaptureError: a frame or its image is missing.
+        CaptureError: a frame, its image or its mask is missing.
     """
     have = {e.time: e for e in entries}
     missing = [t for t in times if t not in have]
     if missing:
         raise CaptureError(f"frame {missing[0]:g} is missing ({len(missing)} of {len(times)} frames)")
     for t in times:
-        if not have[t].image.is_file():
-            raise CaptureError(f"frame {t:g}: image {have[t].image} is missing")
+        for what, path in (("image", have[t].image), ("mask", have[t].mask)):
+            if path and not path.is_file():
+                raise CaptureError(f"frame {t:g}: {what} {path} is missing")
+    _warn_of_lost(name, entries, have, times)
     return [have[t] for t in times]
+
+
+def _warn_of_lost(name: str, entries: list[Entry], have: dict[float, Entry], times: list[float]) -> None:
+    same, gone = len(entries) - len(have), have.keys() - set(times)
+    if same:
+        why = "they have the frame or time of another image; give each image of a camera its own 'frame' or 'time'"
+        warnings.warn(f"camera {name}: {same} of {len(entries)} images are left out: {why}", stacklevel=7)
+    if gone and len({e.split for e in entries}) > 1:
+        why = "a camera is for training or for testing; name a test camera in 'camera'"
+        lost = f"{len(gone)} of {len(entries)} images are left out, the first one is {have[min(gone)].image.name}"
+        warnings.warn(f"camera {name}: {lost}: {why}", stacklevel=7)
 
 
 def _track(name: str, entries: list[Entry]) -> Track:

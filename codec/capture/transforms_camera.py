@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import CaptureError
 from ..model.camera import NEAR, Camera
+from .images import image_size
 from .rig import pinhole, rigid
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")  # OpenCV's order
@@ -20,20 +21,25 @@ def entry_camera(name: str, image: Path, v: dict, size: tuple[int, int]) -> Came
     """The camera of one entry.
 
     Args:
-        image: for messages.
+        image: its file, for messages.
         v: the entry, completed from the head of the file.
-        size: width and height of the image, pixels.
+        size: width and height of the first image of the camera, pixels: all its images have this size.
 
     Raises:
         CaptureError: pose, intrinsics or size are missing or wrong.
         TypeError, ValueError: a value is not a number.
     """
     width, height = size
-    if (int(v.get("w", width)), int(v.get("h", height))) != (width, height):
-        raise CaptureError(f"image {image} is {width}x{height}, expected {v.get('w')}x{v.get('h')} (w, h)")
+    stated = int(v.get("w", width)), int(v.get("h", height))
+    if stated != (width, height):
+        own = image_size(image)[:2]
+        expected, source = (size, "as the first image of its camera") if own == stated else (stated, "(w, h)")
+        raise CaptureError(f"image {image} is {own[0]}x{own[1]}, expected {expected[0]}x{expected[1]} {source}")
     fisheye = v.get("camera_model") == FISHEYE or bool(v.get("is_fisheye"))
     distortion = np.array([float(v.get(k, 0)) for k in (FISHEYE_DISTORTION if fisheye else DISTORTION)])
     near = float(v.get("near", NEAR))
+    if "near" in v and near == NEAR:
+        near = math.nextafter(NEAR, 1)  # NEAR itself says that the near plane is not known
     if not 0 < near < math.inf:
         raise CaptureError(f"near plane at {near:g}, expected a distance above 0")
     K = _intrinsics(v, width, height)

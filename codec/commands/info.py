@@ -13,7 +13,7 @@ from .inputs import open_stream_warning
 from .options import Json, stdout
 from .tracks import Tracks
 
-CALIBRATIONS = (".json", ".qca.txt", ".npy", ".csv")
+CALIBRATIONS = (".json", ".txt", ".npy", ".csv", ".yml", ".bin")
 SPLATS = (".ply", ".sog", ".drc", ".spz", ".splat", ".splatv", ".zip")
 NOT_STREAMS = CALIBRATIONS + SPLATS
 
@@ -34,6 +34,8 @@ def info(
     track: Tracks = None,
 ) -> None:
     """Contents of a file: groups, bits by attribute and unit; the format of splats; the layout of a capture."""
+    if sheet and sheet.suffix.lower() != ".png":
+        raise UsageError(f"--sheet {sheet}: the picture must be named *.png")
     kind = _kind(path)
     if maps and kind != "stream":
         what = {"capture": "a capture", "splats": "made of splats"}[kind]
@@ -52,7 +54,7 @@ def _kind(path: Path) -> str:
     """stream, splats or capture."""
     from ..splats import detect_input
 
-    if path.is_dir() or path.name.endswith(NOT_STREAMS):
+    if path.is_dir() or path.name.lower().endswith(NOT_STREAMS):
         return detect_input(path)
     return "stream"
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from ..errors import UsageError
 from ..progress import Bar
 from .options import stdout
 
@@ -22,11 +23,14 @@ def masks(
 ) -> None:
     """Masks for a capture without masks: from an empty plate, or of moving objects."""
     from ..capture import open_capture
+    from ..capture.detect import capture_folder
     from ..capture.masks import make_masks
 
+    if plate and moving:
+        raise UsageError(f"--moving and --plate {plate} exclude each other: leave one of them away")
     opened = open_capture(capture)
-    root = capture if capture.is_dir() else capture.parent
-    plates = plate or (root / "plate" if (root / "plate").is_dir() and not moving else None)
+    beside = capture_folder(capture) / "plate"
+    plates = plate or (beside if beside.is_dir() and not moving else None)
     with Bar() as bar:
         count = make_masks(opened, plates, overwrite=overwrite, on_progress=lambda d, n: bar.update("cameras", d, n))
     where = opened.footage[0].mask_files[0]
