@@ -36,7 +36,9 @@ def save_frames(folder, frames):
 
 def test_tracked_folder(tmp_path):
     g = gaussians(500)
-    s = open_sequence(save_frames(tmp_path / "s", [moved(g, t) for t in range(12)]), gop=5, fps=24)
+    save_frames(tmp_path / "s", [moved(g, t) for t in range(12)])
+    (tmp_path / "s" / "._f0.ply").write_bytes(b"\0\5\x16\7")  # macOS adds such files
+    s = open_sequence(tmp_path / "s", gop=5, fps=24)
     assert (s.mode, s.fps, [len(x) for x in s.groups]) == ("tracked", 24, [5, 5, 2])
     assert s.names[10] == "f10.ply"  # natural order: f2 before f10
     np.testing.assert_allclose(s.frame(11).means, moved(g, 11).means, atol=1e-6)
@@ -168,6 +170,14 @@ def test_sequence_round_trip(tmp_path):
     assert (read_splat(tmp_path / "s/000000.ply").logit_opacities[:5] == -30).all()  # hidden from other tools
 
 
+def test_files_of_another_format_are_no_frames_of_a_stored_sequence(tmp_path):
+    write_sequence(GaussianSequence(25, [parametric_group()]), tmp_path)
+    write_splat(tmp_path / "000000.spz", gaussians(3))
+    s = open_sequence(tmp_path)
+    assert s.names == [f"{t:06}.ply" for t in range(4)]
+    assert isinstance(s.groups[0], ParametricGroup), "no frame was changed"
+
+
 def test_writer_goes_on_after_a_stop(tmp_path):
     groups = stored_sequence().groups
     SequenceWriter(tmp_path, 25).add(groups[0])
@@ -221,6 +231,15 @@ def test_bad_sequence_json(tmp_path, change, message):
     write_sequence(stored_sequence(), tmp_path)
     edit(tmp_path, change)
     with pytest.raises(CaptureError, match=message):
+        open_sequence(tmp_path)
+
+
+@pytest.mark.parametrize("size", [0, 500])
+def test_a_cut_file_of_a_group(tmp_path, size):
+    write_sequence(stored_sequence(), tmp_path)
+    npz = tmp_path / "group_0000.npz"
+    npz.write_bytes(npz.read_bytes()[:size])
+    with pytest.raises(CaptureError, match=r"group_0000.npz: missing or damaged"):
         open_sequence(tmp_path)
 
 

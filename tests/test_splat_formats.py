@@ -23,7 +23,7 @@ from synthetic import assert_close, blob, covariances, gaussians, moved
 from gscodec.errors import CaptureError, UsageError
 from gscodec.model.gaussians import SH_C0, Gaussians
 from gscodec.model.rotations import quat_multiply, quat_to_matrix
-from gscodec.splats import archive, open_sequence, read_splat, write_splat
+from gscodec.splats import archive, detect_input, open_sequence, read_splat, write_splat
 from gscodec.splats.describe import describe_splats
 from gscodec.splats.files import splat_size
 from gscodec.splats.glb import UPRIGHT
@@ -60,6 +60,9 @@ def test_spz_holds_far_positions(tmp_path):
     far = Gaussians(g.means * 0 + 4e5, g.quats, g.log_scales, g.logit_opacities, g.sh0, g.shN)
     write_splat(tmp_path / "a.spz", far)
     np.testing.assert_allclose(read_splat(tmp_path / "a.spz").means, far.means, atol=1 / 16)
+    edge = Gaussians(np.full_like(g.means, 2048 - 2**-13), *(getattr(g, n) for n in REST))
+    write_splat(tmp_path / "a.spz", edge)  # rounded to 12 bits of fraction it would need more than 24 bits
+    np.testing.assert_allclose(read_splat(tmp_path / "a.spz").means, edge.means, atol=1 / 4096)
     with pytest.raises(CaptureError, match=r"a position of 1e\+30, expected less than 8388608"):
         write_splat(tmp_path / "b.spz", Gaussians(g.means * 0 + 1e30, *(getattr(g, n) for n in REST)))
     with pytest.raises(CaptureError, match="no Gaussians to write"):
@@ -312,7 +315,12 @@ def test_the_last_iteration_of_a_checkpoint_counts(videogs, tmp_path):
     old = tmp_path / "checkpoint" / "0" / "point_cloud" / "iteration_900"
     old.mkdir()
     (old / "point_cloud.ply").write_text("of an earlier iteration")
+    (old.parent / "iteration_90000").mkdir()  # not saved yet
     assert open_sequence(tmp_path).frame_count == open_sequence(tmp_path / "checkpoint").frame_count == 2
+    for ply in old.parent.rglob("*.ply"):
+        ply.unlink()
+    with pytest.raises(CaptureError, match=r"checkpoint/0: no iteration has a point_cloud.ply, expected one"):
+        open_sequence(tmp_path)
 
 
 def test_maps_without_the_viewers_ranges(videogs, tmp_path):
@@ -376,6 +384,9 @@ def test_a_zip_is_what_it_holds(tmp_path):
         z.write(GOLDEN / "spacetime.splatv", "deep/down/a.splatv")
     assert open_sequence(tmp_path / "b.zip").frame_count == 50
     assert open_sequence(GOLDEN / "videogs_images.zip").frame_count == 2
+    with zipfile.ZipFile(tmp_path / "c.zip", "w") as z:
+        z.write(tmp_path / "0.spz", "2024/0.spz")
+    assert open_sequence(tmp_path / "c.zip").frame_count == 1
 
 
 def test_bad_zips(tmp_path, monkeypatch):
@@ -396,8 +407,14 @@ def test_bad_zips(tmp_path, monkeypatch):
     assert not (tmp_path.parent.parent / "evil.ply").exists()
     with zipfile.ZipFile(tmp_path / "e.zip", "w") as z:
         z.writestr("readme.txt", b"no splats")
-    with pytest.raises(CaptureError, match="no splats, expected one file per frame"):
+    with pytest.raises(CaptureError, match=r"e\.zip: no splats, expected one file per frame"):
         open_sequence(tmp_path / "e.zip")
+    with pytest.raises(CaptureError, match=r"e\.zip: neither a capture nor splats"):
+        detect_input(tmp_path / "e.zip")
+    with zipfile.ZipFile(tmp_path / "g.zip", "w") as z:
+        z.writestr("scene/transforms.json", b"{}")
+    with pytest.raises(CaptureError, match=r"g\.zip: a zip of a capture, expected its folder; unpack the zip first"):
+        detect_input(tmp_path / "g.zip")
     monkeypatch.setattr(archive, "SPARE", 10**18)
     with zipfile.ZipFile(tmp_path / "f.zip", "w") as z:
         z.writestr("a.ply", b"much larger than the disk")

@@ -15,7 +15,7 @@ from synthetic import assert_close, gaussians
 
 from gscodec.errors import CaptureError, UsageError
 from gscodec.model.gaussians import Gaussians
-from gscodec.splats import read_splat, write_splat
+from gscodec.splats import detect_input, read_splat, write_splat
 from gscodec.splats.codebook import codebook, palette
 from gscodec.splats.files import splat_size
 
@@ -134,16 +134,16 @@ def test_compressed_ply_round_trip(tmp_path, k):
     assert_close(back, read_splat(tmp_path / "b.compressed.ply"), 1e-5, 1e-5, 1e-6, 1e-6, 1e-5, 1e-5)
 
 
-def compressed(path, chunks=1, rows=1, sh=None, drop=""):
+def compressed(path, chunks=1, rows=1, sh=None, drop="", more=()):
     """Writes a .compressed.ply of one Gaussian word by word, from the format's description."""
     names = [f"{m}_{a}" for m in ("min", "max") for a in ("x", "y", "z")]
-    names += [f"{m}_scale_{a}" for m in ("min", "max") for a in "xyz"]
+    names += [*(f"{m}_scale_{a}" for m in ("min", "max") for a in "xyz"), *more]
     header = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
     header += [f"property float {n}" for n in names if n != drop] + [f"element vertex {rows}"]
     header += [f"property uint packed_{w}" for w in ("position", "rotation", "scale", "color")]
     if sh is not None:
         header += [f"element sh {sh}", *(f"property uchar f_rest_{i}" for i in range(9))]
-    bounds = [0, 0, 0, 1, 2, 4, -8, -8, -8, 0, 0, 0][: 12 - bool(drop)]
+    bounds = [0, 0, 0, 1, 2, 4, -8, -8, -8, 0, 0, 0][: 12 - bool(drop)] + [0] * len(more)
     data = struct.pack(f"<{len(bounds)}f", *bounds) * chunks
     words = (2047 << 21 | 0 << 11 | 2047, 2 << 30 | 1023 << 20 | 512 << 10 | 512, 1 << 31, 255 << 24 | 128)
     data += struct.pack("<4I", *words) * rows + bytes(range(9)) * (sh or 0)
@@ -167,6 +167,7 @@ def test_compressed_ply_bits(tmp_path):
         ({"chunks": 2}, "2 chunks for 1 Gaussians, expected 1 of 256"),
         ({"sh": 3}, "3 rows of SH for 1 Gaussians"),
         ({"drop": "max_x"}, "no property max_x, expected a SuperSplat compressed PLY"),
+        ({"more": ["min_r", "min_g", "min_b", "max_r"]}, "no property max_g, max_b, expected a SuperSplat"),
     ],
 )
 def test_bad_compressed_ply(tmp_path, harm, message):
@@ -174,7 +175,7 @@ def test_bad_compressed_ply(tmp_path, harm, message):
         read_splat(compressed(tmp_path / "a.ply", **harm))
 
 
-@pytest.mark.parametrize("name", ["a.compressed.ply", "a.sog"])
+@pytest.mark.parametrize("name", ["a.compressed.ply", "a.sog", "a.drc"])
 def test_formats_that_cannot_be_empty(tmp_path, name):
     with pytest.raises(CaptureError, match=r"no Gaussians to write; use .ply"):
         write_splat(tmp_path / name, gaussians(0))
@@ -183,11 +184,12 @@ def test_formats_that_cannot_be_empty(tmp_path, name):
 # -- SOG
 
 
-@pytest.mark.parametrize(("name", "k"), [("a.sog", 0), ("a.sog", 8), ("folder/meta.json", 3)])
+@pytest.mark.parametrize(("name", "k"), [("a.sog", 0), ("A.SOG", 8), ("folder/meta.json", 3)])
 def test_sog_round_trip(tmp_path, name, k):
     g = gaussians(300, k)
     write_splat(tmp_path / name, g)
-    path = tmp_path / name if name.endswith(".sog") else tmp_path / "folder"
+    path = tmp_path / "folder" if name.endswith("meta.json") else tmp_path / name
+    assert detect_input(tmp_path / name) == "splats"
     assert splat_size(path) == (300, k)
     back = read_splat(path)
     assert_close(g, back, 4e-4, 0.5, 2e-4, 1 / 255, 0.5, 0.3)
@@ -241,6 +243,11 @@ def test_bad_sog_palette(sog):
         read_splat(save(shN=meta["shN"] | {"bands": 2}))
     with pytest.raises(CaptureError, match="SH label 19 for a palette of 3"):
         read_splat(save(shN=meta["shN"] | {"count": 3}))
+
+
+def test_sog_with_harmonics_of_null(sog):
+    folder = sog[1](shN=None)
+    assert splat_size(folder) == (20, read_splat(folder).shN.shape[1]) == (20, 0)
 
 
 def test_bad_sog_bundles(tmp_path):

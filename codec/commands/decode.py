@@ -37,6 +37,8 @@ def decode(
         raise UsageError(f"--format {form}: expected {', '.join(FORMATS)}; a .splatv is named as the output instead")
     if maps and (frames or form != "ply" or folder.suffix.lower() == ".splatv"):
         raise UsageError("--maps writes the whole stream as images into a folder; leave --format and --frames away")
+    if form != "ply" and folder.suffix.lower() == ".splatv":
+        raise UsageError(f"--format {form}: {folder} is one .splatv, expected a folder for {form} frames")
     s = open_stream_of_frames(stream, track)
     if maps:
         from ..decode.maps import write_maps
@@ -52,13 +54,22 @@ def decode(
         write_sequence(s.sequence(), folder)
     else:
         folder.mkdir(parents=True, exist_ok=True)
+        if form == "ply":
+            (folder / "sequence.json").unlink(missing_ok=True)  # some of its frames will be overwritten
         for t in chosen:
             write_splat(folder / f"{t:06d}.{form}", s.frame(t), s.config["up"])
     stdout.print(f"{folder}: {len(chosen)} frames")
 
 
 def _one_track(s: Stream | Scene, purpose: str) -> Stream:
-    return s.alone(purpose) if hasattr(s, "alone") else s
+    """The stream of the only visible track, which has no transform."""
+    if not hasattr(s, "alone"):
+        return s
+    stream, track = s.alone(purpose), next(t for t in s.tracks if not t.placement.hidden)
+    if track.placement.keys:
+        which = track.placement.name or s.tracks.index(track) + 1
+        raise UsageError(f"{purpose} cannot hold the transform of a track; add --track {which}:transform=none")
+    return stream
 
 
 def _to_splatv(s: Stream, path: Path, chosen: range) -> str:

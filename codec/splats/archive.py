@@ -40,11 +40,16 @@ def _unpacked(path: Path, _: int, size: int) -> Path:
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as e:
         raise CaptureError(f"{path}: not a readable zip ({e}), expected a zip of splats") from None
     inner = Path(folder.name)
-    while len(found := list(inner.iterdir())) == 1 and not found[0].name.isdigit():
+    while len(found := list(inner.iterdir())) == 1 and not _is_frame(found[0]):
         inner = found[0]
         if inner.is_file():
             break
     return inner
+
+
+def _is_frame(folder: Path) -> bool:
+    """Whether the folder is a numbered frame, of VideoGS's checkpoints or an unpacked SOG."""
+    return folder.name.isdigit() and any((folder / inside).exists() for inside in ("point_cloud", "meta.json"))
 
 
 def _is_litter(name: str) -> bool:

@@ -41,7 +41,8 @@ def gaussians_of_compressed(table: dict[str, np.ndarray], path: Path) -> Gaussia
         CaptureError: a property is missing or the elements do not fit together.
     """
     rows, chunks = table["vertex"], table["chunk"]
-    names = [*WORDS, *RANGES["position"], *RANGES["scale"]]
+    ranged = bool({*RANGES["color"]} & {*chunks.dtype.names})  # before 2024 there was none, and colours are in 0..1
+    names = [*WORDS, *RANGES["position"], *RANGES["scale"], *(RANGES["color"] if ranged else ())]
     missing = [n for n in names if n not in (*rows.dtype.names, *chunks.dtype.names)]
     if missing:
         raise CaptureError(f"{path}: no property {', '.join(missing)}, expected a SuperSplat compressed PLY")
@@ -50,7 +51,6 @@ def gaussians_of_compressed(table: dict[str, np.ndarray], path: Path) -> Gaussia
         raise CaptureError(f"{path}: {len(chunks)} chunks for {len(rows)} Gaussians, expected {expected} of {CHUNK}")
     position, rotation, scale, color = (rows[w].astype(np.uint32) for w in WORDS)
     rgba = np.stack([color >> s & 255 for s in (24, 16, 8, 0)], 1) / 255
-    ranged = RANGES["color"][0] in chunks.dtype.names  # files written before 2024 have colours in 0..1
     rgb = _unscale(rgba[:, :3], chunks, "color") if ranged else rgba[:, :3]
     small = (np.stack([rotation >> s & 1023 for s in (20, 10, 0)], 1) / 1023 - 0.5) * np.sqrt(2)
     return Gaussians(

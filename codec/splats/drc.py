@@ -41,7 +41,14 @@ def read_drc(path: Path) -> Gaussians:
 
 
 def write_drc(path: Path, gaussians: Gaussians) -> None:
-    """Writes the positions, 16 bits an axis. Draco changes their order and drops duplicates."""
+    """Writes the positions, 16 bits an axis. Draco changes their order and drops duplicates.
+
+    Raises:
+        CaptureError: there are no Gaussians, which this format cannot express.
+        UsageError: DracoPy is not installed.
+    """
+    if not len(gaussians):
+        raise CaptureError(f"{path}: no Gaussians to write; use .ply for an empty frame")
     draco = require("DracoPy", "writing a .drc")
     data = draco.encode(gaussians.means, quantization_bits=BITS, compression_level=LEVEL, preserve_order=False)
     with part_file(path) as part:

@@ -81,7 +81,7 @@ def splat_size(path: Path) -> tuple[int, int]:
         header = spz_header(path)
         return header.count, min(SH_DEGREES[header.degree], 15)
     meta, _ = read_sog_meta(path)
-    return int(meta.get("count", 0)), SH_BANDS.get(meta.get("shN", {}).get("bands", 0), 0)
+    return int(meta.get("count", 0)), SH_BANDS.get((meta.get("shN") or {}).get("bands", 0), 0)
 
 
 def write_splat(path: str | Path, gaussians: Gaussians, up: str = "-y") -> None:

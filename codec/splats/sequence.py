@@ -12,6 +12,7 @@ import hashlib
 import json
 import re
 import warnings
+import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -63,7 +64,7 @@ def splat_paths(path: Path) -> list[Path]:
         return [path] if is_splat(path) else []
     if found := find_checkpoints(path):
         return found
-    found = [p for p in path.iterdir() if is_splat(p)]
+    found = [p for p in path.iterdir() if is_splat(p) and not p.name.startswith(".")]  # macOS adds ._NAME
     return sorted(found, key=lambda p: [int(w) if w.isdigit() else w for w in re.split(r"(\d+)", p.name)])
 
 
@@ -84,14 +85,15 @@ def detect_input(path: str | Path) -> str:
     path = Path(path)
     if not path.exists():
         raise CaptureError(f"{path}: no such file or folder, expected a capture or a folder of splats")
-    if path.suffix.lower() == ".zip":
-        path = unpacked(path)
-    if find_capture(path):
+    inner = unpacked(path) if path.suffix.lower() == ".zip" else path
+    if find_capture(inner):
+        if inner != path:
+            raise CaptureError(f"{path}: a zip of a capture, expected its folder; unpack the zip first")
         return "capture"
-    if is_scene(path) or splat_paths(path):
+    if is_scene(inner) or splat_paths(inner):
         return "splats"
     looked = "; ".join([*LOOKED_FOR, f"splats, one per frame: {EXPECTED}", SCENES])
-    raise CaptureError(f"{path}: {_instead(path)}neither a capture nor splats; looked for {looked}")
+    raise CaptureError(f"{path}: {_instead(inner)}neither a capture nor splats; looked for {looked}")
 
 
 def _instead(path: Path) -> str:
@@ -126,7 +128,7 @@ def open_sequence(
         CaptureError: there are no splats, or sequence.json does not fit them.
         UsageError: `gop` or `fps` is not positive.
     """
-    path = Path(path)
+    path = named = Path(path)
     if gop < 1 or (fps is not None and not fps > 0):
         raise UsageError(f"gop {gop} and fps {fps} must be positive")
     if path.suffix.lower() == ".zip" and path.is_file():
@@ -136,7 +138,7 @@ def open_sequence(
         groups, names, rate = _scene(path, gop)
         return SplatSequence(fps or rate, groups, mode="scene", names=names)
     if not paths:
-        raise CaptureError(f"{path}: no splats, expected one file per frame: {EXPECTED}; or {SCENES}")
+        raise CaptureError(f"{named}: no splats, expected one file per frame: {EXPECTED}; or {SCENES}")
     if path.is_dir() and (path / "sequence.json").is_file():
         return _stored(path, paths, fps)
     sizes = [splat_size(p) for p in paths]
@@ -187,8 +189,9 @@ def _tracks(
 
 
 def _stored(path: Path, paths: list[Path], fps: float | None) -> SplatSequence:
-    """The sequence that sequence.json describes."""
+    """The sequence that sequence.json describes: of the .ply files, if there are any."""
     where = path / "sequence.json"
+    paths = [p for p in paths if p.suffix.lower() == ".ply"] or paths
     try:
         data = json.loads(where.read_text())
         rate = float(fps or data["fps"])
@@ -221,7 +224,7 @@ def _stored_group(
     try:
         with np.load(path / Path(extra).name) as stored:
             arrays = {k: stored[k] for k in stored.files}
-    except (OSError, ValueError) as e:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError) as e:
         raise CaptureError(f"{path / extra}: missing or damaged ({e}), sequence.json refers to it") from e
     if sha256 is not None:
         if _digest(own) == sha256:

@@ -40,7 +40,7 @@ def read_sog_meta(path: Path) -> tuple[dict, Callable[[str], bytes]]:
     Raises:
         CaptureError: there is none, or it is not version 2.
     """
-    if path.suffix == ".sog":
+    if path.suffix.lower() == ".sog":
         try:
             with zipfile.ZipFile(path) as z:
                 files = {n: z.read(n) for n in z.namelist()}
@@ -140,7 +140,7 @@ def write_sog(path: Path, gaussians: Gaussians) -> None:
     meta, maps = _maps(gaussians)
     files = {name: _webp(pixels) for name, pixels in maps.items()}
     files["meta.json"] = json.dumps(meta, separators=(",", ":")).encode()  # last: it makes the folder valid
-    if path.suffix != ".sog":
+    if path.suffix.lower() != ".sog":
         path.parent.mkdir(parents=True, exist_ok=True)
         for name, data in files.items():
             with part_file(path.parent / name) as part:

@@ -200,7 +200,7 @@ def write_spz(path: Path, gaussians: Gaussians) -> None:
     if not len(g):
         raise CaptureError(f"{path}: no Gaussians to write; use .ply for an empty frame")
     far = float(np.abs(g.means).max())
-    fraction = min(POSITION_BITS, 22 - max(0, int(np.floor(np.log2(max(far, 1))))))
+    fraction = min(POSITION_BITS, int(np.floor(np.log2((2**23 - 1) / max(far, 1)))))
     if fraction < 0:
         raise CaptureError(f"{path}: a position of {far:g}, expected less than {2**23} in a .spz")
     fixed = np.rint(g.means.astype(np.float64) * RDF * (1 << fraction)).astype("<i4")

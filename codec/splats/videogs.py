@@ -1,6 +1,6 @@
 """VideoGS (V3, Wang et al. 2024): its checkpoints and its packed maps -> frames.
 
-    checkpoint/FRAME/point_cloud/iteration_N/point_cloud.ply     as trained: standard .ply; the last iteration is read
+    checkpoint/FRAME/point_cloud/iteration_N/point_cloud.ply     as trained: standard .ply; of the last iteration saved
     feature_image/groupG/FRAME_PLANE.png, group_info.json, viewer_min_max.json (or min_max.json)
     feature_video/png_all_QP/groupG/PLANE.mp4, group_info.json, viewer_min_max.json
 
@@ -34,14 +34,20 @@ GAUSSIANS_MAX = 50_000_000
 
 
 def find_checkpoints(path: Path) -> list[Path]:
-    """The .ply of each frame in order, of the last iteration; empty if `path` holds no checkpoints."""
+    """The .ply of each frame in order, of the last iteration that has one; empty if `path` holds no checkpoints.
+
+    Raises:
+        CaptureError: no iteration of a frame has one.
+    """
     found = []
     for root in (path / "checkpoint", path):
         folders = [p for p in root.iterdir() if p.name.isdigit()] if root.is_dir() else []
         for folder in sorted(folders, key=lambda p: int(p.name)):
             saved = {int(m[1]): p for p in folder.glob("point_cloud/*") if (m := re.match(r"iteration_(\d+)$", p.name))}
-            if saved and (ply := saved[max(saved)] / "point_cloud.ply").is_file():
-                found.append(ply)
+            plys = [ply for n in sorted(saved) if (ply := saved[n] / "point_cloud.ply").is_file()]
+            if saved and not plys:
+                raise CaptureError(f"{folder}: no iteration has a point_cloud.ply, expected one; train the frame again")
+            found += plys[-1:]
         if found:
             break
     return found
