@@ -20,10 +20,12 @@ def program() -> dict:
     return {"version": __version__, "code": digest.hexdigest()[:16]}
 
 
-def inputs(source: Path) -> dict:
-    """Path of the input; size and modification time of each of its files."""
+def inputs(source: Path, output: Path | None = None) -> dict:
+    """Path of the input; size and modification time of each of its files, without those of `output` and NAME.part."""
     source = Path(source).resolve()
     files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
+    if output is not None:
+        files = [p for p in files if not str(p).startswith(str(Path(output).resolve()))]
     root = source if source.is_dir() else source.parent
     stats = {str(p.relative_to(root)): p.stat() for p in files}
     return {"path": str(source), "files": {n: [s.st_size, s.st_mtime_ns] for n, s in stats.items()}}

@@ -19,13 +19,13 @@ class Bar:
         self._terminal = sys.stderr.isatty()
         self._said = self._started = time.monotonic()
         self._rich = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
             TextColumn("ETA"),
             TimeRemainingColumn(),
-            console=Console(stderr=True),
+            console=Console(stderr=True, markup=False, emoji=False),  # prints names as they are
             disable=not self._terminal,
         )
         self._rich.start()

@@ -22,7 +22,7 @@ from gscodec.errors import CaptureError
 from gscodec.metrics.image import psnr
 from gscodec.model.camera import Camera, look_at
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
-from gscodec.model.gaussians import concatenate
+from gscodec.model.gaussians import Gaussians, concatenate
 from gscodec.render.image import render_image
 
 FRAMES = 6
@@ -167,6 +167,25 @@ def test_subjects_that_part_are_told_apart_and_split_without_loss(apart, tmp_pat
         for name in ("means", "log_scales", "logit_opacities", "sh0"):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
         assert psnr(render_image(a, side()), render_image(b, side())) > 40
+
+
+def test_subjects_are_found_beside_empty_groups_and_later_births(tmp_path):
+    """Segments: nothing; both; nothing; one subject, and in a later group both."""
+    none, both = DenseGroup([Gaussians.none()]), pair(4.0).groups
+    one = replaced(both[0], lambda g: g.take(np.arange(200)))
+    born = np.r_[np.arange(200), np.full(100, -1)]
+    path = tmp_path / "a.gsv"
+    config = stream_config(fps=30, sh_degree=0, gaussians=300, frames=4)
+    groups = [none, both[0], none, one, DenseGroup(both[1].frames, None, born)]
+    encode_sequence(GaussianSequence(30.0, groups), path, config, EncodeSettings(quality=60, refine=0, random_access=8))
+    stream = open_stream(path)
+    assert stream.group(4).reference == 1
+    labels = find_subjects(stream)
+    assert [np.bincount(own).tolist() for own in labels] == [[], [200, 100], [], [200], [200, 100]]
+
+
+def replaced(group, change):
+    return DenseGroup([change(g) for g in group.frames])
 
 
 def side():

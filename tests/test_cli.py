@@ -12,6 +12,7 @@ from synthetic import turning
 from gscodec.commands import checkout
 from gscodec.errors import UsageError
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.progress import Bar
 from gscodec.splats import write_sequence
 
 
@@ -92,6 +93,22 @@ def test_info_draws_the_maps(folder, tmp_path):
     width, height, depth = png_header(tmp_path / "maps.png")
     assert (width > 100, height > 100, depth) == (True, True, 8)
     assert "--maps" in run("info", folder / "a.gsv", "--maps", tmp_path / "maps").stderr
+    fails(run("info", folder / "plys", "--sheet", tmp_path / "a.jpg"), "--sheet", "must be named *.png")
+
+
+def test_names_are_no_markup(folder, tmp_path, capsys):
+    path = tmp_path / "take[final]:smile:.gsv"
+    path.write_bytes((folder / "a.gsv").read_bytes())
+    assert run("info", path).stdout.startswith(f"{path}: 5 frames")
+    with Bar() as bar:
+        bar._terminal = True
+        bar.say("x[/a]:smile:")
+    assert capsys.readouterr().err == "x[/a]:smile:\n"
+
+
+def test_info_takes_endings_in_upper_case(folder, tmp_path):
+    (tmp_path / "A.PLY").write_bytes((folder / "plys" / "000000.ply").read_bytes())
+    assert "3DGS .ply" in run("info", tmp_path / "A.PLY").stdout
 
 
 def test_eval_gives_the_quality_of_every_prefix(tmp_path):
@@ -114,8 +131,12 @@ def test_eval_gives_the_quality_of_every_prefix(tmp_path):
 def test_decode_and_encode_again(folder, tmp_path):
     assert run("decode", folder / "a.gsv", tmp_path / "plys").returncode == 0
     assert len(list((tmp_path / "plys").glob("*.ply"))) == 5
-    assert run("encode", tmp_path / "plys", tmp_path / "b.gsv", "--frames", "1:4").returncode == 0
+    assert run("decode", folder / "a.gsv", tmp_path / "plys", "--format", "spz").returncode == 0
+    done = run("encode", tmp_path / "plys", tmp_path / "b.gsv", "--frames", "1:4")
+    assert (done.returncode, "were changed" in done.stderr) == (0, False), done.stderr
     assert json.loads(run("info", tmp_path / "b.gsv", "--json").stdout)["frames"] == 3
+    assert run("decode", folder / "a.gsv", tmp_path / "plys", "--frames", "0:2").returncode == 0
+    assert not (tmp_path / "plys" / "sequence.json").exists(), "it would not fit the new frames"
 
 
 def test_eval_against_the_splats(folder):
@@ -140,6 +161,12 @@ def test_wrong_paths_and_values(folder, tmp_path):
     fails(run("encode", folder / "plys", tmp_path / "o.gsv", "--quality", "200"), "0 (small) to 100")
     fails(run("encode", folder / "plys", tmp_path / "o.gsv", "--frames", "9:12"), "frames 0 to 4")
     fails(run("encode", folder / "plys", tmp_path / "o.gsv", "--gop", "0"), "--gop")
+    fails(run("encode", folder / "plys", tmp_path / "o.gsv", "--preset", "bar"), "--preset bar does not exist")
+    both = ("--bitrate", "1M", "--quality", "10")
+    fails(run("encode", folder / "plys", tmp_path / "o.gsv", *both), "--quality and --bitrate exclude each other")
+    no_folder = ("--json", tmp_path / "none" / "r.json")
+    fails(run("encode", folder / "plys", tmp_path / "o.gsv", *no_folder), "there is no folder", "make it first")
+    fails(run("encode", "--from-maps", folder, tmp_path / "o.gsv", "--frames", "0:4"), "leave --frames away")
     fails(run("info", tmp_path / "no.gsv"), "no.gsv", "No such file")
     fails(run("render", gsv, tmp_path / "o", "--camera", "cam99"), "cam99", "orbit")
     fails(run("render", gsv, tmp_path / "o", "--size", "huge"), "WxH")
@@ -153,6 +180,7 @@ def test_wrong_paths_and_values(folder, tmp_path):
     fails(run("encode", tmp_path, tmp_path / "o.gsv"), "the folder is empty, neither a capture nor splats")
     fails(run("render", folder, tmp_path / "o.mp4"), "a folder, expected a .gsv file")
     fails(run("decode", folder / "report.json", tmp_path / "o"), "not a .gsv file")
+    fails(run("decode", gsv, tmp_path / "o.splatv", "--format", "spz"), "--format spz", "is one .splatv")
     fails(run("encode"), "SEQ", code=2)
     assert not list(tmp_path.iterdir()), "nothing is left behind"
 

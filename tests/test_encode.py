@@ -18,6 +18,7 @@ from gscodec.commands.eval import evaluate_stream
 from gscodec.decode import Stream, open_stream
 from gscodec.decode.maps import write_maps
 from gscodec.encode.axis_order import sorted_axes
+from gscodec.encode.coded_form import appearance
 from gscodec.encode.coder import CoderState, GroupCoder
 from gscodec.encode.encode import StreamOutput, encode_groups, stream_config
 from gscodec.encode.measure import measure_group
@@ -34,6 +35,7 @@ from gscodec.model.parametric_group import NodeMotion, ParametricGroup
 from gscodec.model.rotations import quat_conjugate, quat_multiply
 from gscodec.model.temporal_transform import dct_basis
 from gscodec.progress import Bar
+from gscodec.render.movie import camera_path
 
 
 def write(sequence, out, quality=50.0, **settings):
@@ -182,6 +184,14 @@ def test_what_nobody_sees_is_dropped_unless_all_is_to_be_kept(tmp_path):
     assert coded(group, 50, keep_all=True)[0].gaussians == 100
 
 
+def test_an_orbit_is_around_the_first_frame_with_gaussians(tmp_path):
+    groups = [DenseGroup([Gaussians.none()]), *turning(60, frames=2).groups]
+    write(turning().with_groups(groups), tmp_path / "a.gsv")
+    stream = open_stream(tmp_path / "a.gsv")
+    last = [list(camera_path(stream, "orbit", None, frames))[-1] for frames in (range(3), range(1, 3))]
+    np.testing.assert_array_equal(last[0].viewmat, last[1].viewmat)
+
+
 def test_lifetimes_survive(tmp_path):
     sequence = turning(120, frames=6, lifetimes=True)
     write(sequence, tmp_path / "a.gsv", keep_all=True)
@@ -289,6 +299,15 @@ def test_what_comes_out_is_parametric_again(tmp_path):
         for t in range(6):
             near = {"means": 1e-5, "log_scales": 1e-5, "sh0": 1e-5, "shN": 1e-5, "opacity": 1e-5}
             assert_close(stream.frame(t), group.visible(t), **near)
+
+
+def test_trajectories_of_no_gaussian_are_parametric_too():
+    stream = open_stream(Path(__file__).parent.parent / "spec" / "vectors" / "valid" / "predicted_nothing_left.gsv")
+    group = stream.sequence().groups[1]
+    assert (len(group.canonical), "sh0" in group.trajectories) == (0, True)
+    values, trajectories = appearance(group, np.zeros((0, 3), int))
+    assert values["sh0"].shape == (0, 3)
+    assert not trajectories
 
 
 @pytest.mark.parametrize("layers", [1, 3])
@@ -525,6 +544,8 @@ def test_settings_out_of_range_are_refused():
         EncodeSettings(quality=101)
     with pytest.raises(UsageError, match="bitrate 0"):
         EncodeSettings(bitrate=0)
+    with pytest.raises(UsageError, match="bitrate inf"):
+        EncodeSettings(bitrate=float("inf"))
 
 
 def test_report_is_json(tmp_path):

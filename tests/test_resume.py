@@ -138,3 +138,7 @@ def test_a_changed_picture_is_named(tmp_path):
     after = before | {"input": inputs(tmp_path)}
     assert sentence(before, after) == f"{picture.relative_to(tmp_path)} has changed"
     assert sentence(before, before) == ""
+    inside = tmp_path / "out.gsv"
+    for made in (inside, inside.with_name("out.gsv.part.json")):
+        made.write_bytes(b"of an earlier run")
+    assert inputs(tmp_path, inside) == after["input"]

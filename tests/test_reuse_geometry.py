@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from synthetic import encode_sequence, turning
 from trained import capture, load_groups
 
 from bench.procedural import write_transforms
@@ -17,6 +18,8 @@ from gscodec.encode.recolor import COLORS
 from gscodec.encode.settings import EncodeSettings
 from gscodec.fit import fit_groups
 from gscodec.metrics.image import psnr
+from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
+from gscodec.model.gaussians import Gaussians
 from gscodec.progress import Bar
 from gscodec.render.image import render_image
 from gscodec.splats import read_splat, write_sequence, write_splat
@@ -132,6 +135,30 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(old, plys, tmp_path):
     assert [p.name for p in sorted(tmp_path.iterdir())] == ["a.gsv", "b.gsv"]
 
 
+def test_a_placed_track_keeps_its_placement(old, plys, tmp_path):
+    """Its splats are those without the placement."""
+    placed, new = tmp_path / "placed.gsv", tmp_path / "new.gsv"
+    assert run("edit", old, "-o", placed, "--track", "1:name=he:move=9,0,0").returncode == 0
+    assert run("encode", plys, new, "--reuse-geometry", placed).returncode == 0
+    assert open_stream(new).config["placement"] == open_stream(placed).config["placement"]
+    shares_geometry(placed, new)
+    assert run("decode", placed, tmp_path / "moved").returncode == 0
+    done = run("encode", tmp_path / "moved", tmp_path / "no.gsv", "--reuse-geometry", placed)
+    assert "of a placed track, with --track 1:transform=none" in done.stderr
+    assert not list(tmp_path.glob("no.gsv*"))
+
+
+def test_an_empty_group_stays_empty(tmp_path):
+    groups = [DenseGroup([Gaussians.none()]), *turning(60, frames=2).groups]
+    config = stream_config(fps=25, sh_degree=0, gaussians=60, frames=2)
+    encode_sequence(GaussianSequence(25.0, groups), tmp_path / "a.gsv", config, EncodeSettings(refine=0))
+    write_sequence(open_stream(tmp_path / "a.gsv").sequence(), tmp_path / "plys")
+    with Bar() as bar:
+        options = EncodeSettings(), TrainOptions("medium", None, 30), bar
+        encode_reusing(tmp_path / "plys", "splats", tmp_path / "a.gsv", tmp_path / "b.gsv", *options)
+    assert [len(open_stream(tmp_path / "b.gsv").frame(t)) for t in range(3)] == [0, 60, 60]
+
+
 def test_a_capture_in_other_light_gives_its_colours(old, tmp_path):
     """The new colours come from the pictures, and are much nearer to them than those of the stream."""
     folder, new = tmp_path / "capture", tmp_path / "new.gsv"
@@ -160,6 +187,8 @@ def test_what_does_not_fit_is_said(old, plys, tmp_path):
     says("leave --quality away", plys, out, "--quality", 50)
     says("leave --preset away", plys, out, "--preset", "fast")
     says("leave --gop away", plys, out, "--gop", 7)
+    says("leave --random-access away", plys, out, "--random-access", 4)
+    says("--refine 7: colours are refined by the pictures of a capture", plys, out, "--refine", 7)
     says("expected as many", plys, out, "--frames", "0:5")
     says("the output is the stream whose geometry is reused", plys, old)
     fewer = tmp_path / "fewer"

@@ -15,6 +15,7 @@ from synthetic import blob, encode_sequence, moved
 
 from gscodec import _native
 from gscodec.decode import open_scene, open_stream
+from gscodec.decode.report import describe_scene
 from gscodec.decode.scene import read_scene
 from gscodec.encode.encode import stream_config
 from gscodec.encode.settings import EncodeSettings
@@ -220,9 +221,17 @@ def test_wrong_words_are_told(scene, parts, tmp_path):
     }.items():
         assert message in re.sub(r"\s+", " ", fails("edit", scene, "-o", out, "--track", option)), option
     assert "two tracks are named 'man'" in fails("mux", parts / "man.gsv", parts / "man.gsv", "-o", out)
+    assert "two tracks are named 'man'" in fails("mux", scene, "-o", out, "--track", "ball:name=man")
+    assert "the file has 2 tracks, expected one for the name 'n'" in fails("mux", f"n={scene}", "-o", out)
+    hidden = ("--track", "man:hide", "--track", "ball:hide")
+    assert "shows no frame: its tracks are hidden" in fails("render", scene, out.with_suffix(".mp4"), *hidden)
     assert "no track is left" in fails("edit", parts / "man.gsv", "-o", out, "--drop", "1")
     assert "shows 2; add --track NAME:only" in fails("decode", scene, tmp_path / "maps", "--maps")
     run("decode", scene, tmp_path / "maps", "--maps", "--track", "man:only")
+    moved = ("--track", "man:only", "--track", "man:move=1,0,0")
+    assert "transform of a track; add --track man:transform=none" in fails(
+        "decode", scene, tmp_path / "a.splatv", *moved
+    )
     assert not out.exists()
 
 
@@ -273,6 +282,14 @@ def test_hostile_placements_are_named():
     assert all(place and at <= int(place[1]) <= at + size for place in places), told
 
 
+def test_a_track_without_groups_is_described():
+    shares = [
+        [u["share"] for u in t["units"].values()]
+        for t in describe_scene(open_scene(VECTORS / "tracks_hidden.gsv"))["tracks"]
+    ]
+    assert [0] in shares
+
+
 def test_sound_of_a_scene(parts, tmp_path):
     """The sound is that of the first track, and stays with its groups."""
     write_tone(tmp_path / "tone.wav", 1.0)
@@ -285,7 +302,7 @@ def test_sound_of_a_scene(parts, tmp_path):
     assert "that of loud is left out" in run("mux", parts / "man.gsv", tmp_path / "loud.gsv", "-o", tmp_path / "b.gsv")
     assert "which is dropped" in run("edit", tmp_path / "a.gsv", "-o", tmp_path / "b.gsv", "--drop", "loud")
     silent = run("edit", tmp_path / "loud.gsv", parts / "man.gsv", "-o", tmp_path / "b.gsv")
-    assert "which is left out" in silent
+    assert f"there is no sound in {parts / 'man.gsv'}, so the file has none" in silent
     assert "audio" not in open_stream(tmp_path / "b.gsv").config
     run("edit", tmp_path / "a.gsv", "-o", tmp_path / "c.gsv", "--frames", "loud=15:30", "--frames", "man=0:4")
     (cut,) = open_scene(tmp_path / "c.gsv").tracks[0].stream.groups

@@ -65,7 +65,9 @@ def edit(
         kept[0] = replace(kept[0], config=kept[0].config | {"cameras": first.config["cameras"]})
     size = write_tracks(out, kept)
     if kept[0].has_sound and "audio" not in kept[0].config:
-        stdout.print("the files to join have sound of different forms, which is left out")
+        silent = ", ".join(s.name for s in scenes if "audio" not in s.config)
+        why = f"there is no sound in {silent}" if silent else "the files to join have sound of different forms"
+        stdout.print(f"{why}, so the file has none")
     elif 0 in dropped and plans[0].has_sound:
         stdout.print("the sound goes with the first track, which is dropped")
     stdout.print(f"{out}: {len(kept)} tracks, {size} bytes")

@@ -45,6 +45,7 @@ ENDED = {  # ParametricGroup.ended
 
 
 def encode(
+    ctx: typer.Context,
     seq: SequencePath,
     out: StreamPath,
     quality: Quality = None,
@@ -92,7 +93,10 @@ def encode(
     report: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the report there.")] = None,
 ) -> None:
     """Capture or Gaussian sequence to a stream. A second run resumes; Ctrl-C leaves a playable file."""
+    if report and not report.parent.is_dir():
+        raise UsageError(f"--json {report}: there is no folder {report.parent}, make it first")
     if from_maps:
+        _check_maps(ctx)
         _from_maps(seq, out, audio)
         return
     from ..encode.reuse_geometry import color_bytes
@@ -153,6 +157,14 @@ def _print_tracks(out: Path, result: TracksReport) -> None:
         raise typer.Exit(130)
 
 
+def _check_maps(ctx: typer.Context) -> None:
+    """Raises a UsageError for an option that `--from-maps` does not use."""
+    for p in ctx.command.params:
+        source = ctx.get_parameter_source(p.name)
+        if source and source.name == "COMMANDLINE" and p.name not in ("seq", "out", "from_maps", "audio"):
+            raise UsageError(f"--from-maps takes all but the sound (--audio) from the maps; leave {p.opts[0]} away")
+
+
 def _from_maps(folder: Path, out: Path, audio: Path | None) -> None:
     from ..encode.audio import read_audio
     from ..encode.from_maps import encode_maps
@@ -201,12 +213,16 @@ def encode_input(
     from .sources import capture_source, say_lengths, splat_source
 
     out, kind = Path(out), detect_input(source)
-    _check(source, out, kind, options, tracks, reuse_geometry)
+    _check(source, out, kind, settings, options, tracks, reuse_geometry)
     sound = read_audio(audio) if audio else None
     out.parent.mkdir(parents=True, exist_ok=True)
 
     def made_by(opened: Source) -> dict:
-        return {"program": program(), "input": inputs(source), "settings": asdict(opened.settings) | opened.made_of}
+        return {
+            "program": program(),
+            "input": inputs(source, out),
+            "settings": asdict(opened.settings) | opened.made_of,
+        }
 
     if reuse_geometry:
         return encode_reusing(source, kind, reuse_geometry, out, settings, options, bar, sound)
@@ -234,11 +250,20 @@ def encode_input(
 
 
 def _check(
-    source: Path, out: Path, kind: str, options: TrainOptions, tracks: str | None, reuse_geometry: Path | None
+    source: Path,
+    out: Path,
+    kind: str,
+    settings: EncodeSettings,
+    options: TrainOptions,
+    tracks: str | None,
+    reuse_geometry: Path | None,
 ) -> None:
     """Raises a UsageError where the options of `encode_input` contradict each other, or what `source` holds."""
-    if options.gop < 1:
-        raise UsageError(f"--gop {options.gop} is out of range, expected at least 1 frame in a group")
+    from ..train.settings import train_settings
+
+    train_settings(options.preset, settings.quality, motion=options.motion, gop=options.gop)  # checks them, for splats
+    if settings.quality is not None and settings.bitrate is not None:
+        raise UsageError("--quality and --bitrate exclude each other: leave one of them away")
     if out.suffix != ".gsv":
         raise UsageError(f"{out}: the output must be named *.gsv")
     if kind == "splats" and options.cluster:

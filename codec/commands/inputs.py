@@ -75,9 +75,14 @@ def open_stream_of_frames(path: Path, tracks: Sequence[str] | None = None) -> St
     """As `open_stream_warning`, a stream with at least one whole frame.
 
     Raises:
-        UsageError: it has none.
+        UsageError: it has none, or shows none of them.
     """
     stream = open_stream_warning(path, tracks)
     if not stream.frame_count:
+        if stream.groups:
+            raise UsageError(
+                f"{stream.name} shows no frame: its tracks are hidden or end before the scene begins; show one with "
+                f"--track NAME:show:offset=0"
+            )
         raise UsageError(f"{stream.name} has no whole frame, expected at least one group; encode it (further) first")
     return stream

@@ -29,14 +29,19 @@ def mux(
     for text in inputs:
         name, _, file = ("", "", text) if Path(text).exists() else text.rpartition("=")
         opened = open_tracks(Path(file))
+        if name and len(opened.tracks) > 1:
+            raise UsageError(
+                f"{text}: the file has {len(opened.tracks)} tracks, expected one for the name {name!r}; --track "
+                f"OLD:name=NEW names them"
+            )
         for t in opened.tracks:
-            own = checked_name(name) if name and len(opened.tracks) == 1 else t.placement.name or Path(file).stem
+            own = checked_name(name) if name else t.placement.name or Path(file).stem
             tracks.append(Track(t.stream, replace(t.placement, name=own)))
-    names = [t.placement.name for t in tracks]
+    scene = place(Scene(tracks, str(out)), track)
+    names = [t.placement.name for t in scene.tracks]
     for name in names:
         if names.count(name) > 1:
             raise UsageError(f"two tracks are named {name!r}; name them: gscodec mux left=a.gsv right=b.gsv -o c.gsv")
-    scene = place(Scene(tracks, str(out)), track)
     plans = [TrackPlan.of(t) for t in scene.tracks]
     for plan in plans[1:]:
         name, up = plan.placement.name, plan.config["up"]
@@ -47,5 +52,4 @@ def mux(
         if plan.has_sound:
             stdout.print(f"a scene has the sound of its first track; that of {name} is left out")
     size = write_tracks(out, plans)
-    names = [t.placement.name for t in scene.tracks]
     stdout.print(f"{out}: {', '.join(names)}; {scene.frame_count} frames, {size} bytes")

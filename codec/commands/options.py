@@ -30,4 +30,4 @@ Quality = Annotated[
     float | None, typer.Option(help="0 (small) to 100 (fine).", show_default="as the capture needs; 50 for splats")
 ]
 
-stdout = Console(soft_wrap=True, highlight=False)
+stdout = Console(soft_wrap=True, highlight=False, markup=False, emoji=False)  # prints names as they are

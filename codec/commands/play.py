@@ -25,12 +25,15 @@ def play(
     track: Tracks = None,
 ) -> None:
     """Play a stream in the browser. Needs no GPU; Ctrl-C ends it."""
+    part = stream.with_name(stream.name + ".part")
+    if not stream.exists() and part.exists():  # it is being written
+        stream = part
     with TemporaryDirectory() as folder:
         shown = _placed(stream, Path(folder), track) if track else stream
         if export:
             from gscodec.player.export import export_page
 
-            stdout.print(export_page(shown, export), markup=False)
+            stdout.print(export_page(shown, export))
             return
         from gscodec.player.play import play_stream
 

@@ -20,7 +20,7 @@ from ..errors import CaptureError, UsageError, require
 from ..fingerprint import inputs, program
 from ..frame_range import frame_range
 from ..model.camera import Calibration, Camera
-from ..model.gaussians import GOP
+from ..model.gaussians import GOP, RANDOM_ACCESS
 from ..model.parametric_group import ParametricGroup
 from ..progress import Bar
 from .inputs import open_frames, open_tracks
@@ -46,11 +46,11 @@ def encode_reusing(
     Raises:
         UsageError, CaptureError, BitstreamError: see the message.
     """
-    _check(settings, options)
+    _check(kind, settings, options)
     stream = _only_track(old)
     if out.exists() and out.samefile(old):
         raise UsageError(f"{out}: the output is the stream whose geometry is reused; name another file")
-    made_by = {"program": program(), "input": inputs(source), "settings": asdict(settings)}
+    made_by = {"program": program(), "input": inputs(source, out), "settings": asdict(settings)}
     made_by["settings"] |= {"frames": options.frames, "reuse_geometry": inputs(old)}
     more = {"cameras": lambda _: stream.cameras}
     if kind == "splats":
@@ -66,14 +66,17 @@ def encode_reusing(
     return encode_recolored(stream, colors, writer, settings, on_group=on_group, **more)
 
 
-def _check(settings: EncodeSettings, options: TrainOptions) -> None:
-    """Raises UsageError for options that would change the geometry."""
+def _check(kind: str, settings: EncodeSettings, options: TrainOptions) -> None:
+    """Raises UsageError for options that would change the geometry, or refine the colours of splats."""
+    if kind == "splats" and settings.refine:
+        raise UsageError(f"--refine {settings.refine}: colours are refined by the pictures of a capture; leave it away")
     usual = TrainOptions(PRESET, None, GOP)
     given = {
         "--quality": settings.quality is not None,
         "--bitrate": settings.bitrate is not None,
         "--layers": settings.layers is not None,
         "--keep-all": settings.keep_all,
+        "--random-access": settings.random_access != RANDOM_ACCESS,
         "--ray": options.cluster is not None,
         "--rig": options.rig is not None,
         **{f"--{n}": getattr(options, n) != getattr(usual, n) for n in ("preset", "gop", "motion")},

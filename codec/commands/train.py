@@ -62,7 +62,7 @@ def train_to_folder(
     work, unfinished = folder / "work", folder / "unfinished.json"
     settings = {"frames": options.frames, "random_access": random_access, "training": asdict(recipe)}
     settings |= options.fingerprint()
-    made_by = {"program": program(), "input": inputs(source), "settings": settings}
+    made_by = {"program": program(), "input": inputs(source, folder), "settings": settings}
     training = {
         "capture": str(source.resolve()),
         "range": options.frames,

@@ -54,4 +54,4 @@ def _coefficients(attribute: str, t: QuantizedTrajectories) -> np.ndarray:
     c = t.coefficients.astype(np.float32) * np.float32(t.step)
     if not BY_NAME[attribute].decorrelated:
         return c
-    return (TO_RGB.astype(np.float32) @ c.reshape(len(c), -1, 3, c.shape[2])).reshape(c.shape)
+    return (TO_RGB.astype(np.float32) @ c.reshape(len(c), c.shape[1] // 3, 3, c.shape[2])).reshape(c.shape)

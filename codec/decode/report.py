@@ -56,7 +56,7 @@ def describe(stream: Stream) -> dict:
         "cameras": [c["name"] for c in stream.config["cameras"]],
         "sound": sound,
         "complete": stream.complete,
-        "units": {n: {"bytes": b, "share": b / total, "bits_per_gaussian": per[n]} for n, b in units.items()},
+        "units": {n: {"bytes": b, "share": b / max(total, 1), "bits_per_gaussian": per[n]} for n, b in units.items()},
         "layers": [{"bytes": layers[k]} for k in sorted(layers)],
         "per_group": groups,
     }

@@ -183,5 +183,5 @@ def appearance(group: ParametricGroup, order: np.ndarray) -> tuple[dict, dict]:
 
 def _decorrelated(c: np.ndarray) -> np.ndarray:
     """[K, C, N] of RGB triples -> of Y, Co, Cg."""
-    triples = c.reshape(len(c), -1, 3, c.shape[2])
+    triples = c.reshape(len(c), c.shape[1] // 3, 3, c.shape[2])
     return (TO_YCOCG.astype(c.dtype) @ triples).reshape(c.shape)

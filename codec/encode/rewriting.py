@@ -22,6 +22,6 @@ def sound_of(stream: Stream) -> GroupSound | None:
 
 
 def writer_like(stream: Stream, out: Path, made_by: dict, audio: AudioTrack | GroupSound | None) -> StreamWriter:
-    """A writer of the file `out` with the head of `stream` and with other sound."""
-    config = {k: v for k, v in stream.config.items() if k not in ("track", "placement", "audio")}
+    """A writer of the file `out` with the head and the placement of `stream`, and with other sound."""
+    config = {k: v for k, v in stream.config.items() if k not in ("track", "audio")}
     return StreamWriter(out, config, made_by, audio)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from ..errors import UsageError
@@ -211,8 +212,8 @@ class EncodeSettings:
     def __post_init__(self):
         if self.quality is not None and not 0 <= self.quality <= 100:
             raise UsageError(f"--quality {self.quality:g} is out of range, expected 0 (small) to 100 (fine)")
-        if self.bitrate is not None and not self.bitrate > 0:
-            raise UsageError(f"--bitrate {self.bitrate:g} is out of range, expected bits per second above 0")
+        if self.bitrate is not None and not 0 < self.bitrate < math.inf:
+            raise UsageError(f"--bitrate {self.bitrate:g} is out of range, expected finite bits per second above 0")
         if self.random_access < 0:
             raise UsageError(f"--random-access {self.random_access} is out of range, expected 0 frames or more")
         if self.layers is not None and not 1 <= self.layers <= LAYERS_MAX:

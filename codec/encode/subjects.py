@@ -35,14 +35,18 @@ def find_subjects(stream: Stream) -> list[np.ndarray]:
     there are more than `MOST`."""
     reach = None
     found: list[np.ndarray] = []
-    last: tuple[np.ndarray, np.ndarray] | None = None  # means and labels in the frame before
+    last: tuple[np.ndarray, np.ndarray] | None = None  # means and labels in the last frame with Gaussians
     for segment in _segments(stream):
-        reach = reach or _reach(segment[0].means[0])
+        shown = [k for k, g in enumerate(segment) if len(g.identities)]
+        if not shown:
+            found += [np.zeros(0, int) for _ in segment]
+            continue
+        reach = reach or _reach(segment[shown[0]].means[0])
         own = _components(segment, reach)
-        table = _by_size(own) if last is None else _by_place(own[0], segment[0].means[0], *last)
+        table = _by_size(own) if last is None else _by_place(own, segment, *last)
         own = [table[labels] for labels in own]
         found += own
-        last = segment[-1].means[-1], own[-1]
+        last = segment[shown[-1]].means[-1], own[shown[-1]]
     count = max((int(labels.max(initial=0)) for labels in found), default=0) + 1
     return found if count <= MOST else [np.zeros_like(labels) for labels in found]
 
@@ -127,14 +131,14 @@ def _by_size(labels: list[np.ndarray]) -> np.ndarray:
     return rank
 
 
-def _by_place(labels: np.ndarray, means: np.ndarray, before: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """[components] label of most of the nearest Gaussians `before` [M, 3], whose labels are `known` [M]."""
+def _by_place(labels: list[np.ndarray], segment: list[_Group], before: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """[components] label of most of the Gaussians `before` [M, 3], whose labels are `known` [M], that are nearest to
+    the component in the first group that has it; `labels`: the components of the groups."""
     from scipy.spatial import cKDTree
 
-    count = int(labels.max(initial=0)) + 1
-    if not len(labels) or not len(known):
-        return np.zeros(max(count, NEIGHBORS), int)
-    near = known[cKDTree(before).query(means)[1]]
-    votes = np.zeros((count, int(known.max()) + 1), int)
-    np.add.at(votes, (labels, near), 1)
+    count = max(int(own.max(initial=0)) for own in labels) + 1
+    tree, votes = cKDTree(before), np.zeros((count, int(known.max()) + 1), int)
+    for g, own in zip(segment, labels, strict=True):
+        new = ~votes.any(1)[own]
+        np.add.at(votes, (own[new], known[tree.query(g.means[0][new])[1]]), 1)
     return votes.argmax(1)

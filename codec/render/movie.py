@@ -62,7 +62,7 @@ def load_camera(path: Path) -> Camera:
 
 
 def camera_path(stream, camera: str, size: str | None, frames: range) -> Iterator[Camera]:
-    """One camera per frame.
+    """One camera per frame. That of an orbit is placed by the first frame with Gaussians.
 
     Raises:
         UsageError: the camera or the size makes no sense.
@@ -70,7 +70,8 @@ def camera_path(stream, camera: str, size: str | None, frames: range) -> Iterato
     wanted, low_pass = parse_size(size), low_pass_of(stream.cameras)
     if camera == "orbit":
         width, height = wanted or (512, 512)
-        first, near = stream.frame(frames[0]), min((c.near for c in stream.cameras), default=NEAR)
+        first = next((g for g in map(stream.frame, frames) if len(g)), Gaussians.none())
+        near = min((c.near for c in stream.cameras), default=NEAR)
         for t in frames:
             turn = t / (stream.fps * ORBIT_SECONDS)
             yield orbit_camera(first, stream.config["up"], turn, width, height, near, low_pass)
