@@ -149,9 +149,9 @@ def test_eval_against_the_splats(folder):
 def test_render_images_and_video(folder, tmp_path):
     assert run("render", folder / "a.gsv", tmp_path / "png", "--size", "64x48", "--frames", "0:2").returncode == 0
     assert sorted(p.name for p in (tmp_path / "png").iterdir()) == ["000000.png", "000001.png"]
-    assert run("render", folder / "a.gsv", tmp_path / "a.mp4", "--size", "64x48").returncode == 0
-    assert (tmp_path / "a.mp4").stat().st_size > 500
-    assert not list(tmp_path.glob("*.part*"))
+    assert run("render", folder / "a.gsv", tmp_path / "new" / "a.mp4", "--size", "64x48").returncode == 0
+    assert (tmp_path / "new" / "a.mp4").stat().st_size > 500
+    assert not list(tmp_path.rglob("*.part*"))
 
 
 def test_wrong_paths_and_values(folder, tmp_path):
@@ -171,6 +171,7 @@ def test_wrong_paths_and_values(folder, tmp_path):
     fails(run("render", gsv, tmp_path / "o", "--camera", "cam99"), "cam99", "orbit")
     fails(run("render", gsv, tmp_path / "o", "--size", "huge"), "WxH")
     fails(run("render", gsv, tmp_path / "o.avi"), ".mp4")
+    fails(run("render", gsv, tmp_path / "o.mp4", "--size", "1x1"), "at least 2 x 2 pixels")
     fails(run("eval", gsv, folder), "neither a capture nor splats", "looked for")
     cut = (folder / "plys" / "000000.ply").read_bytes()[:-9]
     (tmp_path / "cut.ply").write_bytes(cut)

@@ -46,16 +46,16 @@ def orbit_camera(g: Gaussians, up: str, turn: float, width: int, height: int, ne
     return Camera("orbit", K, look_at(eye, centre, u), width, height, near=near, low_pass=low_pass)
 
 
-def load_camera(path: Path) -> Camera:
-    """A camera from a .json file with K [3, 3], viewmat [4, 4] (world-to-camera, OpenCV), width, height and, if it
-    is known, near (world units).
+def load_camera(path: Path, near: float = NEAR) -> Camera:
+    """A camera from a .json file with K [3, 3], viewmat [4, 4] (world-to-camera, OpenCV), width, height and near (world
+    units; `near` if the file has none).
 
     Raises:
         UsageError: it is not such a file.
     """
     try:
         c = json.loads(Path(path).read_text())
-        K, viewmat, near = np.array(c["K"], float), np.array(c["viewmat"], float), float(c.get("near", NEAR))
+        K, viewmat, near = np.array(c["K"], float), np.array(c["viewmat"], float), float(c.get("near", near))
         return Camera("file", K, viewmat, int(c["width"]), int(c["height"]), near=near)
     except (OSError, ValueError, KeyError, TypeError) as e:
         raise UsageError(f"--camera {path}: expected a JSON object with K, viewmat, width and height ({e})") from None
@@ -68,10 +68,10 @@ def camera_path(stream, camera: str, size: str | None, frames: range) -> Iterato
         UsageError: the camera or the size makes no sense.
     """
     wanted, low_pass = parse_size(size), low_pass_of(stream.cameras)
+    near = min((c.near for c in stream.cameras), default=NEAR)
     if camera == "orbit":
         width, height = wanted or (512, 512)
         first = next((g for g in map(stream.frame, frames) if len(g)), Gaussians.none())
-        near = min((c.near for c in stream.cameras), default=NEAR)
         for t in frames:
             turn = t / (stream.fps * ORBIT_SECONDS)
             yield orbit_camera(first, stream.config["up"], turn, width, height, near, low_pass)
@@ -80,7 +80,7 @@ def camera_path(stream, camera: str, size: str | None, frames: range) -> Iterato
     if camera in known:
         fixed = known[camera]
     elif camera.endswith(".json"):
-        fixed = replace(load_camera(Path(camera)), low_pass=low_pass)
+        fixed = replace(load_camera(Path(camera), near), low_pass=low_pass)
     else:
         names = ", ".join(known) or "none in this file"
         raise UsageError(
@@ -137,6 +137,9 @@ def _write_movie(images, path: Path, fps: float, frames: range, sound: Path | No
     part = path.with_name(path.stem + ".part.mp4")
     first = next(images)
     h, w = first.shape[0] // 2 * 2, first.shape[1] // 2 * 2  # yuv420p has even sides
+    if not h or not w:
+        raise UsageError(f"{path}: a .mp4 has at least 2 x 2 pixels, expected a larger --size")
+    path.parent.mkdir(parents=True, exist_ok=True)
     writer = ffmpeg.write_frames(
         str(part), (w, h), fps=fps, codec="libx264", quality=None, macro_block_size=1, output_params=["-crf", "16"]
     )
