@@ -4,7 +4,7 @@
 // Only @bandwidth and BaseURL of each Representation are read (on-demand profile: one indexed file each). The
 // representation changes at sync groups only, and all files must have the same ones.
 
-import { Source, StreamError } from "./source.js";
+import { Source, StreamError, absolute } from "./source.js";
 
 const SHARE = 0.7; // of the measured link that a representation may use
 const BUSY = 0.8; // share of the time that decoding may take
@@ -18,7 +18,7 @@ export class AdaptiveSource extends EventTarget {
 
   constructor(url) {
     super();
-    this.url = new URL(url, document.baseURI).href;
+    this.url = absolute(url);
   }
 
   async open(create) {
@@ -108,12 +108,22 @@ export class AdaptiveSource extends EventTarget {
     this.decode.set(this.#chosen.get(i), ms);
   }
 
+  // Whether link and device sustain representation k.
+  #fits(k) {
+    const [n, d] = this.config.fps;
+    return this.#files[k].bandwidth < SHARE * this.link && ((this.decode.get(k) ?? 0) * n) / d < 1000 * BUSY;
+  }
+
+  // Whether a better representation than that of the last group is not sustained.
+  get limited() {
+    const better = this.representation + 1;
+    return this.link > 0 && better < this.#files.length && !this.#fits(better);
+  }
+
   // The best sustainable representation: up by one step at a time, down at once.
   #choose() {
-    const [n, d] = this.config.fps;
-    const fits = (k) => this.#files[k].bandwidth < SHARE * this.link && ((this.decode.get(k) ?? 0) * n) / d < 1000 * BUSY;
     let best = 0;
-    while (best < Math.min(this.representation + 1, this.#files.length - 1) && fits(best + 1)) best++;
+    while (best < Math.min(this.representation + 1, this.#files.length - 1) && this.#fits(best + 1)) best++;
     return best;
   }
 

@@ -66,7 +66,8 @@ export function onKeys(host, act) {
     const name = KEYS[e.key.toLowerCase()];
     const inside = e.composedPath()[0];
     if (!name || e.ctrlKey || e.metaKey || e.altKey || inside.localName === "select") return;
-    if (e.key === " " && inside.localName === "button") return; // the button's own key
+    if (e.key === " " && inside.matches("button, [type=checkbox]")) return; // its own key
+    if (/^(Arrow|Home|End)/.test(e.key) && inside.matches(".sound input")) return; // the volume's own keys
     e.preventDefault();
     act(name, e);
   });

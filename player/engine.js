@@ -13,7 +13,7 @@ import { lowPassOf } from "./camera.js";
 import { ALL, AUTO, Native, load } from "./native.js";
 import { LayerChoice } from "./layers.js";
 import { Renderer } from "./renderer.js";
-import { Source } from "./source.js";
+import { LinkError, Source } from "./source.js";
 import { Whole, joined, order, sharing } from "./tiles.js";
 import { Scene, placed, unplaced } from "./tracks.js";
 
@@ -21,6 +21,7 @@ const AHEAD = 10; // seconds of payloads to fetch ahead
 const SETS = 2; // of group workers
 const SHARES_MAX = 4; // workers of a set; the others start when a group has tiles for them
 const RASTER_WORKERS_MAX = 8;
+const AGAIN = 3000; // ms after which a group that could not be fetched is fetched again
 const PIECES_MAX = 100; // of a group in a worker, see SLOTS of player.rs
 
 // A script from another origin cannot be a worker, but a worker may import it. Bundlers detect a worker by this
@@ -39,13 +40,15 @@ export class Engine extends EventTarget {
   // decoded
   static partly = 1 << 20;
   groups = new Map(); // group -> {state: fetching | decoding | ready, header, layers, abort, and the fields below}
+  // asked: `layers` of the engine at its start
   // set: workers that hold it; pieces: number of workers that hold tiles of it; left: orders still to be decoded;
   // order: see tiles.js; content: a Whole or Parts; flags: requested tiles of Parts; orders: number of orders so far;
   // waiting: orders of each worker
   view = null; // () => view of the renderer; null: all tiles; undefined: not known yet. Without it
   // large groups are decoded whole, too; in a scene of several tracks only the host has it
   pose = null; // transform of the track in a scene, see tracks.js
-  failed = new Map(); // group -> message
+  failed = new Map(); // damaged group -> message
+  missed = new Map(); // group that could not be fetched -> {message, again: time of the next try}
   layers; // number of layers of each group to fetch and draw
   choice = new LayerChoice();
   #chosen = new Map(); // sync group -> number of layers, of it and of the groups predicted from it
@@ -86,7 +89,7 @@ export class Engine extends EventTarget {
     this.loading.then((m) => this.closed || this.#connect(m), () => {});
     await this.source.open(async () => Native.create(await this.loading));
     const several = this.source.tracks > 1 || placed(this.source.config);
-    if (several && this.#rasters.length && !this.host && !this.alone) {
+    if (several && this.#rasters.length && !this.host && !this.alone && !this.closed) {
       this.scene = new Scene(this, (track) => new Engine(null, this.source.url, { track, host: this }));
       await this.scene.open((type, detail) => this.#say(type, detail));
     }
@@ -176,6 +179,11 @@ export class Engine extends EventTarget {
     set.slice(0, pieces).forEach((worker, piece) => worker.postMessage({ ...message(piece), group, t: local }));
   }
 
+  // Bytes of all tracks.
+  get received() {
+    return (this.scene?.engines ?? [this]).reduce((n, { source }) => n + source.received, 0);
+  }
+
   get fps() {
     const [n, d] = this.source.config.fps;
     return n / d;
@@ -226,7 +234,7 @@ export class Engine extends EventTarget {
     const next = this.#after(i, loop);
     if (next !== null) decoded.push(next);
     for (const [k, g] of this.groups) {
-      if (!decoded.includes(k)) this.#release(k, g);
+      if (!decoded.includes(k) || g.asked !== this.layers) this.#release(k, g);
       else if (g.flags && g.state === "ready" && !g.left) this.#grow(k, g);
     }
     const busy = [...this.groups.values()].filter((g) => g.state !== "ready").length;
@@ -283,10 +291,10 @@ export class Engine extends EventTarget {
   }
 
   async #decode(i) {
-    if (this.failed.has(i)) return;
+    if (this.failed.has(i) || this.#pauses(i)) return;
     const abort = new AbortController();
     const layers = this.#layersOf(i);
-    const entry = { state: "fetching", layers, abort, left: 0, waiting: [], flags: null };
+    const entry = { state: "fetching", asked: this.layers, layers, abort, left: 0, waiting: [], flags: null };
     this.groups.set(i, entry);
     try {
       const content = (entry.content = await this.#fetch(i, layers, abort.signal));
@@ -305,7 +313,7 @@ export class Engine extends EventTarget {
       this.#share(i, entry, entry.flags);
     } catch (e) {
       if (this.groups.get(i) !== entry || abort.signal.aborted) return;
-      this.#fail(i, e.message);
+      this.#lose(i, e);
     }
   }
 
@@ -331,7 +339,7 @@ export class Engine extends EventTarget {
   // Fetches and decodes the tiles that have come into view.
   async #grow(i, entry) {
     const { content, flags, layers, abort } = entry;
-    if (entry.growing) return;
+    if (entry.growing || this.#pauses(i)) return;
     const more = content.seen(this.sight(), layers).map((seen, j) => seen & ~flags[j]);
     if (!more.includes(1)) return;
     if (entry.orders > PIECES_MAX * entry.pieces) return this.#release(i, entry); // decoded anew, in one piece
@@ -342,7 +350,7 @@ export class Engine extends EventTarget {
       more.forEach((flag, j) => (flags[j] |= flag));
       this.#share(i, entry, more, true);
     } catch (e) {
-      if (this.groups.get(i) === entry && !abort.signal.aborted) this.#fail(i, e.message);
+      if (this.groups.get(i) === entry && !abort.signal.aborted) this.#lose(i, e);
     }
     entry.growing = false;
   }
@@ -384,9 +392,26 @@ export class Engine extends EventTarget {
         seconds += this.source.groups[k].frames / this.fps;
       }
     } catch {
-      // `#decode` reports the error when the group is needed
+      await new Promise((done) => setTimeout(done, AGAIN)); // `#decode` reports the error when the group is needed
     }
     this.prefetching = false;
+  }
+
+  // Group i could not be decoded: it is damaged, or its bytes have not come, which is tried again.
+  #lose(i, e) {
+    if (!(e instanceof LinkError)) return this.#fail(i, e.message);
+    if (!this.ready(i)) this.groups.delete(i);
+    this.missed.set(i, { message: e.message, again: performance.now() + AGAIN });
+    this.#say("missed", { frames: this.#frames(i), message: e.message });
+  }
+
+  #pauses(i) {
+    return performance.now() < this.missed.get(i)?.again;
+  }
+
+  #frames(i) {
+    const g = this.source.groups[i];
+    return `${g.start_frame}–${g.start_frame + g.frames - 1}`;
   }
 
   #fail(i, message) {
@@ -394,9 +419,7 @@ export class Engine extends EventTarget {
     const entry = this.groups.get(i);
     if (entry) this.#release(i, { ...entry, state: "failed", left: 0 });
     this.failed.set(i, message);
-    const g = this.source.groups[i];
-    const frames = `${g.start_frame}–${g.start_frame + g.frames - 1}`;
-    this.#say("damaged", { group: i, frames, message });
+    this.#say("damaged", { group: i, frames: this.#frames(i), message });
   }
 
   #dead(e) {
@@ -433,9 +456,9 @@ export class Engine extends EventTarget {
     } else if (m.type === "packed") {
       this.renderer.onPacked(m);
     } else if (m.type === "failed") {
-      if (m.id !== undefined) this.renderer.drop(m.id);
       if (m.fatal) return this.#dead(m);
-      this.#fail(m.group, m.message);
+      if (m.id === undefined) this.#fail(m.group, m.message); // else a picture or a request: the group is not damaged
+      else this.renderer.drop(m.id, m.message);
     }
   }
 }

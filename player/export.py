@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
 from urllib.parse import quote
 
+from gscodec.atomic_write import part_file
 from gscodec.decode import open_stream
 from gscodec.errors import UsageError
 from gscodec.player.server import FILES, PAGE
@@ -30,10 +30,10 @@ def export_page(path: Path, folder: Path) -> str:
         to = folder / source.name
         if to.exists() and to.samefile(source):
             continue
-        part = to.with_name(to.name + ".part")
-        shutil.copyfile(source, part)
-        os.replace(part, to)
-    address = f"{quote(folder.resolve().name)}/index.html?src={quote(path.name)}"
+        with part_file(to) as part:
+            shutil.copyfile(source, part)
+    src = quote(path.name, safe=" ")  # an address itself
+    address = f"{quote(folder.resolve().name)}/index.html?src={quote(src)}"
     return (
         f'<iframe src="{address}" width="640" height="480" allow="autoplay; fullscreen; xr-spatial-tracking"></iframe>'
     )

@@ -7,12 +7,19 @@ import { AUTO } from "./native.js";
 
 const STALL = 300; // ms without an image until the busy sign appears
 
+export function sentence(text) {
+  const s = text.charAt(0).toUpperCase() + text.slice(1);
+  return /[.!?]$/.test(s) ? s : `${s}.`;
+}
+
 export class Messages {
   #times = []; // of the images of the last second
   #busySince = 0;
   #told = 0; // time at which the text was last set
   #colors; // of the time bar
   #slow = 0; // how often in a row too few images were drawn
+  #frame = 0;
+  #changed = -Infinity; // time at which the frame last changed
 
   constructor(player) {
     this.player = player;
@@ -48,7 +55,7 @@ export class Messages {
     player.$(".time").innerHTML = `${seconds(player.frame)} <small>/ ${seconds(player.frameCount)}</small>`;
     bar.setAttribute("aria-valuetext", `frame ${player.frame} of ${player.frameCount}`);
     this.#paint();
-    this.#tellSlow();
+    this.#tellSlow(now);
     if (!player.$(".stats").hidden) player.$(".stats").textContent = this.#figures();
   }
 
@@ -66,19 +73,20 @@ export class Messages {
     this.#colors = track;
   }
 
-  #tellSlow() {
+  #tellSlow(now) {
     const { player } = this;
+    if (player.frame !== this.#frame) [this.#frame, this.#changed] = [player.frame, now];
     const wanted = Math.min(player.fps * player.speed, 60);
     const drawn = this.#times.length;
-    this.#slow = player.paused || drawn > 0.8 * wanted || !player.$(".busy").hidden ? 0 : this.#slow + 1;
+    const due = !player.paused && now - this.#changed < 1000; // not for one frame, or at the end of a growing file
+    this.#slow = !due || drawn > 0.8 * wanted || !player.$(".busy").hidden ? 0 : this.#slow + 1;
     const text = `This device draws ${drawn} of ${Math.round(wanted)} frames a second.`;
     this.note("slow", this.#slow > 20 ? text : null);
     const { source, layers, choice, groups } = player.engine;
     const shown = groups.get(player.engine.groupOf(player.frame));
     const fewer = layers === AUTO && choice.reason && shown?.layers < shown?.header?.layers;
     this.note("layers", fewer ? `${shown.layers} of ${shown.header.layers} layers: ${choice.reason} no more just now.` : null);
-    const lower = source.quality && source.representation < source.representations - 1;
-    this.note("quality", lower ? `Quality ${source.quality}: the link or this device carries no more just now.` : null);
+    this.note("quality", source.limited ? `Quality ${source.quality}: the link or this device carries no more just now.` : null);
   }
 
   #figures() {
@@ -119,6 +127,11 @@ export class Messages {
 
   damaged({ group, frames, message }) {
     this.note("damage", `Frames ${frames} are damaged and left out (group ${group}: ${message}).`, true);
+  }
+
+  missed({ frames, message }) {
+    this.note("link", null);
+    this.note("fetch", `Frames ${frames} cannot be fetched: ${sentence(message)} Trying again…`, true);
   }
 
   // The player stops; the first failure stays.

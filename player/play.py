@@ -11,7 +11,7 @@ from gscodec.player.server import Server
 
 
 def play_stream(path: Path, *, host: str, port: int, browser: bool, say: Callable[[str], object]) -> None:
-    """Serves `path` and the player until Ctrl-C. A file that is still being written (OUT.gsv.part) plays as it grows.
+    """Serves the file `path` and the player until Ctrl-C. A file that is being written plays as it grows.
 
     Args:
         browser: open the page.
@@ -21,10 +21,6 @@ def play_stream(path: Path, *, host: str, port: int, browser: bool, say: Callabl
         OSError, BitstreamError: the file does not exist or is not a .gsv file.
         UsageError: the address cannot be used.
     """
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    if not path.exists() and part.exists():
-        path = part
     open_stream(path)  # reports a bad file here instead of in the page
     server = Server(path, host=host, port=port)
     say(f"{path} plays at {server.url} (Ctrl-C ends it)")

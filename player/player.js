@@ -11,7 +11,7 @@
 import { Camera, viewFrom } from "./camera.js";
 import { MARKUP, onDrag, onKeys } from "./controls.js";
 import { Engine } from "./engine.js";
-import { Messages } from "./messages.js";
+import { Messages, sentence } from "./messages.js";
 import { ALL, AUTO } from "./native.js";
 import { Resolution } from "./resolution.js";
 
@@ -115,7 +115,7 @@ export class GsvPlayer extends HTMLElement {
 
   get stats() {
     const e = this.engine;
-    return { ...e?.stats, fps: this.#messages.drawn, received: e?.source?.received ?? 0 };
+    return { ...e?.stats, fps: this.#messages.drawn, received: e?.received ?? 0 };
   }
 
   play() {
@@ -127,43 +127,70 @@ export class GsvPlayer extends HTMLElement {
     this.paused = true;
   }
 
-  // Stops at frame t and resolves with {t, view} when its sharp image is on the canvas.
-  show(t) {
+  // Stops at frame t, as soon as the file is open, and resolves with {t, view} when its sharp image is on the canvas.
+  async show(t) {
+    if (!this.#begun) await this.#event("ready", () => true);
+    if (!(Number.isInteger(t) && t >= 0 && t < this.frameCount)) {
+      throw new RangeError(`There is no frame ${t}: expected 0 to ${this.frameCount - 1}.`);
+    }
     this.pause();
     this.#seek(t);
     this.#drawn = "";
     this.#moved = -STILL;
+    const sharp = (d) => d.t === t && d.view.join() === this.#view(true).join();
+    const detail = await this.#event("picture", (d) => this.frame !== t || sharp(d));
+    if (this.frame !== t) throw new Error(`Frame ${t} is not shown: the player has gone to frame ${this.frame}.`);
+    return detail;
+  }
+
+  // The detail of the next event for which right(detail) is true; rejects when the player stops or cannot draw.
+  #event(type, right) {
+    if (!this.$(".error").hidden) return Promise.reject(new Error(this.$(".error p").textContent));
     return new Promise((resolve, reject) => {
-      const seen = ({ detail }) => {
-        if (detail.t !== t || detail.view.join() !== this.#view(true).join()) return;
-        this.removeEventListener("picture", seen);
-        resolve(detail);
-      };
-      this.addEventListener("picture", seen);
-      this.addEventListener("error", (e) => reject(new Error(e.detail)), { once: true });
+      const stop = new AbortController();
+      const on = (name, f) => this.addEventListener(name, f, { signal: stop.signal });
+      on(type, ({ detail }) => right(detail) && (stop.abort(), resolve(detail)));
+      for (const name of ["error", "undrawn"]) on(name, ({ detail }) => (stop.abort(), reject(new Error(detail))));
     });
   }
 
   // Opening and closing
 
   async #open() {
+    const src = this.getAttribute("src");
     this.#close();
     this.$(".error").hidden = true;
     this.$(".notes").replaceChildren();
-    this.$(".busy").hidden = false;
+    this.$(".busy").hidden = !src;
     Object.assign(this, { camera: null, header: null, paused: true, shown: null });
     [this.#position, this.#drawn, this.#begun] = [0, "", false];
     this.#resolution.reset();
-    const engine = (this.engine = new Engine(this.$("canvas"), this.getAttribute("src")));
+    this.#list(null);
+    if (!src) return;
+    try {
+      this.engine = new Engine(this.$("canvas"), src);
+    } catch (e) {
+      return this.#messages.fail("This file cannot be played", e.message);
+    }
+    const { engine } = this;
     engine.layers = this.#layers;
     engine.view = () => (engine.gpu?.head ? null : this.camera ? this.#view(true) : undefined);
     const { source } = engine;
     const on = (target, type, f) => target.addEventListener(type, (e) => this.engine === engine && f(e.detail));
     on(engine, "damaged", (d) => this.#messages.damaged(d));
+    on(engine, "missed", (d) => this.#messages.missed(d));
+    on(engine, "undrawn", (why) => {
+      this.#messages.note("draw", `The picture cannot be drawn (${why}).`, true);
+      this.dispatchEvent(new CustomEvent("undrawn", { detail: why }));
+    });
     on(engine, "nogpu", (why) => this.#messages.note("gpu", `The GPU cannot be used (${why}): the CPU draws.`));
     on(engine, "fatal", (message) => this.#messages.fail("The player has stopped", `${message}.`));
     on(engine, "bounds", () => this.#begin(engine));
-    on(engine, "decoded", ({ header }) => ((this.header = header), this.#begin(engine)));
+    on(engine, "decoded", ({ header }) => {
+      this.header = header;
+      this.#messages.note("fetch", null);
+      this.#begin(engine);
+    });
     on(engine, "picture", (detail) => this.#pictured(detail));
     on(engine, "silent", (why) => this.#messages.note("sound", `The sound cannot be played (${why}).`));
     on(source, "retry", (why) => this.#messages.note("link", `Connection lost (${why}). Trying again…`, true));
@@ -204,8 +231,8 @@ export class GsvPlayer extends HTMLElement {
   #grown() {
     const { source } = this.engine;
     this.$(".seek input").max = Math.max(this.frameCount - 1, 0);
-    const unfinished = source.settled ? "The file is unfinished: these are the frames it has." : "Live: the file is still being written.";
-    this.#messages.note("live", source.complete ? null : unfinished);
+    const settled = "The file has stopped growing: these are the frames it has.";
+    this.#messages.note("live", source.complete ? null : source.settled ? settled : "Live: the file is still being written.");
   }
 
   // Begins when the content of the first frame is decoded; makes the camera when the bounds are known.
@@ -254,7 +281,7 @@ export class GsvPlayer extends HTMLElement {
     if (!engine?.source?.groups.length || !this.$(".error").hidden) return;
     const { scene } = engine;
     let group = engine.groupOf(this.frame);
-    if (!scene && engine.failed.has(group)) group = this.#passOver(group);
+    if (scene ? scene.lost : engine.failed.has(group)) group = this.#passOver(group);
     if (group === null) return;
     if (scene) scene.want(this.frame, this.#loops);
     else engine.want(group, this.#loops);
@@ -331,6 +358,7 @@ export class GsvPlayer extends HTMLElement {
     const { engine } = this;
     if (!this.shown) requestAnimationFrame(() => setTimeout(() => this.engine === engine && this.#render())); // after the first paint
     this.shown = detail;
+    this.#messages.note("draw", null);
     this.#messages.pictured(now);
     this.dispatchEvent(new CustomEvent("picture", { detail }));
     if (!this.paused) this.#resolution.adapt(now);
@@ -415,11 +443,6 @@ export class GsvPlayer extends HTMLElement {
     };
     actions[name]?.();
   }
-}
-
-function sentence(text) {
-  const s = text.charAt(0).toUpperCase() + text.slice(1);
-  return /[.!?]$/.test(s) ? s : `${s}.`;
 }
 
 customElements.define("gsv-player", GsvPlayer);

@@ -14,7 +14,7 @@ export class Renderer {
   #closed = false;
 
   // rasters: number of raster workers; stats: gets project, blend and gaussians; divide(load): ends of bands of about
-  // the same load; say(type, detail): events picture, nogpu, fatal
+  // the same load; say(type, detail): events picture, undrawn, nogpu, fatal
   constructor(canvas, { rasters, stats, divide, say }) {
     Object.assign(this, { canvas, rasters, stats, divide, say });
     this.context = canvas?.getContext("2d", { alpha: false });
@@ -96,9 +96,9 @@ export class Renderer {
     this.#load = sum.load;
   }
 
-  // The group worker has failed to draw an image.
-  drop(id) {
-    this.#images.delete(id);
+  // A group worker has failed to draw an image.
+  drop(id, why) {
+    if (this.#images.delete(id)) this.say("undrawn", why);
   }
 
   // A group worker has packed its Gaussians of an image for the GPU.

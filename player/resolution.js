@@ -23,7 +23,7 @@ export class Resolution {
   // [width, height]; `sharp`: at full resolution.
   size(sharp) {
     const { player } = this;
-    const fixed = /^(\d+)x(\d+)$/.exec(player.getAttribute("size") ?? "");
+    const fixed = /^0*([1-9]\d*)x0*([1-9]\d*)$/.exec(player.getAttribute("size") ?? "");
     if (fixed) return [Number(fixed[1]), Number(fixed[2])];
     const stage = player.$(".stage");
     const ratio = Math.min(devicePixelRatio || 1, 2);

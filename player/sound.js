@@ -10,6 +10,7 @@ const OFF = 0.01; // seconds from the position of the page above which sound sta
 const DELAY_OFF = 0.02; // change of `delay` in seconds above which sound starts anew
 const SETTLE = 4; // samples of the group before, for the decoder to settle
 const KEPT = 40; // decoded chunks
+const AGAIN = 3000; // ms until a group that could not be fetched is fetched again
 
 const u32 = (...words) => words.flatMap((v) => [24, 16, 8, 0].map((n) => (v >>> n) & 255));
 const text = (s) => [...s].map((c) => c.charCodeAt());
@@ -39,6 +40,7 @@ export class Sound {
   #last = null; // time of the context at the last `passed`
   #nodes = new Set();
   #chunks = new Map(); // group -> promise of the result of #decode
+  #fetching = false; // a group that no picture needs
   #closing = new AbortController();
 
   // player: its bar, and its attributes `muted` and `volume`
@@ -94,11 +96,15 @@ export class Sound {
     return before === null || this.#last === null ? null : Math.min(Math.max(this.#last - before, 0), 0.25);
   }
 
+  // Seconds until a loop starts anew.
+  get #length() {
+    return (this.engine.scene ?? this.engine.source).frameCount / this.engine.fps;
+  }
+
   // Seconds by which the sound, at a time of the context, is ahead of second `t` of the video.
   #before(t, heard) {
-    const { source, fps } = this.engine;
-    const [off, length] = [this.#at.t + (heard - this.#at.heard) * this.#at.speed - t, source.frameCount / fps];
-    return this.#at.loops ? off - length * Math.round(off / length) : off;
+    const off = this.#at.t + (heard - this.#at.heard) * this.#at.speed - t;
+    return this.#at.loops ? off - this.#length * Math.round(off / this.#length) : off;
   }
 
   // Follows the page, which was at `frame` (with a fraction) at the last `passed`; plays: whether it plays.
@@ -114,10 +120,20 @@ export class Sound {
 
   #schedule(at, { groups }, fps) {
     const until = at.t + (this.#last - at.heard + AHEAD) * at.speed;
-    while (at.next < groups.length && groups[at.next].start_frame / fps + at.base < until && this.engine.source.has(at.next)) {
+    while (at.next < groups.length && groups[at.next].start_frame / fps + at.base < until) {
+      if (!this.engine.source.has(at.next)) return this.#fetch(at.next);
       if (this.engine.source.sound(at.next)) this.#play(at, at.next, at.base);
-      if (++at.next === groups.length && at.loops) [at.next, at.base] = [0, at.base + this.engine.source.frameCount / fps];
+      if (++at.next === groups.length && at.loops) [at.next, at.base] = [0, at.base + this.#length];
     }
+  }
+
+  // Fetches group i for its sound, where the first track of a scene is not shown.
+  async #fetch(i) {
+    const { scene, source, groups } = this.engine;
+    if (!scene || groups.has(i) || this.#fetching) return;
+    this.#fetching = true;
+    await source.payload(i, this.#closing.signal, 1).catch(() => new Promise((done) => setTimeout(done, AGAIN)));
+    this.#fetching = false;
   }
 
   #seen(t) {

@@ -25,6 +25,18 @@ const sleep = (ms, signal) =>
 
 export class StreamError extends Error {}
 
+// The bytes do not come: the file itself may be whole.
+export class LinkError extends StreamError {}
+
+// An address in the page as an absolute one.
+export function absolute(url) {
+  try {
+    return new URL(url, document.baseURI).href;
+  } catch {
+    throw new StreamError(`"${url}" is not an address: expected one such as https://host/movie.gsv.`);
+  }
+}
+
 export class Source extends EventTarget {
   groups = []; // {start_frame, frames, sync, offset, size, indexed, ends}: of the payload, of the fragment if `indexed`
   // ends: bytes of it that end with each layer, if that is known
@@ -44,7 +56,7 @@ export class Source extends EventTarget {
   constructor(url, track = 0) {
     super();
     this.track = track;
-    this.url = new URL(url, document.baseURI).href;
+    this.url = absolute(url);
   }
 
   get frameCount() {
@@ -67,7 +79,9 @@ export class Source extends EventTarget {
     while (!d.config && (await this.#more())) d = this.native.describe();
     if (!d.config) throw new StreamError("The file ends before its header does.");
     [this.config, this.tracks] = [d.config, d.tracks];
-    if (d.index.length && !this.#whole) {
+    const [told, first] = [d.index[0], d.groups[0] ?? d.pending]; // the fragment, if it is in the bytes so far
+    const agrees = !first || (first.start_frame === told?.start_frame && first.frames === told.frames);
+    if (told && agrees && !this.#whole) {
       this.#head = head;
       this.#useIndex(d.index, d.layers);
     } else {
@@ -253,7 +267,7 @@ export class Source extends EventTarget {
         if (signal?.aborted || this.#closing.signal.aborted) throw e;
         if (e instanceof StreamError) throw e;
         if (at > before) [since, wait] = [performance.now(), 250];
-        if (performance.now() - since > PATIENCE) throw new StreamError(`The connection is lost: ${e.message}.`);
+        if (performance.now() - since > PATIENCE) throw new LinkError(`The connection is lost: ${e.message}.`);
         this.#say("retry", e.message);
         await sleep(wait, signal);
         wait = Math.min(2 * wait, 4000);
@@ -308,7 +322,7 @@ export class Source extends EventTarget {
     }
     if (status >= 500 || status === 408 || status === 429) throw new Error(`the server answered ${status}`);
     if (status !== 200 && status !== 206) {
-      throw new StreamError(status === 404 ? "The file was not found on the server." : `The server answered ${status} ${response.statusText}.`);
+      throw new LinkError(status === 404 ? "The file was not found on the server." : `The server answered ${status} ${response.statusText}.`);
     }
     const range = /bytes (\d+)-(\d+)\/(\d+|\*)/.exec(response.headers.get("content-range") ?? "");
     if (range && range[3] !== "*") this.total = Number(range[3]);

@@ -35,7 +35,8 @@ export function unplaced(view, pose) {
 }
 
 export class Scene {
-  tracks = []; // {engine, name, hidden}
+  engines = []; // of all tracks, from the start
+  tracks = []; // {engine, name, hidden} of those that are open
   opened = false;
 
   // host: the engine of the first track; create(k): that of track k
@@ -46,14 +47,16 @@ export class Scene {
 
   // Resolves when all tracks are open, or lost. say(type, detail): events of the host.
   async open(say) {
-    const engines = [this.host, ...Array.from({ length: this.host.source.tracks - 1 }, (_, i) => this.create(i + 1))];
+    this.engines = [this.host, ...Array.from({ length: this.host.source.tracks - 1 }, (_, i) => this.create(i + 1))];
     const add = (engine, i) => {
       const { name, hidden } = engine.source.config.placement;
       return { engine, name: name || `Track ${i + 1}`, hidden };
     };
-    const opened = engines.map(async (engine, i) => {
+    const opened = this.engines.map(async (engine, i) => {
       if (!i) return add(engine, i);
-      for (const type of ["damaged", "fatal", "bounds", "decoded"]) engine.addEventListener(type, (e) => say(type, e.detail));
+      for (const type of ["damaged", "missed", "fatal", "bounds", "decoded"]) {
+        engine.addEventListener(type, (e) => say(type, e.detail));
+      }
       try {
         await engine.open();
         return add(engine, i);
@@ -68,11 +71,11 @@ export class Scene {
   }
 
   close() {
-    for (const { engine } of this.tracks) if (engine !== this.host) engine.close();
+    for (const engine of this.engines) if (engine !== this.host) engine.close();
   }
 
   show(layers) {
-    for (const { engine } of this.tracks) if (engine !== this.host) engine.show(layers);
+    for (const engine of this.engines) if (engine !== this.host) engine.show(layers);
   }
 
   // Time of frame t of the scene in units of the timescale of a track.
@@ -116,11 +119,25 @@ export class Scene {
     }
   }
 
-  // {engine, t} of the tracks that frame t shows; without any the first track, whose workers draw the background.
+  // {engine, t} of the tracks that frame t shows; without any a whole group, whose workers draw the background.
   #wanted(t) {
     if (!this.opened) return [{ engine: this.host, t: 0 }];
     const shown = this.#shown(t);
-    return shown.length ? shown : [{ engine: this.host, t: 0, pose: NOTHING }];
+    return shown.length ? shown : [{ ...(this.#whole() ?? { engine: this.host, t: 0 }), pose: NOTHING }];
+  }
+
+  // {engine, t} of the first group that is not damaged.
+  #whole() {
+    for (const { engine } of this.tracks) {
+      const group = engine.source.groups.find((_, i) => !engine.failed.has(i));
+      if (group) return { engine, t: group.start_frame };
+    }
+    return null;
+  }
+
+  // Whether all groups of all tracks are damaged.
+  get lost() {
+    return this.opened && !this.#whole();
   }
 
   // Whether everything that frame t shows is decoded.

@@ -63,6 +63,7 @@ class Trouble(http.server.BaseHTTPRequestHandler):
     log: list
     drop_after: int | None = None  # bytes of a body after which the connection is cut
     fail_first = 0
+    refused = False
     ranges = True
     kind = "video/mp4"
     rate: int | None = None  # bytes a second
@@ -79,6 +80,11 @@ class Trouble(http.server.BaseHTTPRequestHandler):
         if cls.fail_first > 0:
             cls.fail_first -= 1
             self.send_error(503)
+            return
+        if cls.refused:
+            self.send_response(403)
+            self.send_header("Content-Length", "0")
+            self.cors()
             return
         size = len(self.data)
         try:

@@ -1,6 +1,7 @@
 """The npm package: packed, installed and imported; frames and pictures against those of decoder and renderer."""
 
 import base64
+import dataclasses
 import functools
 import http.server
 import json
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playing import FPS, GROUPS, LENGTH, Static, camera_of, pixels, psnr, sequence, serving
+from playing import FPS, GROUPS, LENGTH, Static, camera_of, cameras, pixels, psnr, sequence, serving
 from synthetic import encode_sequence
 
 from gscodec.decode import open_scene, open_stream
@@ -172,6 +173,26 @@ def test_errors_are_told(browser, address):
     assert told[1] == "The file was not found on the server."
 
 
+def test_a_drawing_that_fails_is_told_and_the_stream_goes_on(browser, address):
+    browser.goto(address)
+    script = f"""{OPEN}
+        const canvas = document.querySelector("canvas");
+        const told = [];
+        for (const options of [{{}}, {{ canvas }}]) {{
+            const stream = await GsvStream.open("a.gsv", options);
+            told.push(await stream.draw(1, stream.camera().view(0, 0)).catch((e) => e.message));
+            told.push((await stream.frame(1)).count);
+            stream.close();
+        }}
+        return told;
+    }})"""
+    no_canvas, count, empty, again = browser.eval(script)
+    assert "no canvas" in no_canvas
+    assert "0 x 0 pixels is empty" in empty
+    assert count == again > 0
+
+
+LOW_PASS = 2.0  # of the cameras of a stream, unlike the default
 SCENE = """Promise.all([import("three"), import("gscodec/three")]).then(async ([three, { GsvObject }]) => {
     three.ColorManagement.enabled = false;
     const canvas = document.querySelector("canvas");
@@ -179,14 +200,12 @@ SCENE = """Promise.all([import("three"), import("gscodec/three")]).then(async ([
     renderer.setSize(200, 150, false);
     renderer.setClearColor(new three.Color(0.2, 0.3, 0.5), 1);
     const [scene, camera] = [new three.Scene(), new three.PerspectiveCamera(45, 200 / 150, 0.01, 100)];
-    const exact = { preBlurAmount: 0.3, blurAmount: 0, minAlpha: 1 / 255, maxStdDev: 3.33 };
-    const spark = new three.SparkRenderer({ renderer, ...exact });
-    const object = new GsvObject({ src: "z.gsv", autoplay: false, upright: UPRIGHT });
-    scene.add(spark, object);
+    const object = await new GsvObject({ src: "z.gsv", autoplay: false, upright: UPRIGHT }).ready;
+    const exact = { preBlurAmount: object.lowPass, blurAmount: 0, minAlpha: 1 / 255, maxStdDev: 3.33 };
+    scene.add(new three.SparkRenderer({ renderer, ...exact }), object);
     camera.position.set(0.5, 1, 3);
     camera.lookAt(0, 0, 0);
     camera.updateMatrixWorld(true);
-    await object.ready;
     object.playback.position = 8;
     window.scene = { object, draw: () => (renderer.render(scene, camera), canvas), shown: null };
     object.addEventListener("frame", (e) => (window.scene.shown = e.frame));
@@ -204,7 +223,10 @@ def scene_comes_to(browser, want) -> bool:
 
 
 def test_a_three_js_scene_shows_it(gl_browser, address, app):
-    config = stream_config(fps=FPS, sh_degree=1, gaussians=400, frames=LENGTH, up="z", background=(0.2, 0.3, 0.5))
+    trained = [dataclasses.replace(camera, low_pass=LOW_PASS) for camera in cameras()]
+    config = stream_config(
+        fps=FPS, sh_degree=1, gaussians=400, frames=LENGTH, up="z", background=(0.2, 0.3, 0.5), cameras=trained
+    )
     encode_sequence(sequence(sh_count=3), app / "z.gsv", config, EncodeSettings(quality=80))
     stream = open_stream(app / "z.gsv")
     for upright in ("false", "true"):  # the axes of the stream, or y up
@@ -214,7 +236,7 @@ def test_a_three_js_scene_shows_it(gl_browser, address, app):
             view = view @ np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
         view = np.diag([1.0, -1, -1, 1]) @ view  # OpenGL -> OpenCV
         focal = 75 / np.tan(np.radians(22.5))
-        camera = camera_of([200, 150, focal, focal, 100, 75, *view[:3].ravel(), 0.01, 0.3])
+        camera = camera_of([200, 150, focal, focal, 100, 75, *view[:3].ravel(), 0.01, LOW_PASS])
         want = render_image(stream.frame(8), camera, tuple(stream.config["background"]))
         assert want.std() > 10
         assert scene_comes_to(gl_browser, want), upright

@@ -90,6 +90,20 @@ def test_background_and_controls_of_a_page_that_embeds_it(browser, server):
     assert browser.eval(f"getComputedStyle({part('.bar')}).display") == "none"
 
 
+def test_the_address_sets_the_attributes_of_the_player_only(browser, server):
+    load(browser, server.url, onfocus="document.title='owned'", muted="off", autoplay="off", size="0x0")
+    assert set(browser.eval(f"{PLAYER}.getAttributeNames()")) == {"loop", "size", "src", "tabindex"}
+    assert browser.eval("document.title") == "gscodec player"
+
+
+def test_show_waits_for_the_file_and_refuses_what_it_does_not_have(browser, server):
+    load(browser, server.url, size="64x64", autoplay="off")
+    assert browser.eval(f"({PLAYER}.setAttribute('src', 'stream.gsv?2'), {PLAYER}.show(7).then((d) => d.t))") == 7
+    for t in (-1, GROUPS * LENGTH):
+        told = browser.eval(f"{PLAYER}.show({t}).catch((e) => e.message)")
+        assert told == f"There is no frame {t}: expected 0 to {GROUPS * LENGTH - 1}."
+
+
 def test_it_plays_loops_and_ends(browser, server):
     load(browser, server.url, size="160x120")
     browser.wait(f"{PLAYER}.frame > {LENGTH + 2}")
@@ -226,6 +240,15 @@ def test_predicted_groups_and_their_layers(browser, server, other, tmp_path):
     browser.eval(f"{PLAYER}.setAttribute('layers', 'all')")
     for t in (2 * LENGTH + 3, 0, 4 * LENGTH):
         compare(stream, t)
+    browser.eval(f"""(() => {{
+        {PLAYER}.setAttribute('layers', '1');
+        const post = Worker.prototype.postMessage;
+        Worker.prototype.postMessage = function (m, ...rest) {{
+            post.call(this, m, ...rest);
+            if (m?.type === "decode" && m.group === 2) {PLAYER}.setAttribute('layers', 'all');
+        }};
+    }})()""")
+    compare(stream, 2 * LENGTH + 3)  # the number of layers changes while the group is decoded
     assert browser.errors == []
 
 

@@ -11,6 +11,10 @@ import pytest
 from playing import PLAYER, load, notes, part, serving
 from sounding import LOW, RISE, tone_stream, write_tone
 
+from gscodec.decode import open_scene
+from gscodec.decode.scene import Track
+from gscodec.encode.tracks import TrackPlan, write_tracks
+from gscodec.model.placement import Placement
 from gscodec.player.server import Server
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
@@ -150,6 +154,21 @@ def test_volume_and_mute(page):
     slider = part(".sound input")
     browser.eval(f"(({slider}.value = 1), {slider}.dispatchEvent(new Event('input')))")
     browser.wait("loudest() > 0.4")
+    browser.eval(f"{slider}.focus()")
+    browser.key("ArrowLeft")
+    assert browser.eval(f"{slider}.value") == "0.95"
+
+
+def test_the_sound_of_a_hidden_track_plays_once_in_a_longer_scene(page, streams, other, tmp_path):
+    stream = open_scene(streams[0]).tracks[0].stream
+    placements = (Placement("hidden", hidden=True), Placement("late", offset=FPS))
+    write_tracks(tmp_path / "scene.gsv", [TrackPlan.of(Track(stream, p)) for p in placements])
+    url, _ = other((tmp_path / "scene.gsv").read_bytes())
+    browser = page(src=url)
+    seek(browser, 110)
+    browser.wait("loudest() > 0.2")
+    seek(browser, 240)
+    assert browser.wait(f"{PLAYER}.frame > 260 && [loudest()]") == [0]
 
 
 def test_sound_that_the_browser_cannot_decode_costs_the_sound_only(page, streams, other):

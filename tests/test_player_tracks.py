@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from playing import FPS, LENGTH, PLAYER, canvas, load, notes, part, psnr, sequence, show
+from playing import FPS, LENGTH, PLAYER, canvas, error_text, load, notes, part, psnr, sequence, show
 from synthetic import encode_sequence
 
 from gscodec.decode import open_scene
@@ -53,6 +53,7 @@ def test_the_scene_is_that_of_the_renderer(browser, server, other, scene):
     load(browser, server.url, src=url, size="320x200", autoplay="off")
     assert browser.eval(f"{part('.tracks')}.innerText").split() == ["man", "ball"]
     assert browser.eval(f"{PLAYER}.frameCount") == open_scene(scene).frame_count == 60 + 6
+    assert browser.eval(f"{PLAYER}.stats.received > {PLAYER}.engine.source.received"), "of both tracks"
     for t in (0, 7, 25, 35):  # without the ball, with both, after the end of the man
         camera = show(browser, t)
         want = expected(scene, t, camera)
@@ -64,6 +65,9 @@ def test_the_scene_is_that_of_the_renderer(browser, server, other, scene):
             choose(browser, i, name not in hidden)
         show(browser, 20)
         assert psnr(canvas(browser), expected(scene, 20, camera, hidden) if len(hidden) < 2 else blank(scene)) >= 35
+    browser.eval(f"{part('.tracks input')}.focus()")
+    browser.key(" ")
+    assert browser.eval(f"!{part('.tracks input')}.checked && {PLAYER}.paused"), "space is the key of the checkbox"
     assert browser.errors == []
 
 
@@ -82,3 +86,41 @@ def test_damage_to_a_track_leaves_the_other(browser, server, other, scene):
     camera = show(browser, t)
     assert psnr(canvas(browser), expected(scene, t, camera, ["ball"])) >= 35
     assert "damaged" in notes(browser)
+
+
+@pytest.mark.parametrize("groups", [1, None])
+def test_damage_where_nothing_else_is_shown(browser, server, other, scene, groups):
+    """The first group of the first track, before the other one starts; None: all groups of both."""
+    data = bytearray(scene.read_bytes())
+    for track in open_scene(scene).tracks[:groups]:
+        for g in track.stream.groups[:groups]:
+            data[g["offset"] + g["size"] - 5] ^= 0xFF
+    url, _ = other(bytes(data))
+    if groups:
+        load(browser, server.url, src=url, size="64x64")
+        browser.wait(f"{PLAYER}.frame > {LENGTH}")
+        assert f"Frames 0–{LENGTH - 1} are damaged" in notes(browser)
+    else:
+        browser.goto(f"{server.url}?src={url}")
+        assert "None of its groups can be decoded" in error_text(browser)
+
+
+def test_no_worker_outlives_a_scene_that_is_closed_while_it_opens(browser, server, other, scene):
+    load(browser, server.url, size="64x64")
+    url, _ = other(scene.read_bytes(), rate=60_000)
+    script = f"""new Promise((done) => {{
+        const [player, alive] = [{PLAYER}, new Set()];
+        window.Worker = class extends Worker {{
+            constructor(...how) {{ super(...how); alive.add(this); }}
+            terminate() {{ alive.delete(this); super.terminate(); }}
+        }};
+        player.setAttribute("src", "{url}");
+        const look = () => {{
+            if (!player.engine.scene) return setTimeout(look, 5);
+            const {{ opened }} = player.engine.scene;
+            player.remove();
+            done([opened, alive.size]);
+        }};
+        look();
+    }})"""
+    assert browser.eval(script) == [False, 0]

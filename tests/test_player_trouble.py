@@ -3,6 +3,7 @@
 import http.server
 import time
 
+import numpy as np
 import pytest
 from playing import (
     FPS,
@@ -56,6 +57,15 @@ def test_the_element_on_another_page(browser, gsv, other, tmp_path):
     host.shutdown()
 
 
+@pytest.fixture(scope="module")
+def large(tmp_path_factory):
+    """A stream whose groups are larger than the first request."""
+    path = tmp_path_factory.mktemp("large") / "large.gsv"
+    config = stream_config(fps=1, sh_degree=0, gaussians=8000, frames=LENGTH)
+    encode_sequence(sequence(8000), path, config, EncodeSettings(quality=95))
+    return path
+
+
 @pytest.mark.parametrize(("rate", "told", "quality"), [(20_000, 1, 1), (None, 0.05, 2)])
 def test_the_representation_follows_the_rate_of_the_link(browser, server, gsv, other, rate, told, quality):
     """Two qualities of one capture; `rate` in bytes a second, None: unlimited. The manifest gives the bandwidths times
@@ -77,6 +87,10 @@ def test_the_representation_follows_the_rate_of_the_link(browser, server, gsv, o
     browser.wait(f"{PLAYER}.frame > {2 * LENGTH}")
     show(browser, GROUPS * LENGTH - 1)
     assert browser.eval(f"{PLAYER}.engine.source.quality") == f"{quality} of 2"
+    low = f"Object.assign({PLAYER}.engine.source, {{ representation: 0, link: LINK }})"
+    for link, limited in ((1e-9, True), (1e9, False)):
+        browser.eval(low.replace("LINK", str(link)))
+        browser.wait(f"{part('.notes')}.innerText.includes('carries no more') === {str(limited).lower()}")
 
 
 def test_layers_are_left_out_where_the_link_is_slow(browser, server, other, tmp_path):
@@ -104,15 +118,11 @@ def test_a_manifest_of_nothing(browser, server, other):
     assert "names no files" in error_text(browser)
 
 
-def test_a_seek_fetches_what_it_needs(browser, server, other, tmp_path):
+def test_a_seek_fetches_what_it_needs(browser, server, other, large):
     """Groups are larger than the first request: a seek fetches the shown group and, of the others, only the next."""
-    s = sequence(8000)
-    path = tmp_path / "large.gsv"
-    config = stream_config(fps=1, sh_degree=0, gaussians=8000, frames=LENGTH)
-    encode_sequence(s, path, config, EncodeSettings(quality=95))
-    groups = open_stream(path).groups
+    groups = open_stream(large).groups
     assert groups[0]["size"] > 70_000
-    url, handler = other(path.read_bytes())
+    url, handler = other(large.read_bytes())
     load(browser, server.url, src=url, size="64x64", autoplay="off", loop="off")
     browser.eval(f"{PLAYER}.show({4 * LENGTH})")
     asked = [tuple(map(int, value[6:].split("-"))) for value in handler.log]
@@ -122,6 +132,33 @@ def test_a_seek_fetches_what_it_needs(browser, server, other, tmp_path):
     assert 4 in touched
     assert len(asked) < 8
     assert {0, 4} <= touched
+
+
+def test_a_group_that_the_server_refuses_is_fetched_later(browser, server, other, large):
+    url, handler = other(large.read_bytes())
+    load(browser, server.url, src=url, size="64x64", autoplay="off", loop="off")
+    handler.refused = True
+    browser.eval(f"({PLAYER}.show({4 * LENGTH}), null)")
+    browser.wait(f"{part('.notes')}.innerText.includes('cannot be fetched: The server answered 403')")
+    handler.refused = False
+    browser.wait(f"{PLAYER}.shown?.t === {4 * LENGTH}")
+    assert notes(browser) == ""
+
+
+def test_an_index_of_several_fragments_each_is_ignored(browser, server, gsv, other):
+    data = bytearray(gsv.read_bytes())
+    at = data.index(b"sidx") - 4
+    size = int.from_bytes(data[at : at + 4], "big")
+    head, (one, two, *others) = data[at : at + 40], np.frombuffer(data[at + 40 : at + size], ">u4").reshape(-1, 3)
+    head[28:36] = (int.from_bytes(head[28:36], "big") + 12).to_bytes(8, "big")  # first_offset
+    head[:4], head[38:40] = (size - 12).to_bytes(4, "big"), (1 + len(others)).to_bytes(2, "big")
+    references = np.array([[one[0] + two[0], one[1] + two[1], one[2]], *others], ">u4").tobytes()
+    data[at : at + size] = head + references + b"\0\0\0\x0cfree\0\0\0\0"
+    url, _ = other(bytes(data))
+    load(browser, server.url, src=url, size="64x64", autoplay="off")
+    browser.wait(f"{PLAYER}.frameCount === {GROUPS * LENGTH}")
+    show(browser, LENGTH)
+    assert notes(browser) == ""
 
 
 def test_a_server_without_ranges(browser, server, gsv, other):
@@ -150,6 +187,10 @@ def test_a_server_that_is_gone(browser, server):
     assert "not found" in error_text(browser)
     browser.goto(f"{server.url}?src=http://127.0.0.1:9/a.gsv")
     assert "Trying again" in browser.wait(f"{part('.notes')}.innerText")
+    browser.goto(f"{server.url}?src=http://")
+    assert '"http://" is not an address' in error_text(browser)
+    browser.eval(f"{PLAYER}.removeAttribute('src')")
+    assert browser.eval(f"{part('.error')}.hidden && {part('.busy')}.hidden")
 
 
 def test_a_file_that_is_no_stream(browser, server, other):
@@ -219,6 +260,12 @@ def test_a_growing_file(browser, tmp_path, gsv):
             f.write(data[path.stat().st_size : end])
         time.sleep(0.3)
     browser.wait(f"{PLAYER}.frame >= {GROUPS * LENGTH - 1}")
+    faster = (
+        "{ const now = performance.now.bind(performance), t = now(); performance.now = () => t + 20 * (now() - t); }"
+    )
+    browser.eval(faster)
+    browser.wait(f"{part('.notes')}.innerText.includes('has stopped growing')")
+    assert "This device" not in notes(browser)
     s.shutdown()
 
 

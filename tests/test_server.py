@@ -202,6 +202,10 @@ def test_the_command_finds_the_file_that_is_being_written(tmp_path, gsv):
     command = [sys.executable, "-c", code, "play", str(tmp_path / "a.gsv"), "--no-browser"]
     with started(command) as p:
         assert "a.gsv.part plays at http://127.0.0.1:" in p.stdout.readline()
+    with started([*command, "--track", "1:name=b"]) as p:
+        assert "a.gsv.part plays at http://127.0.0.1:" in p.stdout.readline()
+    r = subprocess.run([*command, "--export", str(tmp_path / "page")], capture_output=True, text=True, timeout=60)
+    assert "a.gsv.part cannot be exported under its name: expected a finished stream" in r.stderr
 
 
 def test_the_command_refuses_what_is_no_stream(tmp_path):
@@ -228,6 +232,19 @@ def test_an_exported_folder_is_for_any_static_host(tmp_path, gsv):
         assert (tmp_path / "movies" / "a film.gsv").read_bytes() == gsv.read_bytes()
     with pytest.raises(UsageError, match="finished stream"):
         export_page(tmp_path / "a.gsv.part", tmp_path / "movies")
+    stream = stream.rename(tmp_path / "take #2.gsv")
+    assert '?src=take%20%25232.gsv"' in export_page(stream, tmp_path / "movies"), "the address of the file in a query"
+
+
+def test_an_export_that_fails_leaves_no_part(tmp_path, gsv, monkeypatch):
+    def full(source, to):
+        to.write_bytes(b"half")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("shutil.copyfile", full)
+    with pytest.raises(OSError, match="space"):
+        export_page(gsv, tmp_path / "movies")
+    assert list((tmp_path / "movies").iterdir()) == []
 
 
 def player_build():

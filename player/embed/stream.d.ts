@@ -86,6 +86,8 @@ export class GsvStream {
   readonly bounds: number[];
   /** Middle of the box; packed Gaussians are relative to it. */
   readonly origin: number[];
+  /** Variance of the low-pass filter of rendering from any place, pixels^2: that of the first camera. */
+  readonly lowPass: number;
   /** Whether the first group is decoded again while the last one plays; true at first. */
   loop: boolean;
   /** A new camera that looks at the scene. */
@@ -97,7 +99,10 @@ export class GsvStream {
    * to `origin`; with colours as seen from `eye`.
    */
   packed(t: number, eye?: ArrayLike<number>): Promise<Uint32Array>;
-  /** Draws frame `t` on the canvas, which becomes as large as the view; resolves when the image is there. */
+  /**
+   * Draws frame `t` on the canvas, which becomes as large as the view; resolves when the image is there. Rejects if it
+   * cannot be drawn, or there is no canvas.
+   */
   draw(t: number, view: View): Promise<void>;
   /** Ends its workers and requests. */
   close(): void;

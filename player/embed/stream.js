@@ -1,7 +1,7 @@
 // GsvStream: the frames of a .gsv file for other programs, as arrays, packed for GPU renderers, or drawn on a canvas.
 // The engine of the page decodes; requests are answered one after another.
 
-import { Camera, viewFrom } from "../camera.js";
+import { Camera, lowPassOf, viewFrom } from "../camera.js";
 import { Engine } from "../engine.js";
 import { ALL, AUTO } from "../native.js";
 
@@ -52,6 +52,10 @@ export class GsvStream {
     return [0, 1, 2].map((i) => (bounds[i] + bounds[i + 3]) / 2);
   }
 
+  get lowPass() {
+    return lowPassOf(this.config.cameras);
+  }
+
   // A camera that orbits the scene, as in the page.
   camera() {
     return new Camera(this.bounds, this.config.up, this.config.cameras);
@@ -69,6 +73,9 @@ export class GsvStream {
   }
 
   draw(t, view) {
+    if (!this.#engine.renderer.canvas) {
+      return Promise.reject(new Error("There is no canvas to draw on: open the stream with { canvas }."));
+    }
     return this.#next(t, () => {
       const picture = this.#event("picture");
       this.#engine.draw(t, view);
@@ -100,16 +107,19 @@ export class GsvStream {
   async #ready(t) {
     const engine = this.#engine;
     const group = engine.groupOf(t);
+    engine.missed.delete(group); // each request tries once
     for (;;) {
       if (engine.closed) throw new Error("The stream is closed.");
       if (engine.failed.has(group)) throw new Error(`Frame ${t} is damaged: ${engine.failed.get(group)}.`);
+      const missed = engine.missed.get(group);
+      if (missed) throw new Error(`Frame ${t} cannot be fetched: ${missed.message}`);
       engine.want(group, this.loop);
       if (engine.ready(group)) return;
-      await Promise.race([this.#event("decoded"), this.#event("damaged")]);
+      await Promise.race(["decoded", "damaged", "missed"].map((type) => this.#event(type)));
     }
   }
 
-  // Rejects when the engine has stopped.
+  // Rejects when the engine has stopped, or cannot draw a picture.
   #event(type) {
     const engine = this.#engine;
     return new Promise((resolve, reject) => {
@@ -118,7 +128,7 @@ export class GsvStream {
         engine.addEventListener(name, (e) => (stop.abort(), settle(e.detail)), { signal: stop.signal });
       };
       on(type, resolve);
-      on("fatal", (message) => reject(new Error(message)));
+      for (const name of ["fatal", "undrawn"]) on(name, (message) => reject(new Error(message)));
     });
   }
 

@@ -8,7 +8,7 @@ export interface GsvObjectEventMap extends Object3DEventMap {
 
 /**
  * Plays a .gsv file in a three.js scene that has a SparkRenderer. Units are those of the stream; y is up. Give the
- * SparkRenderer `preBlurAmount: 0.3, blurAmount: 0` to get the image that gscodec draws.
+ * SparkRenderer `preBlurAmount: lowPass, blurAmount: 0` to get the image that gscodec draws.
  */
 export class GsvObject extends Group<GsvObjectEventMap> {
   constructor(options: PlaybackOptions);
@@ -18,6 +18,8 @@ export class GsvObject extends Group<GsvObjectEventMap> {
   /** Box of most Gaussians of the first frame, [x, y, z] in the axes of this object; known when it is ready. */
   low: [number, number, number];
   high: [number, number, number];
+  /** Variance of the low-pass filter that the stream asks for, pixels^2; known when it is ready. */
+  lowPass: number;
   play(): void;
   pause(): void;
   /** Ends its workers and frees its memory. */

@@ -26,7 +26,7 @@ export class GsvObject extends Group {
       const { rows, origin, low, high } = this.playback;
       this.#mesh.position.set(...origin); // packed Gaussians are relative to it
       this.#mesh.quaternion.setFromRotationMatrix(new Matrix4().set(...rows.flatMap((row) => [...row, 0]), 0, 0, 0, 1));
-      return Object.assign(this, { low, high });
+      return Object.assign(this, { low, high, lowPass: this.playback.stream.lowPass });
     });
   }
 

@@ -1,3 +1,3 @@
-// The parts of three.js and Spark that the player uses: bundled into ../spark.js.
+// What the player takes of three.js and Spark: bundled into ../spark.js.
 export { Color, ColorManagement, Group, Matrix4, PerspectiveCamera, Scene, WebGLRenderer } from "three";
 export { PackedSplats, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
