@@ -126,8 +126,8 @@ class Feed:
 
     def numbers(self) -> list[int]:
         """The last number in the name of each image; empty: a video, or there are none."""
-        found = [] if isinstance(self._source, Video) else [re.findall(r"[0-9]+", p.stem) for p in self._source]
-        return [int(n[-1]) for n in found] if all(found) else []
+        found = [] if isinstance(self._source, Video) else [_numbers(p.stem) for p in self._source]
+        return [n[-1] for n in found] if all(found) else []
 
     def name(self, t: int) -> Path:
         """The file that has frame `t`."""
@@ -147,17 +147,17 @@ def feed_of(source: Video | Sequence[Path], masks: Path, depths: DepthImages | N
         stems = [image.stem for image in source]
     there = numbered(masks)
     if there and len(there) != len(stems):
-        by_numbers = {_numbers(m.stem): m for m in there}
-        found = [by_numbers.get(_numbers(stem)) for stem in stems]
+        by_numbers = {_numbers(m.stem) or m.stem: m for m in there}
+        found = [by_numbers.get(_numbers(stem) or stem) for stem in stems]
         if not any(found):
             raise CaptureError(f"{masks}: {len(there)} masks for {len(stems)} frames, expected the numbers of frames")
         there = found
     return Feed(source, there, there or [masks / f"{stem}.png" for stem in stems], depths=depths)
 
 
-def _numbers(stem: str) -> tuple[int, ...] | str:
-    """The numbers in the name of a picture or mask; the name itself if there are none."""
-    return tuple(map(int, re.findall(r"[0-9]+", stem))) or stem
+def _numbers(stem: str) -> tuple[int, ...]:
+    """The numbers in the name of a picture or mask."""
+    return tuple(map(int, re.findall(r"[0-9]+", stem)))
 
 
 def assemble(
