@@ -114,6 +114,17 @@ def flag(t: float) -> list[Shape]:
     return turned(shapes, 0.02 * t)
 
 
+def tunnels(t: float) -> list[Shape]:
+    """Two balls go around the figure, 6 degrees per frame, and pass through a block each: each is hidden from all
+    cameras for seven frames."""
+    shapes = turned(figure(0.5 * np.sin(0.5 * t)), 0.02 * t)
+    for side, color in ((0, (0.85, 0.75, 0.2)), (np.pi, (0.3, 0.65, 0.4))):
+        ball = placed(True, (0.09, 0.09, 0.09), (0.58, 0, -0.2), color)
+        block = placed(False, (0.12, 0.3, 0.12), (0.58, 0, -0.2), (0.55, 0.5, 0.45))
+        shapes += turned([ball], side + np.radians(6 * t - 90)) + turned([block], side)
+    return shapes
+
+
 def basketball(frames: int) -> Capture:
     """A real room: two men in a dome (CMU Panoptic Sports), of the data folder, at half the size.
 
@@ -176,6 +187,7 @@ SCENES = {
     "wrong masks": Scene(walking, mask_errors=0.2),
     "thin structure": Scene(rods),
     "cloth": Scene(flag),
+    "hidden parts": Scene(tunnels),
     "no texture": Scene(lambda t: turned(figure(0.5 * np.sin(0.5 * t), pattern=0), 0.07 * t)),
     "empty frames": Scene(sometimes),
     "one frame": Scene(walking, frames=1),

@@ -13,7 +13,7 @@ from gscodec.capture.capture import Capture
 from gscodec.capture.images import View
 from gscodec.model.gaussian_sequence import DenseGroup, GaussianSequence
 from gscodec.model.gaussians import concatenate
-from gscodec.model.rotations import quat_to_matrix, rotvec_to_quat
+from gscodec.model.rotations import quat_to_matrix, rotate, rotvec_to_quat
 from gscodec.render.cpu import CpuBackend
 from gscodec.render.image import render_image
 from gscodec.train.change_detection import Changes
@@ -202,6 +202,38 @@ def test_what_jumps_is_found_and_what_is_gone_is_not():
     shift = relocalize(model, some, 1, changes, changes.advance(1), TINY)
     np.testing.assert_allclose(shift, [1, 0, 0], atol=0.25)
     assert relocalize(model, some, 2, changes, changes.advance(2), TINY) is None
+
+
+def test_what_no_camera_sees_goes_on_as_it_moved():
+    """A ball goes around the origin, is hidden by a shell from all cameras, and comes out of it."""
+    shell, ball, place = blob(400), blob(80, seed=1), np.float32([1.4, 0, 0])
+    shell = dataclasses.replace(
+        shell,
+        means=0.35 * shell.means + place,
+        log_scales=np.full_like(shell.log_scales, np.log(0.09)),
+        logit_opacities=np.full_like(shell.logit_opacities, 6),
+    )
+    ball = dataclasses.replace(ball, means=0.15 * ball.means + place, log_scales=ball.log_scales - 1)
+    angles = [-0.6, -0.1, 0.0, 0.1, 0.2, 0.3]  # of the ball; of 0.1 on its motion is known
+    frames = [concatenate([shell, moved(ball, [0, 0, angle], np.zeros(3))]) for angle in angles]
+    tracker = started(frames[0], capture_of(GaussianSequence(25.0, [DenseGroup([g]) for g in frames])), frames=6)
+    tracker.changes.advance(1)
+    tracker.moving[400:] = True
+    nodes, about_z = tracker.graph.carriers(tracker.moving).float()[:, None], torch.tensor([[0, 0, 1.0]])
+
+    def around(angle):
+        """Turn and shift of the ball's nodes around the origin."""
+        there = rotate(rotvec_to_quat(angle * about_z), tracker.pose.nodes)
+        return angle * about_z * nodes, (there - tracker.pose.nodes) * nodes
+
+    tracker.pose = tracker.pose.moved(*around(0.5))
+    turn, back = around(-0.1)
+    tracker.pose = dataclasses.replace(tracker.pose, angular_velocity=-turn, velocity=-back)
+    for t, tolerance in ((2, 1e-5), (3, 1e-5), (4, 1e-3), (5, 0.02)):
+        tracker.advance(t)
+        apart = (tracker.model.params["means"].numpy() - frames[t].means)[400:]
+        assert np.linalg.norm(apart.mean(0)) < tolerance, f"frame {t}; it moves by 0.14 a frame"
+        assert tracker.coasting.all() if t < 4 else tracker.moving[400:].any()
 
 
 def test_masks_say_where_nothing_is():

@@ -272,6 +272,16 @@ class NodeGraph:
         carried = self.neighbors[some][self.weights[some] > self.settings.carrier_weight_min]
         return torch.from_numpy(np.isin(np.arange(len(self)), carried) & ~self.held)
 
+    def mean_of_carried(self, x: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
+        """[M], mean of `x` [N] over the Gaussians of `chosen` ([N] bool) that each node and its neighbours carry, by
+        blending weight; infinity if they carry none."""
+        weights = self.weights * chosen.numpy()[:, None]
+        sums = np.zeros((2, len(self)))
+        for total, by in zip(sums, (np.ones(len(x)), x.numpy()), strict=True):
+            np.add.at(total, self.neighbors, weights * by[:, None])
+        count, total = sums + sums[:, self._edges[0]].sum(2)
+        return torch.from_numpy(np.divide(total, count, out=np.full(len(self), np.inf), where=count > 0))
+
 
 def _padded(a: np.ndarray, width: int) -> np.ndarray:
     """[N, k] -> [N, width], padded with zeros: a group with few nodes may get more."""

@@ -37,9 +37,10 @@ class FrameFit:
         self.tracker, self._rng = tracker, rng
         self._moving, self._all_move = tracker.moving.float(), bool(tracker.moving.all())
         carriers = tracker.graph.carriers(tracker.moving).float()[:, None]
+        going = carriers + tracker.coasting.float()[:, None]  # coasting nodes keep their velocity
         self._nodes = {
-            "angular_velocity": tracker.pose.angular_velocity * carriers,
-            "velocity": tracker.pose.velocity * carriers,
+            "angular_velocity": tracker.pose.angular_velocity * going,
+            "velocity": tracker.pose.velocity * going,
         }
         self._carriers, self._adam = carriers, Adam(backend, s.node_adam)
         self._rates = {"angular_velocity": s.node_rotation_rate, "velocity": s.node_translation_rate * tracker.radius}

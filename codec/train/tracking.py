@@ -8,7 +8,8 @@ colours the motion follows the shading instead of the surface (lumberjack after 
 Gaussians behind pixels that do not change (change_detection.py) stay as they are, to the bit, and so do their nodes.
 New Gaussians (densification.py) have nodes of their own, unless they lie beside others. A search finds motion too fast
 for the gradient: of new Gaussians (relocalization.py), of the subject and its parts (motion_search.py). Gaussians that
-have faded, or lie outside of the masks, are removed.
+have faded, or lie outside of the masks, are removed. What no camera sees any more coasts: its nodes go on as they
+moved last, around a curve, too, until a camera sees it again.
 
 A hash grid and an MLP move the nodes beside their own variables (motion_field.py), so that large motion is reached in
 fewer steps.
@@ -60,6 +61,7 @@ class Tracker:
         own: the Gaussians in the pose of the keyframe; `means` are the offsets from where the nodes carry them.
         pose: of the nodes in the last frame.
         moving: [N] bool, Gaussians that were optimised in the last frame.
+        coasting: [M] bool, nodes that moved on in the last frame though no camera saw what they carry.
         loss: image loss of the last frame with changes, without the mask term.
         masks: changed pixels of the last frame, from `Changes.advance`.
         screen_gradient: [N], mean screen gradient in the last frame.
@@ -75,6 +77,7 @@ class Tracker:
         self.radius, self.loss, self.keyframe_gradient = numbers.tolist()
         self.changes = changes
         self.moving = torch.zeros(len(own), dtype=torch.bool)
+        self.coasting = torch.zeros(len(graph), dtype=torch.bool)
         self.rig: RigPrediction | None = None
         self.searched = False
 
@@ -142,7 +145,8 @@ class Tracker:
         """
         if self.rig is not None:
             self.pose = self.rig.step(self.pose, self.graph, frame)
-        self.moving, self.searched = torch.from_numpy(self._moving(frame)), False
+        self.searched = False
+        self._look(frame)
         self.screen_gradient = torch.zeros(len(self.own))
         if not self.alive.any():
             return self._missing(frame)
@@ -152,8 +156,7 @@ class Tracker:
             self.pose, self.searched = found or self.pose, found is not None
             self._fit(frame, on_step)
         else:
-            still = {n: 0 * getattr(self.pose, n) for n in ("angular_velocity", "velocity")}
-            self.pose = replace(self.pose, **still)
+            self.pose = self._coasted(self.coasting)
         faded = torch.sigmoid(self.own.params["logit_opacities"]) < self.settings.keyframe.prune_opacity
         outside = self.changes.outside(frame, self.model.params["means"].numpy())
         self._remove(torch.from_numpy(outside) | (self.moving & faded))
@@ -294,6 +297,7 @@ class Tracker:
         shift = self.graph.add_nodes(means[separate]) if separate.sum() >= s.separate_min else None
         if shift is not None:
             self.pose = self.pose.extended(self.graph.nodes[first:] - shift)
+            self.coasting = torch.cat([self.coasting, torch.zeros(len(self.graph) - first, dtype=torch.bool)])
             old, rest = torch.cat([old, means[separate]]), torch.cat([rest, means[separate] + shift])
             rotations = torch.cat([rotations, rotvec_to_quat(torch.zeros(int(separate.sum()), 3))])
         near = torch.from_numpy(cKDTree(old.numpy()).query(means.numpy())[1])
@@ -301,27 +305,62 @@ class Tracker:
 
     def changed_fraction(self, frame: int, before: torch.Tensor) -> float:
         """Fraction of the Gaussians that `frame`, the next one, changes, beyond those of `before` ([N] bool)."""
-        new = self._behind(self.changes.copy().advance(frame), frame) & ~before.numpy()
-        return float(new.mean()) if len(new) else 0.0
+        masks, model = self.changes.copy().advance(frame), self.model
+        if not (len(model) and any(m.any() for m in masks)):
+            return 0.0
+        behind = self.changes.behind(frame, masks, model.params["means"].numpy(), self._visible(model, frame)[0])
+        return float((behind & ~before.numpy()).mean())
 
     def jumps(self, frame: int) -> bool:
         """Whether the moving Gaussians of the last frame are far from where their velocity leads them in `frame`, the
         next one, and a search finds them. False with a rig."""
         return self.rig is None and search(self, frame, self.settings.motion_search.jump_ratio) is not None
 
-    def _moving(self, frame: int) -> np.ndarray:
-        """Gaussians that `frame` changes, [N] bool; sets `masks`."""
+    def _look(self, frame: int) -> None:
+        """Sets what `frame` changes: `masks`, `moving`, and `coasting` with the velocity of these nodes."""
         self.masks = self.changes.advance(frame)
-        return self._behind(self.masks, frame)
+        if not (self._changed or self.moving.any() or self.coasting.any()):
+            self.moving = torch.zeros(len(self.own), dtype=torch.bool)
+            return
+        s, before = self.settings.tracking, self.coasting
+        self._turn(before)
+        model = self._model(self._coasted(before))
+        visible, weights = self._visible(model, frame)
+        self.moving = torch.from_numpy(self.changes.behind(frame, self.masks, model.params["means"].numpy(), visible))
+        shown = self.graph.mean_of_carried(weights, self.alive)
+        usual = weights[weights > s.visible_weight].median()
+        lost = (self.pose.velocity.any(1) | self.pose.angular_velocity.any(1)) & (shown < s.leaving_share * usual)
+        if lost.any():
+            ahead = self._visible(self._model(self.pose.next()), frame)[1]
+            share = torch.where(before, s.leaving_share, s.hidden_share)
+            lost &= self.graph.mean_of_carried(ahead, self.alive) < share * usual
+        nearest = torch.from_numpy(self.graph.neighbors[:, 0].astype(np.int64))
+        found = (before & ~lost)[nearest]  # must fit the pictures, even if they have not changed here
+        self.moving = (self.moving | found) & ~lost[nearest]
+        self.coasting = lost & ~self.graph.carriers(self.moving)
+        self._turn(self.coasting & ~before)
 
-    def _behind(self, masks: list[np.ndarray], frame: int) -> np.ndarray:
-        """Gaussians behind the changed pixels `masks` of `frame`, [N] bool."""
-        model, s = self.model, self.settings.tracking
-        if not any(m.any() for m in masks):
-            return np.zeros(len(model), bool)
-        losses = view_losses(model.params, self.views, frame, self.settings, self._of_usual(s.small_scale))
-        visible = [result.max_weight > s.visible_weight for result in losses]
-        return self.changes.behind(frame, masks, model.params["means"].numpy(), visible)
+    def _turn(self, nodes: torch.Tensor) -> None:
+        """Turns the velocity of `nodes` ([M] bool) by a frame of their rotation, so that they go around a curve. A rig
+        knows their velocity."""
+        if self.rig is None:
+            turned = rotate(rotvec_to_quat(self.pose.angular_velocity), self.pose.velocity)
+            self.pose = replace(self.pose, velocity=torch.where(nodes[:, None], turned, self.pose.velocity))
+
+    def _coasted(self, nodes: torch.Tensor) -> Pose:
+        """The pose a frame later, in which `nodes` ([M] bool) have their velocity and others stand still."""
+        velocity = {n: nodes[:, None] * getattr(self.pose, n) for n in ("angular_velocity", "velocity")}
+        return replace(self.pose, **velocity).next()
+
+    def _visible(self, model: Model, frame: int) -> tuple[list[np.ndarray], torch.Tensor]:
+        """Gaussians of `model` that each training camera sees at `frame`, [N] bool, and the largest blending weight of
+        each Gaussian in any of them, [N]."""
+        s = self.settings.tracking
+        visible, weights = [], np.zeros(len(model), np.float32)
+        for result in view_losses(model.params, self.views, frame, self.settings, self._of_usual(s.small_scale)):
+            visible.append(result.max_weight > s.visible_weight)
+            weights = np.maximum(weights, result.max_weight)
+        return visible, torch.from_numpy(weights)
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything as arrays, for a checkpoint."""
@@ -331,7 +370,8 @@ class Tracker:
         graph = {f"graph.{n}": a for n, a in self.graph.state().items()}
         numbers = np.array([self.radius, self.loss, self.keyframe_gradient])
         rig = {} if self.rig is None else {"at_rest": np.array(self.rig.at_rest)}
-        return {"numbers": numbers, **rig, **graph, **own, **pose, **fitted}
+        last = {n: getattr(self, n).numpy() for n in ("moving", "coasting")}
+        return {"numbers": numbers, **last, **rig, **graph, **own, **pose, **fitted}
 
     @staticmethod
     def restored(
@@ -344,5 +384,6 @@ class Tracker:
         changes = Changes(views, fitted, settings.change_detection)
         tracker = Tracker(NodeGraph.restored(graph, settings.graph), own, views, settings, state["numbers"], changes)
         tracker.pose = Pose(*(torch.from_numpy(state[f"pose.{f.name}"]) for f in fields(Pose)))
+        tracker.moving, tracker.coasting = (torch.from_numpy(state[n]) for n in ("moving", "coasting"))
         tracker.rig = rig and RigPrediction(rig, int(state["at_rest"]), tracker.graph)
         return tracker
