@@ -272,6 +272,10 @@ class NodeGraph:
         carried = self.neighbors[some][self.weights[some] > self.settings.carrier_weight_min]
         return torch.from_numpy(np.isin(np.arange(len(self)), carried) & ~self.held)
 
+    def among(self, nodes: torch.Tensor) -> torch.Tensor:
+        """[M] bool: those of `nodes` ([M] bool) most of whose neighbours are of `nodes`, too."""
+        return nodes & torch.from_numpy(nodes.numpy()[self._edges[0]].mean(1) > 0.5)
+
     def mean_of_carried(self, x: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
         """[M], mean of `x` [N] over the Gaussians of `chosen` ([N] bool) that each node and its neighbours carry, by
         blending weight; infinity if they carry none."""
@@ -280,7 +284,7 @@ class NodeGraph:
         for total, by in zip(sums, (np.ones(len(x)), x.numpy()), strict=True):
             np.add.at(total, self.neighbors, weights * by[:, None])
         count, total = sums + sums[:, self._edges[0]].sum(2)
-        return torch.from_numpy(np.divide(total, count, out=np.full(len(self), np.inf), where=count > 0))
+        return torch.from_numpy(np.divide(total, count, out=np.full(len(self), np.inf), where=count > 0)).float()
 
 
 def _padded(a: np.ndarray, width: int) -> np.ndarray:

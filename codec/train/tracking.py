@@ -62,6 +62,7 @@ class Tracker:
         pose: of the nodes in the last frame.
         moving: [N] bool, Gaussians that were optimised in the last frame.
         coasting: [M] bool, nodes that moved on in the last frame though no camera saw what they carry.
+        shown: [M], largest mean blending weight so far of what each node carries (`NodeGraph.mean_of_carried`).
         loss: image loss of the last frame with changes, without the mask term.
         masks: changed pixels of the last frame, from `Changes.advance`.
         screen_gradient: [N], mean screen gradient in the last frame.
@@ -77,7 +78,7 @@ class Tracker:
         self.radius, self.loss, self.keyframe_gradient = numbers.tolist()
         self.changes = changes
         self.moving = torch.zeros(len(own), dtype=torch.bool)
-        self.coasting = torch.zeros(len(graph), dtype=torch.bool)
+        self.coasting, self.shown = torch.zeros(len(graph), dtype=torch.bool), torch.zeros(len(graph))
         self.rig: RigPrediction | None = None
         self.searched = False
 
@@ -107,6 +108,8 @@ class Tracker:
         gradient = float(torch.quantile(stats.mean_screen_gradient(), s.gradient_quantile))
         tracker = Tracker(graph, own, views, settings, np.array([radius, loss, gradient]), changes)
         tracker.rig = rig and RigPrediction(rig, frames[0], graph)
+        weights = tracker._visible(tracker.model, frames[0])[1]
+        tracker.shown = graph.mean_of_carried(weights, key.alive).nan_to_num(posinf=0.0)
         return tracker
 
     def carried(self, own: Model, pose: Pose) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
@@ -297,7 +300,8 @@ class Tracker:
         shift = self.graph.add_nodes(means[separate]) if separate.sum() >= s.separate_min else None
         if shift is not None:
             self.pose = self.pose.extended(self.graph.nodes[first:] - shift)
-            self.coasting = torch.cat([self.coasting, torch.zeros(len(self.graph) - first, dtype=torch.bool)])
+            added = torch.zeros(len(self.graph) - first)
+            self.coasting, self.shown = torch.cat([self.coasting, added.bool()]), torch.cat([self.shown, added])
             old, rest = torch.cat([old, means[separate]]), torch.cat([rest, means[separate] + shift])
             rotations = torch.cat([rotations, rotvec_to_quat(torch.zeros(int(separate.sum()), 3))])
         near = torch.from_numpy(cKDTree(old.numpy()).query(means.numpy())[1])
@@ -328,12 +332,13 @@ class Tracker:
         visible, weights = self._visible(model, frame)
         self.moving = torch.from_numpy(self.changes.behind(frame, self.masks, model.params["means"].numpy(), visible))
         shown = self.graph.mean_of_carried(weights, self.alive)
-        usual = weights[weights > s.visible_weight].median()
-        lost = (self.pose.velocity.any(1) | self.pose.angular_velocity.any(1)) & (shown < s.leaving_share * usual)
+        self.shown = torch.maximum(self.shown, shown.nan_to_num(posinf=0.0))
+        lost = (self.pose.velocity.any(1) | self.pose.angular_velocity.any(1)) & (shown < s.leaving_share * self.shown)
         if lost.any():
             ahead = self._visible(self._model(self.pose.next()), frame)[1]
             share = torch.where(before, s.leaving_share, s.hidden_share)
-            lost &= self.graph.mean_of_carried(ahead, self.alive) < share * usual
+            lost &= self.graph.mean_of_carried(ahead, self.alive) < share * self.shown
+        lost = self.graph.among(lost)  # nodes here and there are behind others of the same surface
         nearest = torch.from_numpy(self.graph.neighbors[:, 0].astype(np.int64))
         found = (before & ~lost)[nearest]  # must fit the pictures, even if they have not changed here
         self.moving = (self.moving | found) & ~lost[nearest]
@@ -370,7 +375,7 @@ class Tracker:
         graph = {f"graph.{n}": a for n, a in self.graph.state().items()}
         numbers = np.array([self.radius, self.loss, self.keyframe_gradient])
         rig = {} if self.rig is None else {"at_rest": np.array(self.rig.at_rest)}
-        last = {n: getattr(self, n).numpy() for n in ("moving", "coasting")}
+        last = {n: getattr(self, n).numpy() for n in ("moving", "coasting", "shown")}
         return {"numbers": numbers, **last, **rig, **graph, **own, **pose, **fitted}
 
     @staticmethod
@@ -384,6 +389,7 @@ class Tracker:
         changes = Changes(views, fitted, settings.change_detection)
         tracker = Tracker(NodeGraph.restored(graph, settings.graph), own, views, settings, state["numbers"], changes)
         tracker.pose = Pose(*(torch.from_numpy(state[f"pose.{f.name}"]) for f in fields(Pose)))
-        tracker.moving, tracker.coasting = (torch.from_numpy(state[n]) for n in ("moving", "coasting"))
+        for n in ("moving", "coasting", "shown"):
+            setattr(tracker, n, torch.from_numpy(state[n]))
         tracker.rig = rig and RigPrediction(rig, int(state["at_rest"]), tracker.graph)
         return tracker
