@@ -227,6 +227,9 @@ def test_what_no_camera_sees_goes_on_as_it_moved():
         return angle * about_z * nodes, (there - tracker.pose.nodes) * nodes
 
     tracker.pose = tracker.pose.moved(*around(0.5))
+    assert tracker.changes.within(1, np.float32([[1.4, 0, 0], [0, 0, 4]])).tolist() == [True, False], (
+        "what can be found"
+    )
     turn, back = around(-0.1)
     tracker.pose = dataclasses.replace(tracker.pose, angular_velocity=-turn, velocity=-back)
     for t, tolerance in ((2, 1e-5), (3, 1e-5), (4, 1e-5), (5, 0.02)):

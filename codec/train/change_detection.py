@@ -96,6 +96,11 @@ class Changes:
             hit[on] += mask[y[on], x[on]]
         return ~self.far(means) & (hit > 0) & (hit >= self.settings.seen_share * seen)
 
+    def within(self, frame: int, points: np.ndarray) -> np.ndarray:
+        """[P] bool: `points` [P, 3] in the picture of a training camera at `frame`, and not too far away (`far`)."""
+        whole = [np.ones(image.shape[:2], bool) for image in self.fitted]
+        return self.behind(frame, whole, points, [np.ones(len(points), bool)] * len(whole))
+
     def far(self, means: np.ndarray) -> np.ndarray:
         """[N] bool: `means` [N, 3] that are too far away to measure their motion (`ChangeDetectionSettings.far`)."""
         return self.views.distance(means) > self.settings.far * self.views.working_distance

@@ -335,9 +335,10 @@ class Tracker:
         self.shown = torch.maximum(self.shown, shown.nan_to_num(posinf=0.0))
         lost = (self.pose.velocity.any(1) | self.pose.angular_velocity.any(1)) & (shown < s.leaving_share * self.shown)
         if lost.any():
-            ahead = self._visible(self._model(self.pose.next()), frame)[1]
-            share = torch.where(before, s.leaving_share, s.hidden_share)
+            there, share = self.pose.next(), torch.where(before, s.leaving_share, s.hidden_share)
+            ahead = self._visible(self._model(there), frame)[1]
             lost &= self.graph.mean_of_carried(ahead, self.alive) < share * self.shown
+            lost &= torch.from_numpy(self.changes.within(frame, there.nodes.numpy()))  # else they would never be found
         lost = self.graph.among(lost)  # nodes here and there are behind others of the same surface
         nearest = torch.from_numpy(self.graph.neighbors[:, 0].astype(np.int64))
         found = (before & ~lost)[nearest]  # must fit the pictures, even if they have not changed here
