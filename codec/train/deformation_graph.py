@@ -273,8 +273,8 @@ class NodeGraph:
         return torch.from_numpy(np.isin(np.arange(len(self)), carried) & ~self.held)
 
     def among(self, nodes: torch.Tensor) -> torch.Tensor:
-        """[M] bool: those of `nodes` ([M] bool) most of whose neighbours are of `nodes`, too."""
-        return nodes & torch.from_numpy(nodes.numpy()[self._edges[0]].mean(1) > 0.5)
+        """[M] bool: those of `nodes` ([M] bool) all of whose neighbours are of `nodes`, too."""
+        return nodes & torch.from_numpy(nodes.numpy()[self._edges[0]].all(1))
 
     def mean_of_carried(self, x: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
         """[M], mean of `x` [N] over the Gaussians of `chosen` ([N] bool) that each node and its neighbours carry, by

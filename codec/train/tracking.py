@@ -339,7 +339,7 @@ class Tracker:
             ahead = self._visible(self._model(there), frame)[1]
             lost &= self.graph.mean_of_carried(ahead, self.alive) < share * self.shown
             lost &= torch.from_numpy(self.changes.within(frame, there.nodes.numpy()))  # else they would never be found
-        lost = self.graph.among(lost)  # nodes here and there are behind others of the same surface
+        lost = self.graph.among(lost)  # others are at the rim of what is hidden, or behind a fold of their own surface
         nearest = torch.from_numpy(self.graph.neighbors[:, 0].astype(np.int64))
         found = (before & ~lost)[nearest]  # must fit the pictures, even if they have not changed here
         self.moving = (self.moving | found) & ~lost[nearest]

@@ -108,8 +108,8 @@ class TrackingSettings:
     separate_distance: float = 4.0  # spacings of new Gaussians; farther from all others they get their own nodes
     separate_min: int = 8  # new Gaussians that are worth nodes of their own
     visible_weight: float = 0.05  # blending weight from which a camera sees a Gaussian
-    # A node begins to coast, as most of its neighbours do, if the mean blending weight of what it and they carry is a
-    # small share of the largest that it has had.
+    # A node begins to coast, as all its neighbours do, if the mean blending weight of what it and they carry is a small
+    # share of the largest that it has had.
     leaving_share: float = 0.6  # largest share where they are now; a node that coasts does so up to this share
     hidden_share: float = 0.3  # largest share where their velocity leads them
 
