@@ -111,7 +111,7 @@ class TrackingSettings:
     # A node begins to coast, as all its neighbours do, if the mean blending weight of what it and they carry is a small
     # share of the largest that it has had.
     leaving_share: float = 0.6  # largest share where they are now; a node that coasts does so up to this share
-    hidden_share: float = 0.3  # largest share where their velocity leads them
+    hidden_share: float = 0.15  # largest share where their velocity leads them
 
 
 @dataclass(frozen=True)
