@@ -75,17 +75,20 @@ class Changes:
             if alpha is None:
                 return np.zeros(len(means), bool)
             masks.append(self._dilated(cv2.resize(alpha, fitted.shape[1::-1], interpolation=cv2.INTER_AREA) > 0))
-        return ~self.behind(frame, masks, means, [np.ones(len(means), bool)] * len(masks))
+        return ~self.behind(frame, masks, means)
 
-    def behind(self, frame: int, masks: list[np.ndarray], means: np.ndarray, visible: list[np.ndarray]) -> np.ndarray:
+    def behind(
+        self, frame: int, masks: list[np.ndarray], means: np.ndarray, visible: list[np.ndarray] | None = None
+    ) -> np.ndarray:
         """Gaussians behind the pixels of `masks`, [N] bool: a large enough share of the cameras that see a Gaussian
         (`seen_share`) see it there, and it is not too far away to have changed (`far`).
 
         Args:
             masks: [h, w] bool of each training camera, from `advance`.
             means: [N, 3] world units.
-            visible: [N] bool of each training camera, Gaussians that the camera sees.
+            visible: [N] bool of each training camera, Gaussians that the camera sees; None: all.
         """
+        visible = visible or [np.ones(len(means), bool)] * len(masks)
         seen, hit = np.zeros(len(means), np.int32), np.zeros(len(means), np.int32)
         for camera, mask, sees in zip(self.views.train_cameras, masks, visible, strict=True):
             height, width = mask.shape
@@ -98,8 +101,7 @@ class Changes:
 
     def within(self, frame: int, points: np.ndarray) -> np.ndarray:
         """[P] bool: `points` [P, 3] in the picture of a training camera at `frame`, and not too far away (`far`)."""
-        whole = [np.ones(image.shape[:2], bool) for image in self.fitted]
-        return self.behind(frame, whole, points, [np.ones(len(points), bool)] * len(whole))
+        return self.behind(frame, [np.ones(image.shape[:2], bool) for image in self.fitted], points)
 
     def far(self, means: np.ndarray) -> np.ndarray:
         """[N] bool: `means` [N, 3] that are too far away to measure their motion (`ChangeDetectionSettings.far`)."""

@@ -280,9 +280,8 @@ class NodeGraph:
         """[M], mean of `x` [N] over the Gaussians of `chosen` ([N] bool) that each node and its neighbours carry, by
         blending weight; infinity if they carry none."""
         weights = self.weights * chosen.numpy()[:, None]
-        sums = np.zeros((2, len(self)))
-        for total, by in zip(sums, (np.ones(len(x)), x.numpy()), strict=True):
-            np.add.at(total, self.neighbors, weights * by[:, None])
+        of_node = (weights, weights * x.numpy()[:, None])
+        sums = np.array([np.bincount(self.neighbors.ravel(), w.ravel(), len(self)) for w in of_node])
         count, total = sums + sums[:, self._edges[0]].sum(2)
         return torch.from_numpy(np.divide(total, count, out=np.full(len(self), np.inf), where=count > 0)).float()
 
