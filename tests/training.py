@@ -11,7 +11,7 @@ from gscodec.metrics.image import psnr
 from gscodec.model.camera import Camera, look_at
 from gscodec.model.gaussian_sequence import GaussianSequence
 from gscodec.render.image import render_image, render_rgba
-from gscodec.train.settings import BudgetSettings, TrainSettings
+from gscodec.train.settings import BudgetSettings, KeyframeSettings, TrainSettings
 
 SIZE = 64
 AS_SET = BudgetSettings(steps_most=1.0)  # number of steps as set, also for small pictures
@@ -24,6 +24,7 @@ TINY = TrainSettings(
     initial_points=300,
     sh_degree=1,
     budget=AS_SET,
+    keyframe=KeyframeSettings(teachers=0),  # after so few steps they know less than the pictures
 )
 
 

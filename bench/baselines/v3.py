@@ -56,7 +56,9 @@ class MotionField(torch.nn.Module):
 def train_v3(capture, frames: range, settings: TrainSettings, steps: tuple[int, int] = STEPS) -> list:
     """Gaussians of each frame: a keyframe for the first, then each frame from the one before, by `steps` of motion and
     of fine-tuning."""
-    settings = replace(settings.of_capture(capture), sh_degree=0)  # its packing has no higher harmonics
+    settings = settings.of_capture(capture)
+    keyframe = replace(settings.keyframe, teachers=0)
+    settings = replace(settings, sh_degree=0, keyframe=keyframe)  # its packing has no higher harmonics
     views = Views(capture, settings, CpuBackend())
     model, radius = initial_model(capture, frames[0], settings.initial_points or POINTS, settings)
     train_keyframe(model, views, frames[0], settings, steps=settings.keyframe_steps, radius=radius)

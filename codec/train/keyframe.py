@@ -6,13 +6,14 @@ harmonics are added on the way, and removed again where they lower the error by 
 masks opacities decay and transparent Gaussians move at random (3DGS-MCMC, Kheradmand et al. 2024): few views of a room
 do not contradict floaters before the cameras. The decay is faster near the cameras: a black floater before a black
 background causes no error in any training view, but hides the subject in views between the cameras. While one view is
-rendered, the step of the view before is applied: gradients are one step old.
+rendered, the step of the view before is applied: gradients are one step old. Teachers, which are other models from the
+same start, give the model views between the cameras as long as it grows (pseudo_views.py).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +22,9 @@ import torch
 from ..model.rotations import quat_normalize, rotate
 from ..render.backend import PendingLoss, RenderLoss
 from .model import REMOVED_LOGIT, Model
+from .pseudo_views import between, pseudo_views
 from .settings import KeyframeSettings, TrainSettings
-from .views import Target, Views, add_harmonics_prior, start_photometric_loss, view_losses
+from .views import Target, Views, add_harmonics_prior, shrink, start_photometric_loss, view_losses
 
 NOISE_POWER = 4  # power of the transparency in the noise of positions
 
@@ -88,9 +90,21 @@ def train_keyframe(
     Args:
         steps: optimisation steps, one view each.
         radius: size of the subject in world units, scales the learning rate of the means.
-        on_step: called with (step, loss).
+        on_step: called with (step, loss), for the steps of teachers, too.
     """
-    run, k = _Run(model, views, frame, settings, steps, radius), settings.keyframe
+    k = settings.keyframe
+    cameras = between([views.capture.camera(i, frame) for i in views.train_cameras]) if k.teachers else []
+    teachers = [Model(model.params) for _ in range(k.teachers if cameras else 0)]
+    for number, teacher in enumerate(teachers, 1):
+        _optimize(_Run(teacher, views, frame, settings, steps, radius, teacher=number), on_step)
+    shown = pseudo_views(cameras, [t.params for t in teachers], not views.capture.has_alpha, views.backend)
+    run = _Run(model, views, frame, settings, steps, radius, shown)
+    _optimize(run, on_step)
+    return float(np.mean(run.losses[-len(views.train_cameras) :]))
+
+
+def _optimize(run: _Run, on_step: Callable[[int, float], None] | None) -> None:
+    k, steps, settings = run.settings.keyframe, run.steps, run.settings
     densify_every = max(k.densify_every, round(k.densify_share * steps))
     for step in range(steps):
         run.step(step)
@@ -103,7 +117,6 @@ def train_keyframe(
         if on_step:
             on_step(step, run.losses[-1] if run.losses else math.inf)
     run.finish()
-    return float(np.mean(run.losses[-len(views.train_cameras) :]))
 
 
 @dataclass(frozen=True)
@@ -118,15 +131,30 @@ class _View:
 class _Run:
     """State of one keyframe's optimisation.
 
+    Args:
+        pseudo: views between the cameras.
+        teacher: number of the teacher that is trained; 0: it is the keyframe itself.
+
     Attributes:
-        losses: image loss of each step that was taken, without the terms of mask and depth.
+        losses: image loss of each step along a view of the capture, without the terms of mask and depth.
     """
 
-    def __init__(self, model: Model, views: Views, frame: int, settings: TrainSettings, steps: int, radius: float):
+    def __init__(
+        self,
+        model: Model,
+        views: Views,
+        frame: int,
+        settings: TrainSettings,
+        steps: int,
+        radius: float,
+        pseudo: Sequence[Target] = (),
+        teacher: int = 0,
+    ):
         k = settings.keyframe
         self.model, self.views, self.frame, self.settings = model, views, frame, settings
-        self.steps, self.radius, self.losses = steps, radius, []
-        self.rng = np.random.default_rng([settings.seed, frame])
+        self.steps, self.radius, self.pseudo, self.losses = steps, radius, pseudo, []
+        self.rng = np.random.default_rng([settings.seed, frame, *([teacher] if teacher else [])])
+        self._order: list[int] = []  # of the round, numbers of pseudo views, then those of views of the capture
         self.statistics = Statistics(len(model), k.mse_min)
         self._started: _View | None = None
         self._opacity_decay = self._decay_of_opacities()
@@ -135,10 +163,10 @@ class _Run:
 
     def step(self, step: int) -> None:
         """Starts to render one view, and meanwhile applies the step of the view before."""
-        s, views = self.settings, self.views
-        target = views.draw(self.frame, picture_scale(step / self.steps, views.largest_side, s.keyframe))
+        s = self.settings
+        target = self._draw(step / self.steps)
         params = _without_some(self.model.params, s.keyframe.dropout * step / self.steps, self.rng)
-        pending = start_photometric_loss(params, [target], s, self.rng, views.backend)
+        pending = start_photometric_loss(params, [target], s, self.rng, self.views.backend)
         self.finish()
         self._started = _View(step, target, pending)
 
@@ -149,12 +177,13 @@ class _Run:
         view, self._started = self._started, None
         k, model, views, result = self.settings.keyframe, self.model, self.views, view.pending()
         self.statistics.add(result)
-        self.losses.append(result.image_loss)
         progress = view.step / max(self.steps - 1, 1)
         decay = k.rate_decay**progress
-        views.exposure.learn(view.target.index, result.grad_exposure[0], decay)
-        if view.step >= k.appearance_from * self.steps:
-            views.extrinsics.learn(view.target.index, model.params, result.grads, decay)
+        if view.target.index is not None:
+            self.losses.append(result.image_loss)
+            views.exposure.learn(view.target.index, result.grad_exposure[0], decay)
+            if view.step >= k.appearance_from * self.steps:
+                views.extrinsics.learn(view.target.index, model.params, result.grads, decay)
         add_harmonics_prior(result.grads, model.params, self.settings)
         if k.opacity_decay:
             add_opacity_decay(result.grads, model.params, self._opacity_decay)
@@ -163,6 +192,21 @@ class _Run:
         model.step(result.grads, {**k.rates.scaled(self.radius, decay), "means": means_rate})
         if k.position_noise:
             move_at_random(model.params, k.position_noise * means_decay, self.rng)
+
+    def _draw(self, progress: float) -> Target:
+        """The next view after a share `progress` of the steps. As long as Gaussians are added, each round has every
+        pseudo view once, between as many views of the capture as there are cameras; later ones have the capture's
+        alone, which are sharper."""
+        k = self.settings.keyframe
+        scale = picture_scale(progress, self.views.largest_side, k)
+        if not self.pseudo or progress >= k.densify_until:
+            return self.views.draw(self.frame, scale)
+        if not self._order:
+            self._order = self.rng.permutation(len(self.pseudo) + len(self.views.train_cameras)).tolist()
+        number = self._order.pop()
+        if number >= len(self.pseudo):
+            return self.views.draw(self.frame, scale)
+        return self.pseudo[number] if scale == 1 else shrink(self.pseudo[number], scale)
 
     def set_degree(self, degree: int | None) -> None:
         """Gives the Gaussians harmonics of this degree; None: of the degree that pays for its bits."""

@@ -37,16 +37,16 @@ class Target:
         camera: pinhole camera of the crop, in its calibrated pose.
         rgb: [H, W, 3] u8, unassociated colour.
         alpha: [H, W] u8; 255 everywhere where the capture has no masks.
-        index: of the camera in the capture.
+        index: of the camera in the capture; None: a pseudo view (pseudo_views.py).
         depth: [H, W] f32, world units along the optical axis, 0 where unknown; None: the camera has no depth images.
         opaque: the capture has no masks.
-        exposure: gain and offset of the camera, [3] each.
+        exposure: gain and offset of the camera, [3] each; None: 1 and 0.
     """
 
     camera: Camera
     rgb: np.ndarray
     alpha: np.ndarray
-    index: int
+    index: int | None
     depth: np.ndarray | None = None
     opaque: bool = False
     exposure: tuple[np.ndarray, np.ndarray] | None = None

@@ -143,18 +143,20 @@ class TrainSettings:
     def of_capture(self, capture) -> TrainSettings:
         """The settings for a capture. Few views hardly contradict changes that overfit the pictures of one frame: the
         fewer views, the higher is the price of a bit, and the faster learns the motion field, which moves neighbours
-        together. Many views need a weaker harmonics prior and less dropout. A capture without masks gets the settings
-        of a room, in which the field would drag resting Gaussians along.
+        together. Many views need a weaker harmonics prior, less dropout, and, of a subject, no teachers. A capture
+        without masks gets the settings of a room, in which the field would drag resting Gaussians along.
         """
         views = max(1, len(capture.indices("train")))
         few, many, field = max(1.0, self.few_views / views), max(1.0, views / self.few_views), self.motion_field
         settings = replace(self, rate_lambda=few * self.rate_lambda)
         if not capture.has_alpha:
             return settings._of_room()
+        k = self.keyframe
+        dropout, teachers = k.dropout * min(1.0, self.few_views / views) ** 4, k.teachers * (views <= k.taught_views)
         return replace(
             settings,
             harmonics_lambda=self.harmonics_lambda / many**2,
-            keyframe=replace(self.keyframe, dropout=self.keyframe.dropout * min(1.0, self.few_views / views) ** 4),
+            keyframe=replace(k, dropout=dropout, teachers=teachers),
             motion_field=field.faster(min(few**2, field.searched_rates)),
         )
 

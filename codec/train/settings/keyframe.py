@@ -131,6 +131,8 @@ class KeyframeSettings:
     rates: LearningRates = field(default_factory=keyframe_rates)
     means_rate_end: float = 1.6e-5  # radii, at the last step
     rate_decay: float = 0.3  # all other rates at the last step, times those at the first
+    teachers: int = 2  # other models of the frame, whose pictures between the cameras it is trained on, too
+    taught_views: int = 15  # training cameras up to which a capture with masks has teachers
     dropout: float = 0.4  # share of the Gaussians that the last step leaves out, where views are few
     appearance_from: float = 0.3  # share of the steps; poses and SH wait for colours that are about right
     gaussians_share: float = 0.8  # of gaussians_max; the rest is left for tracking
