@@ -179,10 +179,12 @@ class _Run:
         """A new subject from the first of `frames`."""
         s = self.settings
         budget = keyframe_budget(self.views, frames[0], s)
-        self.progress.total += (1 + s.keyframe.teachers) * (budget.steps - s.keyframe_steps)
+        models, before = 1 + s.keyframe.teachers, self.progress.done
+        self.progress.total += models * (budget.steps - s.keyframe_steps)
         model, radius = initial_model(self.capture, frames[0], budget.points, s, self.views.view)
         on_step = self._report(f"keyframe {frames[0]}")
         loss = train_keyframe(model, self.views, frames[0], s, steps=budget.steps, radius=radius, on_step=on_step)
+        self.progress.total -= models * budget.steps - (self.progress.done - before)  # without neighbours no teachers
         tracker = Tracker.start(model, self.views, s, loss, frames, self.rig)
         return Subject(tracker, frames[0], loss, radius, self._shown(frames[0]))
 
