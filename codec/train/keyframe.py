@@ -96,7 +96,7 @@ def train_keyframe(
     cameras = between([views.capture.camera(i, frame) for i in views.train_cameras]) if k.teachers else []
     teachers = [Model(model.params) for _ in range(k.teachers if cameras else 0)]
     for number, teacher in enumerate(teachers, 1):
-        _optimize(_Run(teacher, views, frame, settings, steps, radius, teacher=number), on_step)
+        _optimize(_Run(teacher, views, frame, settings, k.of_teacher(steps), radius, teacher=number), on_step)
     shown = pseudo_views(cameras, [t.params for t in teachers], not views.capture.has_alpha, views.backend)
     run = _Run(model, views, frame, settings, steps, radius, shown)
     _optimize(run, on_step)

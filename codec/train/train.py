@@ -124,7 +124,7 @@ class _Run:
     def estimate(self, frames: int) -> None:
         """Sets the total of the progress; `frames`: left to train, if no group is cut."""
         s = self.settings
-        key = (1 + s.keyframe.teachers) * s.keyframe_steps if self.subject is None else 0
+        key = s.keyframe.in_all(s.keyframe_steps) if self.subject is None else 0
         finetune = s.finetune_steps if s.gop > 1 else 0
         self.progress.total = self.progress.done + key + frames * (s.motion_steps + finetune)
 
@@ -179,12 +179,12 @@ class _Run:
         """A new subject from the first of `frames`."""
         s = self.settings
         budget = keyframe_budget(self.views, frames[0], s)
-        models, before = 1 + s.keyframe.teachers, self.progress.done
-        self.progress.total += models * (budget.steps - s.keyframe_steps)
+        steps, before = s.keyframe.in_all(budget.steps), self.progress.done
+        self.progress.total += steps - s.keyframe.in_all(s.keyframe_steps)
         model, radius = initial_model(self.capture, frames[0], budget.points, s, self.views.view)
         on_step = self._report(f"keyframe {frames[0]}")
         loss = train_keyframe(model, self.views, frames[0], s, steps=budget.steps, radius=radius, on_step=on_step)
-        self.progress.total -= models * budget.steps - (self.progress.done - before)  # without neighbours no teachers
+        self.progress.total -= steps - (self.progress.done - before)  # without neighbours there are no teachers
         tracker = Tracker.start(model, self.views, s, loss, frames, self.rig)
         return Subject(tracker, frames[0], loss, radius, self._shown(frames[0]))
 

@@ -173,6 +173,7 @@ class TrainSettings:
                 self.keyframe,
                 price=room.price * self.keyframe.price,
                 dropout=0.0,
+                teacher_share=room.teacher_share * self.keyframe.teacher_share,
                 opacity_decay=room.opacity_decay,
                 position_noise=room.position_noise,
             ),

@@ -132,6 +132,7 @@ class KeyframeSettings:
     means_rate_end: float = 1.6e-5  # radii, at the last step
     rate_decay: float = 0.3  # all other rates at the last step, times those at the first
     teachers: int = 2  # other models of the frame, whose pictures between the cameras it is trained on, too
+    teacher_share: float = 1.0  # steps of a teacher, of those of the keyframe
     taught_views: int = 15  # training cameras up to which a capture with masks has teachers
     dropout: float = 0.4  # share of the Gaussians that the last step leaves out, where views are few
     appearance_from: float = 0.3  # share of the steps; poses and SH wait for colours that are about right
@@ -156,3 +157,11 @@ class KeyframeSettings:
     split_shrink: float = 1.6  # by which the scales of a Gaussian are divided when it is split
     split_offset: float = 0.7  # of a random offset drawn from the Gaussian, for both halves
     clone_offset: float = 0.3  # of such an offset, for the copy
+
+    def of_teacher(self, steps: int) -> int:
+        """Steps of each teacher of a keyframe with `steps`."""
+        return round(self.teacher_share * steps)
+
+    def in_all(self, steps: int) -> int:
+        """Steps of a keyframe with `steps` and of its teachers."""
+        return steps + self.teachers * self.of_teacher(steps)

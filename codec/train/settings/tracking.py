@@ -72,6 +72,7 @@ class RoomSettings:
     price: float = 2.0  # of a Gaussian, times that of a subject: the few training views gain more by it than others
     opacity_decay: float = 0.003  # of a keyframe: no mask removes floaters before the cameras
     position_noise: float = 3.0  # of a keyframe, for the same reason
+    teacher_share: float = 0.5  # times that of a subject: a keyframe has more steps, and its teachers need no detail
     field_in_tracking: bool = False  # it drags resting Gaussians along with moving ones beside them
 
 
