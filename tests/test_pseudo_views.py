@@ -14,7 +14,7 @@ from gscodec.render.sensitivity import params_of
 from gscodec.train import keyframe
 from gscodec.train.calibration import Exposure
 from gscodec.train.initialization import initial_model
-from gscodec.train.pseudo_views import between, pseudo_views
+from gscodec.train.pseudo_views import between, pseudo_view
 from gscodec.train.settings import KeyframeSettings, train_settings
 from gscodec.train.views import Views
 
@@ -45,7 +45,7 @@ def test_a_pseudo_camera_stands_halfway_and_looks_where_its_neighbours_look():
 def test_a_pseudo_view_is_the_mean_picture_of_its_models(opaque):
     camera, backend = between(ring(8))[0], CpuBackend()
     a, b = (turning(300, frames=6).frame(t) for t in (0, 5))
-    (target,) = pseudo_views([camera], [params_of(a), params_of(b)], opaque, backend)
+    target = pseudo_view(camera, [params_of(a), params_of(b)], opaque, backend)
     crop = target.camera
     rgba = np.mean([render_rgba(g, crop) for g in (a, b)], 0)
     alpha = np.ones(rgba.shape[:2]) if opaque else target.alpha / 255

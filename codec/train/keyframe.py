@@ -22,7 +22,7 @@ import torch
 from ..model.rotations import quat_normalize, rotate
 from ..render.backend import PendingLoss, RenderLoss
 from .model import REMOVED_LOGIT, Model
-from .pseudo_views import between, pseudo_views
+from .pseudo_views import between, pseudo_view
 from .settings import KeyframeSettings, TrainSettings
 from .views import Target, Views, add_harmonics_prior, shrink, start_photometric_loss, view_losses
 
@@ -97,7 +97,8 @@ def train_keyframe(
     teachers = [Model(model.params) for _ in range(k.teachers if cameras else 0)]
     for number, teacher in enumerate(teachers, 1):
         _optimize(_Run(teacher, views, frame, settings, k.of_teacher(steps), radius, teacher=number), on_step)
-    shown = pseudo_views(cameras, [t.params for t in teachers], not views.capture.has_alpha, views.backend)
+    models, opaque = [t.params for t in teachers], not views.capture.has_alpha
+    shown = [pseudo_view(camera, models, opaque, views.backend) for camera in cameras]
     run = _Run(model, views, frame, settings, steps, radius, shown)
     _optimize(run, on_step)
     return float(np.mean(run.losses[-len(views.train_cameras) :]))
@@ -153,7 +154,7 @@ class _Run:
         k = settings.keyframe
         self.model, self.views, self.frame, self.settings = model, views, frame, settings
         self.steps, self.radius, self.pseudo, self.losses = steps, radius, pseudo, []
-        self.rng = np.random.default_rng([settings.seed, frame, *([teacher] if teacher else [])])
+        self.rng = np.random.default_rng([settings.seed, frame, teacher])
         self._order: list[int] = []  # of the round, numbers of pseudo views, then those of views of the capture
         self.statistics = Statistics(len(model), k.mse_min)
         self._started: _View | None = None

@@ -22,12 +22,6 @@ NEIGHBOURS = 2  # of each camera, with which it has a pseudo view
 ALIKE_MIN = 0.5  # cosine of the angle between neighbours, as seen from where the cameras look: at most 60 degrees
 
 
-def pseudo_views(cameras: Sequence[Camera], models: Sequence[Params], opaque: bool, backend: Backend) -> list[Target]:
-    """A training target for each of `cameras` (`between`): the mean of the pictures of `models`; of a capture without
-    masks (`opaque`) over the grey that its targets have behind them."""
-    return [_target(camera, models, opaque, backend) for camera in cameras]
-
-
 def between(cameras: Sequence[Camera]) -> list[Camera]:
     """A camera halfway between each camera and each of its `NEIGHBOURS` nearest ones, by their directions from where
     all look; as far from there as the mean of the two, with the picture of the first."""
@@ -57,7 +51,9 @@ def between(cameras: Sequence[Camera]) -> list[Camera]:
     return found
 
 
-def _target(camera: Camera, models: Sequence[Params], opaque: bool, backend: Backend) -> Target:
+def pseudo_view(camera: Camera, models: Sequence[Params], opaque: bool, backend: Backend) -> Target:
+    """A training target for one of the cameras of `between`: the mean of the pictures of `models`; of a capture without
+    masks (`opaque`) over the grey that its targets have behind them."""
     drawn = [backend.render(m, camera, GREY if opaque else (0.0, 0.0, 0.0)) for m in models]
     image, alpha = (np.mean([d[k] for d in drawn], axis=0).clip(0, 1) for k in range(2))
     if opaque:
